@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+from lab.namespace import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.machines import Machines
 
@@ -90,7 +91,7 @@ def sim_link(space: Space) -> Iterator[list[str]]:
         enter = ["nsenter", f"--net=/proc/{anchor.pid}/ns/net"]
         subprocess.run([*enter, "ip", "link", "set", "eth0", "up"], check=True)
         space.ip("set", "eth0", "up")
-        space.ready("eth0")
+        wait_for_carrier("eth0")
         yield enter
     finally:
         anchor.communicate()

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -30,13 +29,13 @@ from typing import Final
 import yaml
 
 from gdp.crypto.certificates import Role
-from gdp.host import netns_files
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
 from gdp.trust.right import Right
 from lab.namespaces import Namespaces
+from lab.process import LabProcess, end_processes
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
@@ -125,7 +124,7 @@ class Proxy:
         self._pair = pair
         self._label = label
         self._log = pair.folder / f"proxy-{label}.log"
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: LabProcess | None = None
         self._port = 9_110 + list(_GRAPHS).index(label)
 
     @property
@@ -163,8 +162,8 @@ class Proxy:
         """End it, by signal or kill; idempotent."""
         process, self._process = self._process, None
         if process is not None:
-            process.send_signal(how)
-            process.communicate(timeout=PATIENCE_S)
+            process.send(how)
+            process.reap(PATIENCE_S)
 
     def warnings(self, name: str) -> list[str]:
         """Return its warnings about a local name: fault and detail."""
@@ -177,7 +176,7 @@ class Proxy:
     def metric(self, name: str) -> float:
         """Return the value of a metric, zero where it is not there."""
         ask = partial(_metrics, self._port)
-        text = netns_files.inside(self._pair.spaces.path(self.machine), ask)
+        text = self._pair.spaces[self.machine].inside(ask)
         found = re.search(rf"^{re.escape(name)} (\S+)$", text, re.MULTILINE)
         return float(found[1]) if found else 0.0
 
@@ -203,7 +202,7 @@ class Pair:
         self._crossings = crossings
         self._hidden = hidden
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
-        self._master: subprocess.Popen[bytes] | None = None
+        self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
         make_domain(self.folder / "pair", "pair")
         make_owner(self.folder / "owner")
@@ -244,7 +243,7 @@ class Pair:
         """Limit the traffic from machine "a" to "b", such as ``20mbit``; empty: no limit."""
         words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
         change = words if rate else ["del", "dev", "b", "root"]
-        subprocess.run(self.spaces.command("a", ["tc", "qdisc", *change]), check=True)
+        subprocess.run(self.spaces["a"].command(["tc", "qdisc", *change]), check=True)
 
     def start_master(self) -> None:
         """Start the ROS 1 master, if it does not run."""
@@ -257,28 +256,18 @@ class Pair:
         """Kill the ROS 1 master."""
         process, self._master = self._master, None
         assert process is not None
-        process.kill()
-        process.communicate()
+        process.kill_group()
 
-    def start(
-        self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = ""
-    ) -> subprocess.Popen[bytes]:
-        """Start a command of ours on a machine; return it when it reports that it is ready."""
-        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+    def start(self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = "") -> LabProcess:
+        """Start a command of ours on a machine; return it when it has printed this."""
+        words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph in self._hidden:
             words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
-        with log.open("ab") as errors:
-            process = subprocess.Popen(
-                [*words, sys.executable, "-m", *argv],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                env={**os.environ, **_ENVIRONMENT},
-                start_new_session=True,
-            )
-        self._run.note_process(process.pid)
-        self._undo.callback(_end, process)
-        _await(process, sign, log)
+        words += [sys.executable, "-m", *argv]
+        process = LabProcess(self._run, argv[0], words, environment=_ENVIRONMENT, log=log)
+        self._undo.callback(end_processes, [process], PATIENCE_S)
+        while sign.encode() not in process.read_line(PATIENCE_S):
+            pass
         return process
 
     def write_proxy(self, label: str, port: int) -> Path:
@@ -333,7 +322,7 @@ class Pair:
 
     def _make_node(self, graph: str, name: str) -> Peer:
         machine = "a" if graph == "a" else "b"
-        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+        words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph == "one":
             logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{PYTHON_PATH}"}
             node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})
@@ -356,27 +345,6 @@ def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> It
     with ExitStack() as undo:
         undo.callback(run.end)
         yield Pair(run, undo, crossings, hidden or {})
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.terminate()
-    try:
-        process.communicate(timeout=PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-
-
-def _await(process: subprocess.Popen[bytes], sign: str, log: Path) -> None:
-    """Return when a process has printed this on its standard output."""
-    assert process.stdout is not None
-    said, end_s = b"", time.monotonic() + PATIENCE_S
-    while sign.encode() not in said:
-        ready = select.select([process.stdout], [], [], max(end_s - time.monotonic(), 0.0))[0]
-        piece = os.read(process.stdout.fileno(), 1 << 16) if ready else b""
-        assert piece, f"{sign!r} was not said, but {said!r}; {log.read_text()[-2_000:]}"
-        said += piece
 
 
 def _metrics(port: int) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import select
-import signal
 import subprocess
 import sys
 import time
@@ -23,6 +21,8 @@ from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
+from lab.namespace import wait_for_carrier
+from lab.process import LabProcess, end_processes
 from netns_tests.spaces import Space
 from tests.waiting import until
 
@@ -37,7 +37,7 @@ class Node:
     def __init__(self, home: Path, label: str, pid: int) -> None:
         self.home, self.label, self.pid = home, label, pid
         self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net", "--"]
-        self.running: list[subprocess.Popen[bytes]] = []
+        self.running: list[LabProcess] = []
         self.identity = home / label
         self.name: Name = load_card(self.identity / "node.card").name
 
@@ -55,13 +55,10 @@ class Node:
         """Return the names of the devices."""
         return {str(each["ifname"]) for each in self.links()}
 
-    def kill(self, process: subprocess.Popen[bytes]) -> None:
+    def kill(self, process: LabProcess) -> None:
         """End a process at once, as the kernel does when memory is short."""
         self.running.remove(process)
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+        process.kill_group()
 
     def run(self, *argv: str) -> subprocess.CompletedProcess[str]:
         """Run a command here, in the folder of all files; it ends by itself."""
@@ -82,21 +79,12 @@ class Node:
         path.write_text(yaml.safe_dump({"identity": self.label, "domain": domain, **keys}))
         return path
 
-    def start(self, module: str, config: Path, *words: str) -> subprocess.Popen[bytes]:
+    def start(self, module: str, config: Path, *words: str) -> LabProcess:
         """Start a node, and return when it is ready."""
-        with (self.home / f"{self.label}-{module}.log").open("ab") as log:
-            process = subprocess.Popen(
-                [*self.enter, sys.executable, "-m", module, "--config", str(config), "--json", *words],
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-                bufsize=0,
-            )
+        argv = [*self.enter, sys.executable, "-m", module, "--config", str(config), "--json", *words]
+        process = LabProcess(None, self.label, argv, log=self.home / f"{self.label}-{module}.log")
         self.running.append(process)
-        assert process.stdout is not None
-        assert select.select([process.stdout], [], [], _PATIENCE_S)[0], self.log(module)
-        line = process.stdout.readline()
-        assert b'"ready"' in line, (line, self.log(module))
+        assert process.read(_PATIENCE_S)["event"] == "ready", self.log(module)
         return process
 
     def log(self, module: str) -> str:
@@ -108,17 +96,9 @@ class Node:
         return dict(ask_node(socket, Command.STATUS, _PATIENCE_S).result)
 
     def end(self) -> None:
-        """End all processes with Ctrl-C, or at last with a kill."""
-        while self.running:
-            process = self.running.pop()
-            process.send_signal(signal.SIGINT)
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
+        """End all processes, at last with a kill."""
+        end_processes(self.running, 10.0)
+        self.running.clear()
 
 
 class RelayLab:
@@ -132,7 +112,6 @@ class RelayLab:
         self.border, self.member = (
             Node(home, label, pid) for label, pid in zip(("border", "member"), pids, strict=True)
         )
-        self.border_device = tap_name(self.border.name, self.member.name)
         self.member_device = tap_name(self.member.name, self.border.name)
 
     def relay_config(self, node: Node, *, standby: bool = False, **more: object) -> Path:
@@ -142,17 +121,17 @@ class RelayLab:
         part: dict[str, object] = {"server": {"port": PORT}} if node is self.border else {"borders": [border]}
         return node.write("relay.yaml", control_socket=f"{node.label}-relay.sock", **{**part, **more})
 
-    def start_relay(self, node: Node, *, standby: bool = False, **more: object) -> subprocess.Popen[bytes]:
+    def start_relay(self, node: Node, *, standby: bool = False, **more: object) -> LabProcess:
         """Start the relay of one machine."""
         return node.start("gdp.cli.relay", self.relay_config(node, standby=standby, **more))
 
-    def start_relays(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+    def start_relays(self) -> tuple[LabProcess, LabProcess]:
         """Start both relays; return border's and member's when frames may pass."""
         processes = self.start_relay(self.border), self.start_relay(self.member)
         until(self.is_up)
         return processes
 
-    def start_switch(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
+    def start_switch(self, node: Node, **more: object) -> LabProcess:
         """Start the switch of one machine; its only links are the relay's devices."""
         socket = f"{node.label}-switch.sock"
         config = node.write("switch.yaml", relay=True, control_socket=socket, data_plane="raw", **more)
@@ -204,7 +183,7 @@ def relay_lab(space: Space, home: Path) -> Iterator[RelayLab]:
         for node, address in ((lab.border, BORDER_ADDRESS), (lab.member, MEMBER_ADDRESS)):
             node.ip("addr", "add", f"{address}/24", "dev", "eth0")
             node.ip("link", "set", "eth0", "up")
-        space.ready("eth0")
+        wait_for_carrier("eth0")
         yield lab
     finally:
         if lab is not None:

@@ -15,11 +15,11 @@ import yaml
 from gdp.crypto.certificates import Role
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run, RunRegistry
-from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from lab.namespaces import Namespaces
+from lab.rights import grant
 from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
 
@@ -51,10 +51,7 @@ class SessionLab:
             node = self.folder / label
             make_node(node, Role.PROXY, label, self.folder / "domain")
             (node / "delegations").mkdir(exist_ok=True)
-            for name, given in names.items():
-                kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-                metadata = Metadata({"kind": kind, "name": name, **({"type": types[name]} if name in types else {})})
-                install_delegation(node, delegate(self.folder / "owner", node / CARD, metadata, list(given)))
+            grant(self.folder / "owner", node, names, types)
 
     def start(self, *argv: str) -> subprocess.Popen[str]:
         """Start Python with these arguments on the machine; it ends with the lab."""
@@ -65,7 +62,7 @@ class SessionLab:
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PATH": path}
         process = subprocess.Popen(
-            self._spaces.command(_MACHINE, argv),
+            self._spaces[_MACHINE].command(argv),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

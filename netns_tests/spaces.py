@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import os
-import select
 import subprocess
 from pathlib import Path
 
-from gdp.ports.rtnetlink import LinkMonitor
+from pyroute2 import netns
 
-_PATIENCE_S = 10.0
-_CLONE_NEWNET = 0x40000000
+from lab.namespace import wait_for_carrier
+
 _LIBRARY = ctypes.CDLL(None, use_errno=True)
-
-
-def _call(result: int) -> None:
-    if result:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-
-
-def enter_namespace(descriptor: int) -> None:
-    """Move this thread into the network namespace of an open descriptor.
-
-    Raises:
-        OSError: not allowed here.
-    """
-    _call(_LIBRARY.setns(descriptor, _CLONE_NEWNET))
 
 
 class Space:
@@ -39,16 +23,14 @@ class Space:
 
     def __enter__(self) -> Space:
         self._before = os.open("/proc/self/ns/net", os.O_RDONLY)
-        try:
-            _call(_LIBRARY.unshare(_CLONE_NEWNET))
-        except OSError:
+        if _LIBRARY.unshare(netns.CLONE_NEWNET):
             os.close(self._before)
-            raise
+            raise OSError(number := ctypes.get_errno(), os.strerror(number))
         Path("/proc/sys/net/ipv6/conf/default/disable_ipv6").write_text("1")  # no frames but ours
         return self
 
     def __exit__(self, *_: object) -> None:
-        enter_namespace(self._before)
+        netns.setns(self._before)
         os.close(self._before)
 
     def ip(self, *words: str) -> None:
@@ -65,19 +47,4 @@ class Space:
         self.ip("add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
         for name in (one, other):
             self.ip("set", name, "up")
-        self.ready(one, other)
-
-    def ready(self, *names: str) -> None:
-        """Return when the kernel reports that these devices can send.
-
-        Raises:
-            TimeoutError: they did not come up.
-        """
-        watch = LinkMonitor()
-        try:
-            while not all(link and link.up for link in map(watch.get, names)):
-                if not select.select([watch], [], [], _PATIENCE_S)[0]:
-                    raise TimeoutError(f"{names} did not come up")
-                watch.poll()
-        finally:
-            watch.close()
+        wait_for_carrier(one, other)

@@ -86,7 +86,7 @@ class Asked:
         """Type the command at machine b; return its exit code and its JSON object."""
         given = ["--node", str(self.pair.identity("b")), "--seconds", "0.5", "--json"]
         ended = subprocess.run(
-            self.pair.spaces.command("b", [sys.executable, "-m", "gdp.cli.gdp", "explain", name, *given]),
+            self.pair.spaces["b"].command([sys.executable, "-m", "gdp.cli.gdp", "explain", name, *given]),
             env={**os.environ, "PYTHONPATH": PYTHON_PATH},
             capture_output=True,
             text=True,
@@ -118,7 +118,7 @@ class Asked:
     def tc(self, machine: str, device: str, *words: str) -> None:
         """Run ``tc qdisc`` on a machine."""
         command = ["tc", "qdisc", words[0], "dev", device, "root", *words[1:]]
-        subprocess.run(self.pair.spaces.command(machine, command), check=True, capture_output=True)
+        subprocess.run(self.pair.spaces[machine].command(command), check=True, capture_output=True)
 
     def _node(self, graph: str, name: str) -> Peer:
         node = self.pair.node(graph, name)
@@ -164,7 +164,7 @@ def test_the_command_says_it_in_json_and_by_its_exit_code(asked: Asked) -> None:
 
 @pytest.mark.nightly
 def test_a_ros_node_in_another_domain_or_with_shared_memory_alone_is_found(asked: Asked) -> None:
-    words = asked.pair.spaces.command("b", ["env", "ROS_DOMAIN_ID=7", "FASTDDS_BUILTIN_TRANSPORTS=SHM"])
+    words = asked.pair.spaces["b"].command(["env", "ROS_DOMAIN_ID=7", "FASTDDS_BUILTIN_TRANSPORTS=SHM"])
     apart = Peer("apart", words)
     try:
         apart.tell("1")

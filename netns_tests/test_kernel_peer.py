@@ -24,6 +24,7 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
 from gdp.ports.netlink import NetlinkSocket
+from lab.namespace import wait_for_carrier
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled
@@ -120,7 +121,7 @@ def test_a_frame_reaches_another_namespace_straight_or_by_the_queue_that_was_put
         space.ip("set", "q1", "netns", str(holder))
         there = Path(f"/proc/{holder}/ns/net")
         inside(there, lambda: space.ip("set", "q1", "up"))
-        space.ready("p1")
+        wait_for_carrier("p1")
         plane = make_kernel(filled(), peer=peer)
         with inside(there, lambda: far_end("q1")) as receiver, IPRoute() as ask:
             assert is_straight(plane, WIDE) == peer
@@ -146,7 +147,7 @@ def test_a_question_that_is_refused_takes_the_plain_way_until_it_is_answered(
     with elsewhere() as holder:
         space.ip("set", "q1", "netns", str(holder))
         inside(Path(f"/proc/{holder}/ns/net"), lambda: space.ip("set", "q1", "up"))
-        space.ready("p1")
+        wait_for_carrier("p1")
         plane = make_kernel(filled())
         assert is_straight(plane, WIDE)
         with monkeypatch.context() as patch:

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.host import netns_files
 from gdp.host.processes import Process
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from lab.namespaces import Namespaces
@@ -38,13 +37,13 @@ def run(runs: RunRegistry) -> Iterator[Run]:
 
 def links(namespaces: Namespaces, node: str) -> dict[str, list[str]]:
     """Return the fields of ``ip -br link`` for each device: state, MAC, flags."""
-    argv = namespaces.command(node, ["ip", "-br", "link"])
+    argv = namespaces[node].command(["ip", "-br", "link"])
     lines = subprocess.run(argv, check=True, capture_output=True, text=True).stdout.splitlines()
     return {line.split("@")[0].split()[0]: line.split()[1:] for line in lines}
 
 
 def read(namespaces: Namespaces, node: str, file: str) -> str:
-    return netns_files.inside(namespaces.path(node), Path(file).read_text).strip()
+    return namespaces[node].inside(Path(file).read_text).strip()
 
 
 def test_every_device_is_called_like_the_neighbour_it_leads_to(run: Run) -> None:
@@ -66,7 +65,7 @@ def test_links_have_the_wanted_mtu_at_both_ends(run: Run, mtu: int) -> None:
     namespaces = Namespaces(chain(2, mtu), run)
     show = ["ip", "link", "show"]
     for node, device in (("s1", "s2"), ("s2", "s1")):
-        argv = namespaces.command(node, [*show, device])
+        argv = namespaces[node].command([*show, device])
         assert f" mtu {mtu} " in subprocess.run(argv, check=True, capture_output=True, text=True).stdout
 
 
@@ -95,7 +94,7 @@ def test_a_link_that_is_not_there_cannot_be_cut(run: Run) -> None:
 
 def test_a_process_inside_keeps_the_id_it_was_started_under(run: Run) -> None:
     namespaces = Namespaces(chain(1), run)
-    argv = namespaces.command("s1", [sys.executable, "-c", "import os; print(os.getpid())"])
+    argv = namespaces["s1"].command([sys.executable, "-c", "import os; print(os.getpid())"])
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert int(process.stdout.readline()) == process.pid
@@ -112,7 +111,7 @@ def test_the_end_of_a_run_removes_what_it_made_and_nothing_else(runs: RunRegistr
     left = Namespaces(chain(2), other)
     gone = Namespaces(chain(2), mine)
     mine.end()
-    assert not any(gone.path(node).exists() for node in ("s1", "s2"))
+    assert not any(gone[node].path.exists() for node in ("s1", "s2"))
     assert set(links(left, "s1")) >= {"lo", "s2"}
     other.end()
     assert list(tmp_path.rglob("*")) == []
@@ -138,12 +137,12 @@ run = RunRegistry(Path(sys.argv[1]) / "runs").start()
 namespaces = Namespaces(chain(2), run)
 pids = []
 for leash in (True, False):
-    argv = namespaces.command("s1", ["sh", "-c", "echo; exec sleep 600"], dies_with_us=leash)
+    argv = namespaces["s1"].command(["sh", "-c", "echo; exec sleep 600"], dies_with_us=leash)
     child = subprocess.Popen(argv, stdout=subprocess.PIPE, start_new_session=True)
     child.stdout.readline()
     run.note_process(child.pid)
     pids.append(child.pid)
-print(*pids, namespaces.path("s1"), flush=True)
+print(*pids, namespaces["s1"].path, flush=True)
 signal.pause()
 """
 

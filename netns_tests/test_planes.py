@@ -29,6 +29,7 @@ from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.switch.table import Table
+from lab.namespace import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.fixtures_forwarding import (
     BOTH,
@@ -334,7 +335,7 @@ def test_a_cut_link_is_noticed_and_so_is_its_repair(
     assert switch.counters.drops[DropReason.PORT_DOWN] == 1
     space.ip("set", "q1", "up")
     poll_until(switch, lambda: heard == [(WIDE, False), (WIDE, True)])
-    space.ready("q1")
+    wait_for_carrier("q1")
     ends[WIDE].close()
     ends[WIDE] = far_end("q1")
     ends[IN].send(MARK)
@@ -351,7 +352,7 @@ def test_a_device_switched_off_is_a_port_down_and_works_again_when_on(
     assert node.transmit(0, PEER_MACS[IN], [bytes(96)]) == 0
     space.ip("set", "p0", "up")
     poll_until(node, lambda: heard == [(0, False), (0, True)])
-    space.ready("q0")
+    wait_for_carrier("q0")
     ends[IN].send(MARK)
     assert len(take_in(node, 1)) == 1
 

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
+from lab.namespace import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.proxy.endpoints.ros2_net import DOMAIN, NODE, Peer, needs, peer_of
 
@@ -43,7 +44,7 @@ def far() -> Iterator[Peer]:
             [*inside, "ip", "link", "set", "two", "up"],
         ):
             subprocess.run(words, check=True)
-        here.ready("one")
+        wait_for_carrier("one")
         peer = stack.enter_context(peer_of("far", inside, SUBNET))
         peer.tell("!from std_msgs.msg import String")
         yield peer

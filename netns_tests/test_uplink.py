@@ -19,7 +19,6 @@ import yaml
 from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
-from gdp.host import netns_files
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
@@ -87,7 +86,7 @@ class Field:
                 (link,) = ipr.get_links(ifname="robot")
                 return int(link.get_attr("IFLA_STATS64")["rx_bytes"])
 
-        return netns_files.inside(self._spaces.path("gateway"), look)
+        return self._spaces["gateway"].inside(look)
 
     def _command(self, role: Role, switch: str, content: Mapping[str, object]) -> None:
         path = self._folder / f"{role.value}-{switch}.yaml"
@@ -102,7 +101,7 @@ class Field:
     def _start(self, switch: str, argv: list[str]) -> subprocess.Popen[bytes]:
         with (self._folder / "log").open("ab") as log:
             process = subprocess.Popen(
-                self._spaces.command(switch, [sys.executable, "-m", *argv]),
+                self._spaces[switch].command([sys.executable, "-m", *argv]),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,

@@ -21,10 +21,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from pyroute2 import netns
 
 from gdp.errors import LocalError
 from gdp.ports.tunnel.uplink_routes import PROTOCOL, UplinkRoutes, mark_of, remove_leftovers
-from netns_tests.spaces import Space, enter_namespace
+from netns_tests.spaces import Space
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -85,11 +86,11 @@ class Site:
     def router(self) -> Iterator[None]:
         """Work in the router's namespace."""
         before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-        enter_namespace(self._router)
+        netns.setns(self._router)
         try:
             yield
         finally:
-            enter_namespace(before)
+            netns.setns(before)
             os.close(before)
 
     def lease(self, uplink: int) -> None:

@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from pyroute2 import netns
 
 from gdp.control.endpoints import Endpoint
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.vxlan import make_vxlan
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
-from netns_tests.spaces import Space, enter_namespace
+from netns_tests.spaces import Space
 
 PATIENCE_S = 30.0
 POLL_S = 1.0
@@ -44,11 +45,11 @@ class Site:
     def entered(self) -> Iterator[None]:
         """Work in this namespace."""
         before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-        enter_namespace(self.fd)
+        netns.setns(self.fd)
         try:
             yield
         finally:
-            enter_namespace(before)
+            netns.setns(before)
             os.close(before)
 
     def ip(self, *words: str) -> str:

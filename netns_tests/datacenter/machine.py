@@ -45,7 +45,7 @@ class BootedMachine:
         network.write_text(lease.network_config, encoding="ascii")
         self._master, slave = os.openpty()
         argv = ["unshare", *_SPACES, str(_BOOT), str(run.directory / name), str(image), os.ttyname(slave)]
-        held = ["sh", "-c", 'read -r go && exec "$@"', "boot", "nsenter", f"--net={lease.namespace}", "--", *argv]
+        held = ["sh", "-c", 'read -r go && exec "$@"', "boot", *lease.namespace.command(argv, dies_with_us=False)]
         self._process = subprocess.Popen(
             held, stdin=subprocess.PIPE, stdout=slave, stderr=slave, start_new_session=True
         )

@@ -16,10 +16,9 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import IPv4Address
-from pathlib import Path
 from typing import Final
 
-from gdp.host import netns_files
+from lab.namespace import Namespace
 from netns_tests.datacenter.router import METADATA
 
 __all__ = ["InstanceDocument", "MetadataService"]
@@ -64,9 +63,9 @@ class InstanceDocument:
 class MetadataService:
     """Service in the router's namespace; ``find``: address of a machine -> its document, None: unknown."""
 
-    def __init__(self, namespace: Path, find: Callable[[IPv4Address], InstanceDocument | None]) -> None:
+    def __init__(self, namespace: Namespace, find: Callable[[IPv4Address], InstanceDocument | None]) -> None:
         handler = type("Handler", (_Handler,), {"find": staticmethod(find), "tokens": set()})
-        self._server = netns_files.inside(namespace, lambda: ThreadingHTTPServer((str(METADATA), _PORT), handler))
+        self._server = namespace.inside(lambda: ThreadingHTTPServer((str(METADATA), _PORT), handler))
         self._server.daemon_threads = True
         self._server.socket.setsockopt(socket.IPPROTO_IP, socket.IP_TTL, 1)  # HttpPutResponseHopLimit of RunInstances
         self._thread = threading.Thread(target=self._server.serve_forever, name="metadata", daemon=True)

@@ -14,11 +14,11 @@ import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import IPv4Address
-from pathlib import Path
 from typing import Final
 
-from gdp.host import netns_files
 from gdp.host.run_registry import Run
+from internet.space import Space
+from lab.namespace import Namespace
 
 __all__ = ["CALLER", "METADATA", "Admitted", "Lease", "Router"]
 
@@ -49,9 +49,9 @@ table ip cloud {
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """Addresses of a machine; ``namespace``: file of its network namespace."""
+    """Addresses of a machine, and its network namespace."""
 
-    namespace: Path
+    namespace: Namespace
     private: IPv4Address
     public: IPv4Address
 
@@ -79,32 +79,35 @@ class Router:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._next = _FIRST
-        self.namespace = self._new_namespace("router")
+        self.namespace = Space(run, "router", forwards=True)
         self.device = f"wan{run.id}"
-        _run("ip", "link", "add", self.device, "type", "veth", "peer", "name", "wan", "netns", str(self.namespace))
+        link = ("type", "veth", "peer", "name", "wan", "netns", str(self.namespace.path))
+        _run("ip", "link", "add", self.device, *link)
         _run("ip", "address", "add", f"{CALLER}/24", "dev", self.device)
         _run("ip", "link", "set", self.device, "up")
-        for words in (
-            f"address add {_WAN}/24 dev wan",
-            "link set wan up",
-            "link set lo up",
-            f"address add {METADATA}/32 dev lo",
-            "link add lan type bridge",
-            f"address add {_LAN}/16 dev lan",
-            "link set lan up",
-        ):
-            self._inside("ip", *words.split())
-        self._inside("sysctl", "-qw", "net.ipv4.ip_forward=1")
-        self._inside("nft", "-f", "-", text=_RULES)
+        self.namespace.ip(
+            [
+                f"address add {_WAN}/24 dev wan",
+                "link set wan up",
+                f"address add {METADATA}/32 dev lo",
+                "link add lan type bridge",
+                f"address add {_LAN}/16 dev lan",
+                "link set lan up",
+            ]
+        )
+        self.namespace.nft(_RULES)
 
     def add(self, name: str, admitted: Iterable[Admitted] = ()) -> Lease:
         """Return the namespace and addresses of a new machine whose device ``eth0`` is up."""
         number, self._next = self._next, self._next + 1
-        lease = Lease(self._new_namespace(name), _PRIVATE + number, _PUBLIC + number)
-        link = ("link", "add", f"m{number}", "type", "veth", "peer", "name", "eth0", "netns", str(lease.namespace))
-        self._inside("ip", *link)
-        self._inside("ip", "link", "set", f"m{number}", "master", "lan", "up")
-        self._inside("ip", "address", "add", f"{lease.public}/32", "dev", "wan")
+        lease = Lease(Namespace(self._run, name), _PRIVATE + number, _PUBLIC + number)
+        self.namespace.ip(
+            [
+                f"link add m{number} type veth peer name eth0 netns {lease.namespace.path}",
+                f"link set m{number} master lan up",
+                f"address add {lease.public}/32 dev wan",
+            ]
+        )
         rules = [
             f"add element ip cloud to_private {{ {lease.public} : {lease.private} }}",
             f"add element ip cloud to_public {{ {lease.private} : {lease.public} }}",
@@ -113,19 +116,10 @@ class Router:
                 for each in admitted
             ),
         ]
-        self._inside("nft", "-f", "-", text="\n".join(rules))
+        self.namespace.nft("\n".join(rules))
         return lease
 
-    def _new_namespace(self, name: str) -> Path:
-        path = netns_files.IP_NETNS_DIRECTORY / f"gdp-{self._run.id}-{name}"
-        self._run.plan_namespace(path)
-        netns_files.create(path)
-        return path
 
-    def _inside(self, *words: str, text: str | None = None) -> None:
-        _run("nsenter", f"--net={self.namespace}", "--", *words, text=text)
-
-
-def _run(*words: str, text: str | None = None) -> None:
-    done = subprocess.run(words, input=text, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+def _run(*words: str) -> None:
+    done = subprocess.run(words, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
     assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"

@@ -20,10 +20,10 @@ from typing import Final, Protocol
 from chains import Chain
 from devices import add_bridge
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
-from peers.process import Started
 from pyroute2 import IPRoute
 
 from gdp.frame.kinds import ETHERTYPE
+from lab.process import LabProcess
 
 __all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
 
@@ -55,7 +55,7 @@ class Baseline(Protocol):
             LocalError: it is not available here; the text gives the reason.
         """
 
-    def workers(self) -> list[Started]:
+    def workers(self) -> list[LabProcess]:
         """Return the processes that forward while it is set up."""
 
 
@@ -74,7 +74,7 @@ class _ByKernel:
 
     processes = False
 
-    def workers(self) -> list[Started]:
+    def workers(self) -> list[LabProcess]:
         """Return no process: the kernel forwards."""
         return []
 
@@ -104,7 +104,7 @@ class Plane:
     def __init__(self, name: str, *, processes: bool) -> None:
         self.name = name
         self.processes = processes
-        self._workers: list[Started] = []
+        self._workers: list[LabProcess] = []
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames of ``size`` bytes, Ethernet header included."""
@@ -127,7 +127,7 @@ class Plane:
                 worker.read(_READY_S)
             return undo.pop_all()
 
-    def workers(self) -> list[Started]:
+    def workers(self) -> list[LabProcess]:
         """Return the switch processes."""
         return self._workers
 

@@ -18,11 +18,11 @@ from typing import Final
 from devices import mac_addresses, set_mtu
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
-from peers.process import Started, figures_of, floats_of
 from rate_search import Try
 from testbed import Lab
 
 from gdp.host.run_registry import RunRegistry
+from lab.process import LabProcess, figures_of, floats_of
 from lab.topology import chain
 
 __all__ = ["ROLES", "Chain"]
@@ -71,7 +71,7 @@ class Chain(Lab):
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def worker(self, node: str, role: str, *, cpu: int | None = None, **settings: object) -> Started:
+    def worker(self, node: str, role: str, *, cpu: int | None = None, **settings: object) -> LabProcess:
         """Start a role of ``roles.py``; ``cpu``: the core to run on, None: any."""
         orders = json.dumps({"role": role, "cpu": cpu, **settings})
         return self.start(node, role, [str(self.roles), orders], has_orders=True)
@@ -103,7 +103,7 @@ class Chain(Lab):
     def attempt(
         self,
         wire: Wire,
-        switches: Sequence[Started],
+        switches: Sequence[LabProcess],
         rate: float | None,
         seconds: float,
     ) -> Try:

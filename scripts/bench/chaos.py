@@ -45,13 +45,13 @@ from faults.overlay import Overlay
 from faults.plan import Plan
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
-from peers.process import FailedError, until
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
 from topologies import ends_of
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError, until
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # observation after the last fault
@@ -453,7 +453,7 @@ def main() -> None:
         for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
             try:
                 broke = run_seed(runs, seed, options)
-            except (GdpError, FailedError) as error:
+            except GdpError as error:
                 print(f"seed {seed}: {error}")
                 broke = [str(error)]
             broken += [seed] if broke else []

@@ -24,13 +24,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from peers.process import FailedError
 from report import Rounds, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
 from fog.supervisor.core.record import Record
 from gdp.enrolment.registry import Registry
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import hashlib
 import re
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from peers.process import FailedError, Started
 from report import Rounds, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
@@ -27,6 +27,7 @@ from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.fresh_machine import FreshMachine, Shell, TypedCommand, typed_commands
 from internet.laboratory import Laboratory
+from lab.process import FailedError, LabProcess
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "internet.md"
 BORDER_HOST: Final = "border.example.org"  # in the tutorial; here the border's address
@@ -109,8 +110,8 @@ def _follow(commands: Sequence[TypedCommand], runs: RunRegistry, delay_ms: float
         tutorial = Tutorial(laboratory, stack, delay_ms)
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
-            command = tutorial.machines[label].command
-            nodes[role] = stack.enter_context(Started(run, role, command, [_ENDPOINT, role, TOPIC]))
+            argv = tutorial.machines[label].command([sys.executable, _ENDPOINT, role, TOPIC])
+            nodes[role] = stack.enter_context(LabProcess(run, role, argv))
             nodes[role].read(_PATIENCE_S)
         begun_s = at_s = time.monotonic()
         for each in commands:

@@ -32,7 +32,6 @@ from typing import Final
 from baselines import Baseline, Bridge, Direct, IPv4, Plane
 from chains import Chain
 from machine import offload_text
-from peers.process import FailedError
 from plot import Panel, panel_of
 from rate_search import LOSS_MAX, highest
 from report import Rounds, Target, percentile, progress
@@ -40,6 +39,7 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 
 PINGS: Final = 1_000
 SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}

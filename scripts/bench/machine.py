@@ -35,7 +35,6 @@ __all__ = [
     "offload_text",
     "offloads",
     "processor_s",
-    "resident_bytes",
     "set_offloads",
     "soft_interrupts_s",
     "thread_s",
@@ -166,15 +165,6 @@ def _ask(ifname: str, command: int, value: int) -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         fcntl.ioctl(asked, _SIOCETHTOOL, argument)
     return int(struct.unpack("=II", request.raw)[1])
-
-
-def resident_bytes(pid: int | None = None) -> int:
-    """Return the present resident memory of a process, by default of this one.
-
-    Its recorded maximum would include the parent's, from before exec.
-    """
-    pages = Path(f"/proc/{pid or 'self'}/statm").read_text(encoding="ascii").split()[1]
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 def processor_s(pid: int) -> float:

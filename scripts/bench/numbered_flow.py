@@ -11,9 +11,8 @@ import time
 from itertools import pairwise
 from typing import Final
 
-from peers.process import FailedError
-
 import gdp
+from lab.process import FailedError
 
 __all__ = ["HZ", "NumberedFlow"]
 

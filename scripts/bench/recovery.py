@@ -24,13 +24,13 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from peers.process import FailedError
 from plot import Panel, panel_of
 from recovery_stage import DEDICATED, ECHO, REPLICA, Cluster
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 
 PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
 CASES: Final = {

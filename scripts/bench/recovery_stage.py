@@ -15,7 +15,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final, TypeVar
 
-from peers.process import FailedError, Started
 from report import progress
 from ros_environment import ros_environment
 from testbed import Lab
@@ -28,6 +27,7 @@ from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
+from lab.process import FailedError, LabProcess
 
 __all__ = ["DEDICATED", "ECHO", "REPLICA", "ROBOT", "Cluster"]
 
@@ -194,7 +194,7 @@ class Cluster:
         if ended.returncode:
             raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
 
-    def _start(self, what: str, arguments: Sequence[str]) -> Started:
+    def _start(self, what: str, arguments: Sequence[str]) -> LabProcess:
         return self._lab.start(ROBOT, what, arguments, self._environment)
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:

@@ -18,7 +18,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from peers.process import FailedError
 from plot import Panel, panel_of
 from preconditions import DATA, RefusedError, data_folder
 from report import Rounds, Target, progress
@@ -26,6 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
 from proxy.bridge.core.expander import MessageExpander

@@ -30,12 +30,12 @@ _HERE: Final = Path(__file__).resolve().parent
 sys.path.append(str(_HERE.parent / "experiments"))
 
 from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it lies with the experiments
-from peers.process import FailedError, figures_of  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
 
 from gdp.host.run_registry import RunRegistry  # noqa: E402
+from lab.process import FailedError, figures_of  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
 CASES: Final = {

@@ -18,7 +18,6 @@ from contextlib import ExitStack
 from typing import Final
 
 from numbered_flow import NumberedFlow
-from peers.process import until
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
@@ -29,6 +28,7 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 from internet.site import Site
+from lab.process import until
 
 TOPIC: Final = "flow"
 TARGET_MS: Final = 300.0

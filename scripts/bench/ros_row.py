@@ -33,7 +33,6 @@ from typing import Final, Literal
 
 from devices import add_address, add_bridge
 from machine import processor_s
-from peers.process import Started
 from ros_environment import BUFFER_BYTES, ros_environment
 from testbed import Lab, OverlayNodes
 from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
@@ -41,6 +40,7 @@ from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
+from lab.process import LabProcess
 from lab.topology import DomainPlan, Link, Topology
 from proxy.config.config import Encoding
 
@@ -143,11 +143,11 @@ class Row:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def node(self, side: str, module: str, role: str, *, direct: bool, **settings: object) -> Started:
+    def node(self, side: str, module: str, role: str, *, direct: bool, **settings: object) -> LabProcess:
         """Start a ROS node at A or B: ``python -m module role settings``."""
         return self.process(side, role, ["-m", module, role, json.dumps(settings)], direct=direct)
 
-    def process(self, side: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
+    def process(self, side: str, what: str, arguments: Sequence[str], *, direct: bool) -> LabProcess:
         """Start a Python process with a ROS node at A or B."""
         node = self._machines[side]
         environment = self._environment(node, DIRECT_DOMAIN if direct else _DOMAINS[side])

@@ -16,13 +16,13 @@ from typing import Final
 
 import skeleton
 from background_load import LOADS, SHARE, load_of
-from peers.process import FailedError, figures_of
 from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_row import BUFFER_BYTES, LEFT, READY_S, RIGHT, Carried, Row
 from skeleton import Options
 
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError, figures_of
 from proxy.config.config import Encoding
 
 __all__ = ["CORES", "DIRECT", "MEDIAN", "P99", "Bench", "Call", "Measured", "Options", "Turn", "main", "parse"]

@@ -28,7 +28,6 @@ from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
 from machine import MachineState, machine_state
-from peers.process import FailedError, until
 from preconditions import require_trust, require_writable
 from report import percentile, print_table, progress
 from skeleton import OUTPUT, clean_exit, command_line, new_run
@@ -38,6 +37,7 @@ from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
+from lab.process import FailedError, until
 
 TARGET_S: Final = 1.0  # target at the 99th percentile, from the signal to the last message
 HZ: Final = 100.0

@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Final
 
 from machine import ROOT, MachineState, machine_state
-from peers.process import FailedError
 from plot import Panel, require_plot, save_bars
 from preconditions import RefusedError, require_trust, require_writable
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run, RunRegistry
+from lab.process import FailedError
 
 OUTPUT: Final = ROOT / "docs" / "benchmarks"
 
@@ -163,7 +163,7 @@ def clean_exit() -> Iterator[None]:
     except RefusedError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    except (GdpError, FailedError) as error:
+    except GdpError as error:
         sys.exit(f"error: {error}")
 
 

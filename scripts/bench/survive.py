@@ -24,13 +24,13 @@ from typing import Final
 
 from faults.overlay import Overlay
 from faults.records import Kind, Record
-from peers.process import FailedError
 from report import Rounds, Spread, Target, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 from survive_rows import NEW_TOPICS, ROWS, Row
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 
 ROUNDS: Final = 30
 HZ: Final = 500.0
@@ -235,7 +235,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         progress(f"{name}: {row.what}, {rounds} times")
         try:
             targets += add(over, row, case, measure_row(runs, row, rounds, options))
-        except (GdpError, FailedError) as error:
+        except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")
     settings = {"events a row": options.rounds, "data plane": options.plane, "trouble": notes or "none"}

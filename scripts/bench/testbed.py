@@ -6,26 +6,28 @@ lab. ``run.end()`` removes namespaces and processes of a lab.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import yaml
-from peers.process import FailedError, Started
 from shared_memory import SharedMemory
 
-from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
 from lab.namespaces import Namespaces
+from lab.process import FailedError, LabProcess
 from lab.topology import Topology
 from ring.cores import MachineCores
 from ring.credentials import OverlayCredentials
+
+_BENCH: Final = Path(__file__).resolve().parent
 
 T = TypeVar("T")
 
@@ -62,13 +64,13 @@ class Lab:
 
     def inside(self, node: str, work: Callable[[], T]) -> T:
         """Call ``work`` in a machine's namespace."""
-        return netns_files.inside(self.namespaces.path(node), work)
+        return self.namespaces[node].inside(work)
 
     def command(self, node: str, argv: Sequence[str], environment: Sequence[str] = ()) -> list[str]:
         """Return the command line that runs ``argv`` on a machine; ``environment`` holds ``KEY=value``."""
         inner = ["env", *environment, *argv] if environment else list(argv)
         memory = self._memories.get(node)
-        return self.namespaces.command(node, memory.command(inner) if memory else inner)
+        return self.namespaces[node].command(memory.command(inner) if memory else inner)
 
     def start(
         self,
@@ -78,11 +80,11 @@ class Lab:
         environment: Sequence[str] = (),
         *,
         has_orders: bool = False,
-    ) -> Started:
+    ) -> LabProcess:
         """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
-
-        command = partial(self.command, node, environment=environment)
-        started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
+        argv = self.command(node, [sys.executable, *arguments], environment)
+        paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))}
+        started = LabProcess(self.run, f"{what} at {node}", argv, environment=paths, has_orders=has_orders)
         if self._cores is not None:
             self._cores.add(node, started.pid)
         return started

@@ -27,7 +27,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from peers.process import FailedError
 from plot import Panel, panel_of
 from preconditions import DATA, RefusedError
 from report import Rounds, Target, progress
@@ -42,6 +41,7 @@ from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError
 
 OURS: Final = "gdp"
 TCP: Final = "tcp"

@@ -21,7 +21,6 @@ from contextlib import ExitStack
 from typing import Final, Literal
 
 from numbered_flow import NumberedFlow
-from peers.process import until
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
@@ -30,6 +29,7 @@ from gdp.trust.right import Right
 from internet.access import Access
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
+from lab.process import until
 
 UPLINKS: Final = ("wlan0", "wwan0")
 TOPICS: Final[dict[str, Literal[1, 2]]] = {"one": 1, "two": 2}  # by the number of paths

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from peers.process import Started
 from ros_environment import ros_environment
 from testbed import Lab, OverlayNodes
 from topologies import flat_topology
@@ -31,6 +30,7 @@ from topologies import flat_topology
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
+from lab.process import LabProcess
 from lab.topology import Topology
 
 __all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
@@ -86,7 +86,7 @@ class Server:
         self._place = place
         self._config = config
         self._work = work
-        self._running: list[Started] = []
+        self._running: list[LabProcess] = []
 
     def begin(self) -> None:
         """Start both."""
@@ -125,7 +125,7 @@ class Server:
     def end(self) -> None:
         """End both; harmless where one is gone already."""
         for each in self._running:
-            each.__exit__(None, None, None)
+            each.close()
         self._running = []
 
     def _signal(self, number: int) -> None:
@@ -185,11 +185,11 @@ class Field:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> Started:
+    def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> LabProcess:
         """Start a client at the robot, or at a server: a role of ``program`` and its settings."""
         return self.process(place, role, [str(program), role, json.dumps(settings)])
 
-    def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
+    def process(self, node: str, what: str, arguments: Sequence[str]) -> LabProcess:
         """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""
         threads = ["OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]  # a machine here has one core
         environment = [*ros_environment(self._nodes.files, self._domain(node)), *threads]

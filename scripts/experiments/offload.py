@@ -15,6 +15,7 @@ import json
 import os
 import signal
 import statistics
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -24,12 +25,12 @@ from bench_path import ROOT
 from experiment import OUTPUT, Computed, Options, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
-from peers.process import Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
 from skeleton import new_run
 
 from gdp.host.cgroups import Cgroup
+from lab.process import LabProcess
 from lab.topology import ring5
 from proxy.config.config import Encoding
 from ring.cores import CORES_HELP, cores_of
@@ -163,8 +164,8 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
     with new_run() as run, ExitStack() as stack:
         started = []
         for number in range(robots):
-            argv = [_END, "alone", json.dumps({"task": name, "count": count})]
-            started.append(stack.enter_context(Started(run, f"robot {number}", list, argv)))
+            argv = [sys.executable, _END, "alone", json.dumps({"task": name, "count": count})]
+            started.append(stack.enter_context(LabProcess(run, f"robot {number}", argv)))
         for number, robot in enumerate(started):
             robot.read(_ROBOTS_READY_S)
             if cores < 1:

@@ -17,13 +17,13 @@ from typing import Final
 
 import bench_path  # noqa: F401 - finds the stage
 from image_request import TYPE
-from peers.process import Started
 from pyroute2 import IPRoute
 from recovery_stage import ROBOT, Cluster
 
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import MACHINE_DEVICE, UP
 from gdp.host import netns_files
+from lab.process import LabProcess
 
 __all__ = ["SERVICE", "TagCluster"]
 
@@ -65,7 +65,7 @@ class TagCluster(Cluster):
         ]
         super().__init__(launch_files, replicas * len(services), gateway)
 
-    def client(self, place: str, role: str, **settings: object) -> Started:
+    def client(self, place: str, role: str, **settings: object) -> LabProcess:
         """Start a client at the robot: a role of ``robot.py`` and its settings."""
         return self._lab.start(place, role, [str(_HERE / "robot.py"), role, json.dumps(settings)], self._environment)
 

@@ -9,6 +9,7 @@ import asyncio
 import json
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -19,18 +20,13 @@ from rich.markup import escape
 from fog_demo.display import Display
 from fog_demo.environment import Environment, end_all_of, standing_runs, sweep
 from fog_demo.scenario import Outcome, Pace, run_scenario
-from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run
-from ring.child import ChildError
+from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 
 __all__ = ["main"]
 
-_PASSED: Final = 0
-_FAILED: Final = 1
-_WRONG_INPUT: Final = 2
 _PACE: Final = Pace()
-_WIDE: Final = 160  # columns without a terminal
 
 _EXAMPLES: Final = """\b
 Examples:
@@ -39,7 +35,7 @@ Examples:
   sudo scripts/fog_demo.sh --json > outcome.json
 """
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog=_EXAMPLES)
@@ -56,23 +52,7 @@ def demo(
     takes about a minute; the last line says how many of the requests failed. Everything is gone afterwards, also after
     Ctrl-C; what a killed demonstration left, the next one takes down.
     """
-    console = Console(stderr=as_json)
-    if not console.is_terminal:
-        console = Console(stderr=as_json, width=_WIDE)
-    errors = Console(stderr=True, highlight=False, soft_wrap=True)
-    try:
-        runs = standing_runs("demo")
-        for swept in sweep(runs):
-            errors.print(f"took down what run {swept} had left behind")
-        run = runs.start()
-        code = _run(run, launch_file.absolute(), Pace(rate, calm, notice), console, as_json=as_json)
-    except ChildError as error:
-        errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}")
-        code = _FAILED
-    except GdpError as error:
-        errors.print(escape(str(error)))
-        code = _WRONG_INPUT
-    raise typer.Exit(code)
+    exit_with(partial(_run, launch_file.absolute(), Pace(rate, calm, notice), console_of(stderr=as_json), as_json))
 
 
 def main() -> None:
@@ -80,8 +60,12 @@ def main() -> None:
     app(prog_name="fog_demo.sh")
 
 
-def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: bool) -> int:
+def _run(launch_file: Path, pace: Pace, console: Console, as_json: bool) -> int:
     """Run the scenario, and take down everything."""
+    runs = standing_runs("demo")
+    for swept in sweep(runs):
+        print(f"took down what run {swept} had left behind", file=sys.stderr)
+    run = runs.start()
     try:
         outcome = asyncio.run(interruptible(_play(run, launch_file, pace, console)))
     except Interrupted as interrupted:
@@ -92,7 +76,7 @@ def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: 
         console.print("[dim]giving machines back, taking the ring down[/dim]")
         end_all_of(run)
     _tell(outcome, console, as_json=as_json)
-    return _FAILED if outcome.counts.failed or not outcome.counts.requests else _PASSED
+    return FAILED if outcome.counts.failed or not outcome.counts.requests else PASSED
 
 
 async def _play(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome:

@@ -9,16 +9,15 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final
 
 from rich.console import Console, Group, RenderableType
-from rich.live import Live
 from rich.text import Text
 
 from fog.cli.views import event_line, machine_fields, machines_table, stage
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Entry
+from lab.command import StepDisplay
 
 __all__ = ["Counts", "Display"]
 
@@ -53,28 +52,12 @@ class Counts:
         return Text.assemble(failed, rest)
 
 
-class Display:
-    """Display of steps, machines, events and counts; a context manager."""
+class Display(StepDisplay):
+    """Display of steps, machines, events and counts."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._begun_s = time.monotonic()
-        self._reported_s = self._begun_s
+        super().__init__(console, is_kept=True, plain_every_s=_PLAIN_EVERY_S)
         self._events: deque[Entry] = deque(maxlen=_EVENTS)
-        self._live = Live(console=console, auto_refresh=False, transient=False) if console.is_terminal else None
-
-    def __enter__(self) -> Display:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def step(self, text: str) -> None:
-        """Show the present step."""
-        self._console.print(
-            f"[dim]{time.monotonic() - self._begun_s:5.1f} s[/dim]  [bold]{text}[/bold]", highlight=False
-        )
 
     def happened(self, entries: Sequence[Entry]) -> None:
         """Add new events of the journal."""
@@ -85,14 +68,8 @@ class Display:
 
     def show(self, machines: Sequence[Record], counts: Counts) -> None:
         """Show the present state; plain lines appear every few seconds."""
-        if self._live is not None:
-            if not self._live.is_started:
-                self._live.start()
-            self._live.update(self._page(machines, counts), refresh=True)
-        elif time.monotonic() - self._reported_s >= _PLAIN_EVERY_S:
-            self._reported_s = time.monotonic()
-            there = ", ".join(f"{each.name} {each.spec.offer.region} {stage(each)}" for each in machines)
-            self._console.print(Text("         ") + counts.line() + Text(f"   machines: {there}"), soft_wrap=True)
+        there = ", ".join(f"{each.name} {each.spec.offer.region} {stage(each)}" for each in machines)
+        self._show(self._page(machines, counts), counts.line() + Text(f"   machines: {there}"))
 
     def _page(self, machines: Sequence[Record], counts: Counts) -> RenderableType:
         now_s = time.time()

@@ -23,11 +23,11 @@ import yaml
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from gdp.stores.keyring import DELEGATIONS
+from lab.child import Child
+from lab.children import Children
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5
-from ring.child import Child
-from ring.children import Children
 from ring.credentials import OverlayCredentials
 
 __all__ = ["ENVIRONMENT", "SITE", "STATE", "Environment", "end_all_of", "fog_command", "standing_runs", "sweep"]
@@ -91,7 +91,7 @@ class Environment:
         """Run a command of ``fog`` on the host of the far switch until it ends.
 
         Raises:
-            ChildError: it failed; the text has its last output.
+            FailedError: it failed; the text has its last output.
         """
         argv = fog_command(self._run, words)
         child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)
@@ -108,13 +108,14 @@ class Environment:
 
     def _write_proxy(self) -> Path:
         """Write the robot's ``proxy.yaml``, without a rule: ``fog`` adds them."""
-        keys = self._keys("proxy", ROBOT)
-        (keys / DELEGATIONS).mkdir(mode=0o700, exist_ok=True)
+        credentials = self._materials.of_proxy(ROBOT)
+        delegations = credentials.identity / DELEGATIONS
+        delegations.mkdir(mode=0o700, exist_ok=True)
         (at,) = (each for each in self._topology.attached("proxy") if each.switch == ROBOT)
         content = {
-            **self._who(keys),
+            **credentials.to_yaml(),
             "iface": at.ifname,
-            "delegations": str(keys / DELEGATIONS),
+            "delegations": str(delegations),
             "ros": {"endpoint": "ros2", "domain": _DOMAIN},
         }
         return self._write("proxy.yaml", content)
@@ -139,15 +140,6 @@ class Environment:
             "uplink": uplink,
         }
         self._write(SITE, content)
-
-    def _who(self, keys: Path) -> dict[str, object]:
-        if not (keys / CARD).exists():
-            raise LocalError(f"{keys}: not admitted")
-        root = self._run.directory / "domains" / "ring" / ROOT_CERTIFICATE
-        return {"identity": str(keys), "domain": {"root": str(root)}}
-
-    def _keys(self, role: str, node: str) -> Path:
-        return self._run.directory / "nodes" / f"{role}-{node}"
 
     def _write(self, name: str, content: Mapping[str, object]) -> Path:
         path = self._run.directory / name

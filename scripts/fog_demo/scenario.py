@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -22,9 +23,9 @@ from fog.supervisor.journal import Entry, Journal
 from fog_demo.display import Counts, Display
 from fog_demo.environment import Environment
 from gdp.errors import LocalError
-from ring.child import Child
-from ring.children import cancel
-from ring.events import Event
+from lab.child import Child
+from lab.children import cancel
+from lab.events import Event
 
 __all__ = ["Outcome", "Pace", "run_scenario"]
 
@@ -132,7 +133,7 @@ async def run_scenario(environment: Environment, launch_file: Path, pace: Pace, 
             try:
                 steps_s = await environment.children.guarded(_befall(site, looking, pace, display))
                 display.step("that was all; the robot's node makes no further request")
-                caller.go()
+                caller.send(signal.SIGUSR1)
                 await asyncio.wait_for(heard, _END_S)
             finally:
                 await cancel(heard)

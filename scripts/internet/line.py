@@ -1,28 +1,29 @@
 """Delay line of a site's uplink: a process that passes frames between two devices after a delay with jitter.
 
-I/O; two AF_PACKET sockets. Run as ``python -m internet.line DEVICE DEVICE``. Each line on its standard input holds a
-delay and a jitter in milliseconds; it ends with its input. It replaces netem, which not every kernel has. Frames pass
-with their offload header, so that a large segment of TCP costs no more than a small one, and no checksum is lost.
+I/O; two AF_PACKET sockets. Run as ``python -m internet.line DEVICE DEVICE``. Each line on its standard input is a
+JSON object with delay and jitter in milliseconds; it ends with its input. It replaces netem, which not every kernel
+has. Frames pass with their offload header, so that a large segment of TCP costs no more than a small one, and no
+checksum is lost.
 Source: packet(7), PACKET_VNET_HDR; Linux, include/uapi/linux/if_packet.h, for the numbers.
 """
 
 from __future__ import annotations
 
 import ctypes
+import json
 import logging
 import os
 import random
 import select
 import socket
-import subprocess
 import sys
 import time
 from typing import Final
 
 from fog.providers.local.delay import DelayLine
-from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from internet.space import Space
+from lab.process import FailedError, LabProcess
 
 __all__ = ["LineProcess", "main"]
 
@@ -35,43 +36,27 @@ _FRAME_BYTES: Final = (1 << 16) + 64
 _BATCH: Final = 32
 _MS_NS: Final = 1_000_000
 _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
-_READY: Final = b"ready\n"
 
 
-class LineProcess:
+class LineProcess(LabProcess):
     """A running delay line between two devices of a namespace; it starts without delay.
 
     Raises:
-        LocalError: it does not start.
+        FailedError: it does not start.
     """
 
     def __init__(self, run: Run, space: Space, one: str, other: str) -> None:
-        argv = [sys.executable, "-m", "internet.line", one, other]
-        self._process = subprocess.Popen(
-            space.command(argv), stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
-        )
-        run.note_process(self._process.pid)
+        argv = space.command([sys.executable, "-m", "internet.line", one, other])
+        super().__init__(run, f"line {space.path.name}", argv, has_orders=True)
         try:
             self.set_delay(0.0)
-        except LocalError:
+        except FailedError:
             self.close()
             raise
 
     def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
-        """Delay frames that arrive from now on."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        try:
-            self._process.stdin.write(f"{ms} {jitter_ms}\n".encode())
-            answer = self._process.stdout.readline()
-        except BrokenPipeError as error:
-            raise LocalError("the delay line has ended") from error
-        if answer != _READY:
-            raise LocalError("the delay line has ended")
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
+        """Delay frames that arrive from now on. Raises ``FailedError``: the process has ended."""
+        self.ask(ms=ms, jitter_ms=jitter_ms)
 
 
 class _Delay:
@@ -112,11 +97,11 @@ def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
             if source in ready:
                 _receive(source, side, line, delay)
         if control in ready:
-            words = os.read(control, 1 << 10).split()
-            if not words:
+            order = os.read(control, 1 << 10)
+            if not order:
                 return
-            delay.delay_ns, delay.jitter_ns = (round(float(word) * _MS_NS) for word in words[-2:])
-            os.write(sys.stdout.fileno(), _READY)
+            delay.delay_ns, delay.jitter_ns = (round(ms * _MS_NS) for ms in json.loads(order).values())
+            os.write(sys.stdout.fileno(), b"{}\n")
         for side, frame in line.poll_frames(time.monotonic_ns()):
             try:
                 sides[side].send(frame)

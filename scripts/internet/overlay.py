@@ -6,10 +6,6 @@ I/O. The run's directory holds a folder for each node, with its keys, its config
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import subprocess
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -20,29 +16,28 @@ import yaml
 import gdp
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
-from gdp.errors import LocalError
-from gdp.host.processes import Process, end_all
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.management.control_client import ask_node, find_control_socket
-from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from internet.host import Host
 from internet.laboratory import Laboratory
+from lab.process import LabProcess, end_processes
+from lab.rights import grant
 
 __all__ = ["LISTEN", "Overlay"]
 
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0
+_START_S: Final = 60.0
 _ATTACH_S: Final = 60.0
 _RELAY: Final = "relay"
 _TLS_PORT: Final = 443
 _NODE: Final = "node"
 _RIB: Final = "rib"
-_SCRIPTS: Final = Path(__file__).resolve().parent.parent
 Yaml = Mapping[str, object]
 
 
@@ -57,7 +52,7 @@ class Overlay:
         self.folder = laboratory.run.directory
         self._laboratory = laboratory
         self._domain, self._owner = self.folder / "domain", self.folder / "owner"
-        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._processes: dict[str, LabProcess] = {}
         self._labels: dict[str, str] = {}  # of switches, by name
         make_domain(self._domain, "field")
         make_owner(self._owner)
@@ -122,7 +117,7 @@ class Overlay:
         """Start the switches and relays of these hosts; return when all are ready.
 
         Raises:
-            LocalError: one does not start.
+            FailedError: one does not start.
         """
         self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
         relays = {f"{host.label}-{_RELAY}": host for host in hosts}
@@ -141,26 +136,19 @@ class Overlay:
 
     def end(self, *labels: str) -> None:
         """End the switches of these hosts, or the RIB, at once."""
-        ending = [self._processes.pop(label) for label in labels]
-        end_all([Process.from_pid(each.pid) for each in ending if each.poll() is None], _PATIENCE_S)
-        for process in ending:
-            process.communicate()
+        end_processes([self._processes.pop(label) for label in labels], _PATIENCE_S)
 
     def kill_border(self, border: Host) -> None:
         """Kill a border's switch, its RIB and its relay; ``start`` and ``start_rib`` bring them back."""
         labels = {border.label, f"{border.label}-{_RELAY}", _RIB} & self._processes.keys()
         for process in [self._processes.pop(label) for label in labels]:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+            process.kill_group()
 
     def add_node(self, host: Host, rights: Mapping[str, Collection[Right]]) -> Path:
         """Make the keys of the host's node, with rights on names; return its directory."""
         node = self.folder / f"{host.label}-{_NODE}"
         make_node(node, Role.PROXY, node.name, self._domain)
-        for name, given in rights.items():
-            kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-            metadata = Metadata({"kind": kind, "name": name})
-            install_delegation(node, delegate(self._owner, node / CARD, metadata, list(given)))
+        grant(self._owner, node, rights)
         return node
 
     def open_session(self, host: Host, node: Path, lease_s: float | None = None) -> gdp.Session:
@@ -216,23 +204,9 @@ class Overlay:
         return {"root": str(self._domain / ROOT_CERTIFICATE)}
 
     def _start(self, commands: Mapping[str, tuple[Host, str, Path]]) -> None:
-        paths = os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))
         for label, (host, module, config) in commands.items():
-            argv = [sys.executable, "-m", module, "--json", "--config", str(config)]
-            with (self.folder / f"{label}.log").open("ab") as log:
-                process = self._processes[label] = subprocess.Popen(
-                    host.command(argv),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    text=True,
-                    env={**os.environ, "PYTHONPATH": paths},
-                    start_new_session=True,
-                )
-            self._laboratory.run.note_process(process.pid)
+            argv = host.command([sys.executable, "-m", module, "--json", "--config", str(config)])
+            self._processes[label] = LabProcess(self._laboratory.run, label, argv)
         for label in commands:
-            stdout = self._processes[label].stdout
-            assert stdout is not None
-            line = stdout.readline()
-            if not line or json.loads(line).get("event") != "ready":
-                raise LocalError(f"{label} does not start: {line}{self.log(label)[-2_000:]}")
+            if self._processes[label].read(_START_S).get("event") != "ready":
+                raise self._processes[label].failed("does not start")

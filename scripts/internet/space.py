@@ -1,21 +1,19 @@
 """Network namespace of a laboratory: commands of ip(8), nft(8) and conntrack(8) inside it.
 
-I/O; needs CAP_NET_ADMIN. The run's record names each namespace before it is made.
+I/O; needs CAP_NET_ADMIN.
 """
 
 from __future__ import annotations
 
-import contextlib
-import select
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from gdp.errors import LocalError
-from gdp.host import netns_files
-from gdp.host.run_registry import Run, in_first_user_namespace
-from gdp.ports.rtnetlink import LinkMonitor
+from gdp.host.run_registry import Run
+from lab.namespace import Namespace, wait_for_carrier
 
 __all__ = ["TOOLS", "Space"]
 
@@ -33,12 +31,9 @@ _SETTINGS: Final = {  # no address waits for duplicate detection, and none is lo
 }
 _FORWARDING: Final = {"ipv4/ip_forward": 1, "ipv6/conf/all/forwarding": 1}
 _NO_BRIDGE_RULES: Final = {"bridge/bridge-nf-call-iptables": 0, "bridge/bridge-nf-call-ip6tables": 0}
-_PATIENCE_S: Final = 10.0
-
-T = TypeVar("T")
 
 
-class Space:
+class Space(Namespace):
     """A namespace of a run, whose loopback is up.
 
     Args:
@@ -50,22 +45,11 @@ class Space:
     """
 
     def __init__(self, run: Run, label: str, *, forwards: bool = False) -> None:
-        folder = netns_files.IP_NETNS_DIRECTORY if in_first_user_namespace() else run.directory / "netns"
-        self.path = folder / f"gdp-{run.id}-{label}"
-        run.plan_namespace(self.path)
-        netns_files.create(self.path)
+        super().__init__(run, label)
         self.set(_SETTINGS | (_FORWARDING if forwards else {}))
         if (_NET / "bridge").exists():  # else br_netfilter is not loaded, and bridged packets meet no rule
             self.set(_NO_BRIDGE_RULES)
         self.ip(["link set lo up"])
-
-    def inside(self, work: Callable[[], T]) -> T:
-        """Call ``work`` in a thread inside, and return its result; a socket made there stays there."""
-        return netns_files.inside(self.path, work)
-
-    def command(self, argv: Sequence[str]) -> list[str]:
-        """Return the command line that runs ``argv`` inside; the kernel kills it with the thread that starts it."""
-        return ["nsenter", f"--net={self.path}", "--", "setpriv", "--pdeathsig", "KILL", "--", *argv]
 
     def ip(self, lines: Iterable[str]) -> None:
         """Execute commands of ip(8), each without the word ``ip``. Raises ``LocalError``: one is refused."""
@@ -77,15 +61,7 @@ class Space:
 
     def wait_for_carrier(self, *devices: str) -> None:
         """Return when these devices can send. Raises ``LocalError``: they do not get so far."""
-
-        def wait() -> None:
-            with contextlib.closing(LinkMonitor()) as monitor:
-                while not all(link is not None and link.up for link in map(monitor.get, devices)):
-                    if not select.select([monitor], [], [], _PATIENCE_S)[0]:
-                        raise LocalError(f"{self.path.name}: no carrier at {', '.join(devices)}")
-                    monitor.poll()
-
-        self.inside(wait)
+        self.inside(partial(wait_for_carrier, *devices))
 
     def flush_connections(self) -> None:
         """Forget the connections that the namespace tracks, and with them their NAT mappings."""

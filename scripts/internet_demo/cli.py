@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Final
@@ -20,7 +21,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from gdp.errors import GdpError, LocalError
+from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import RunRegistry, outer_uid
 from internet.laboratory import Laboratory
@@ -28,14 +29,11 @@ from internet.space import TOOLS
 from internet_demo.display import Display
 from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Outcome, Pace, run_scenario
+from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 
 __all__ = ["app", "main"]
 
-_PASSED: Final = 0
-_FAILED: Final = 1
-_WRONG_INPUT: Final = 2
 _PACE: Final = Pace()
-_WIDE: Final = 160  # columns without a terminal
 
 _EXAMPLES: Final = """\b
 Examples:
@@ -45,7 +43,7 @@ Examples:
   sudo scripts/internet_demo.sh --json > outcome.json
 """
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = new_app()
 
 
 class _Ended(Exception):  # noqa: N818  (not an error)
@@ -67,19 +65,8 @@ def demo(
     images and calls cross. It takes about a minute; the last line says how many of them were lost. Everything is gone
     afterwards, also after Ctrl-C; what a killed demonstration left, the next one removes.
     """
-    console = Console(stderr=as_json)
-    if not console.is_terminal:
-        console = Console(stderr=as_json, width=_WIDE)
-    errors = Console(stderr=True, highlight=False, soft_wrap=True)
-    try:
-        code = _run(run_figure1 if figure1 else run_scenario, Pace(rate, size, calm, delay), console, as_json=as_json)
-    except _Ended as ended:
-        console.print("interrupted")
-        code = 128 + int(ended.args[0])
-    except GdpError as error:
-        errors.print(escape(str(error)))
-        code = _WRONG_INPUT
-    raise typer.Exit(code)
+    play, pace = run_figure1 if figure1 else run_scenario, Pace(rate, size, calm, delay)
+    exit_with(partial(_run, play, pace, console_of(stderr=as_json), as_json))
 
 
 def main() -> None:
@@ -87,23 +74,26 @@ def main() -> None:
     app(prog_name="internet_demo.sh")
 
 
-def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, console: Console, *, as_json: bool) -> int:
+def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, console: Console, as_json: bool) -> int:
     if missing := [tool for tool in TOOLS if shutil.which(tool) is None]:
         raise LocalError(f"not installed: {', '.join(missing)} (packages iproute2, nftables, conntrack)")
     runs = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
     for swept in runs.sweep():
         console.print(f"removed what run {swept} had left behind")
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(each, _end)
     run = runs.start()
     try:
+        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(each, _end)
         with Laboratory(run) as laboratory, Display(console) as display:
             outcome = play(laboratory, pace, display)
+    except _Ended as ended:
+        console.print("interrupted")
+        return 128 + int(ended.args[0])
     finally:
         let_nothing_interrupt()
         run.end()
     _tell(outcome, console, as_json=as_json)
-    return _FAILED if outcome.lost or outcome.doubled or not outcome.images else _PASSED
+    return FAILED if outcome.lost or outcome.doubled or not outcome.images else PASSED
 
 
 def _end(number: int, frame: FrameType | None) -> None:

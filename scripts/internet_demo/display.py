@@ -5,18 +5,16 @@ I/O; prints.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from types import TracebackType
 from typing import Final
 
 from rich.console import Console, Group, RenderableType
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from internet_demo.stage import Link, Machine
 from internet_demo.traffic import Traffic
+from lab.command import StepDisplay
 
 __all__ = ["Display"]
 
@@ -24,37 +22,16 @@ _PLAIN_EVERY_S: Final = 2.5
 _WAYS: Final = (("direct", True), ("border", False))
 
 
-class Display:
-    """Display of steps, machines and counts; a context manager."""
+class Display(StepDisplay):
+    """Display of steps, machines and counts."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._begun_s = self._reported_s = time.monotonic()
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-
-    def __enter__(self) -> Display:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def step(self, text: str) -> None:
-        """Show the present step."""
-        elapsed_s = time.monotonic() - self._begun_s
-        line = Text.assemble((f"{elapsed_s:5.1f} s  ", "dim"), (text, "bold"))
-        self._console.print(line, highlight=False, soft_wrap=True)
+        super().__init__(console, is_kept=False, plain_every_s=_PLAIN_EVERY_S)
 
     def show(self, machines: Iterable[Machine], links: Mapping[str, Sequence[Link]], traffic: Traffic) -> None:
         """Show the present state; plain lines appear every few seconds."""
         counts = _counts(traffic)
-        if self._live is not None:
-            if not self._live.is_started:
-                self._live.start()
-            self._live.update(_page(machines, links, counts), refresh=True)
-        elif time.monotonic() - self._reported_s >= _PLAIN_EVERY_S:
-            self._reported_s = time.monotonic()
-            self._console.print(Text(f"         {counts}; {_ways(links.get('robot', ()))}"), soft_wrap=True)
+        self._show(_page(machines, links, counts), Text(f"{counts}; {_ways(links.get('robot', ()))}"))
 
 
 def _counts(traffic: Traffic) -> str:

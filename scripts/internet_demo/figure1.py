@@ -9,11 +9,8 @@ I/O; each machine runs its own proxy. ::
 
 from __future__ import annotations
 
-import json
 import signal
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +18,6 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from gdp.errors import LocalError
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from internet.access import Access
@@ -97,22 +93,15 @@ class _Node:
     """A talker or a listener of one topic."""
 
     def __init__(self, stage: _Stage, host: Host, *words: str) -> None:
-        self.process = stage.start_program(host, [sys.executable, "-m", *words], subprocess.PIPE)
+        self.process = stage.start_program(host, [sys.executable, "-m", *words], heard=True)
 
     def wait_for(self, event: str, is_met: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
-        """Return the next event of this name for which ``is_met``, after a minute any. Raises ``LocalError``: none."""
-        assert self.process.stdout is not None
+        """Return the next event of this name for which ``is_met``, after a minute any. Raises ``FailedError``: none."""
         deadline_s = time.monotonic() + _PATIENCE_S
-        end = threading.Timer(2 * _PATIENCE_S, self.process.kill)  # of a node that says nothing
-        end.start()
-        try:
-            for line in self.process.stdout:
-                said: dict[str, Any] = json.loads(line)
-                if said["event"] == event and (is_met(said) or time.monotonic() > deadline_s):
-                    return said
-        finally:
-            end.cancel()
-        raise LocalError(f"a ROS node of the figure did not say {event!r}")
+        while True:
+            said: dict[str, Any] = self.process.read(deadline_s + _PATIENCE_S - time.monotonic())
+            if said["event"] == event and (is_met(said) or time.monotonic() > deadline_s):
+                return said
 
 
 def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
@@ -143,7 +132,7 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
         outcome.drawing = stage.drawing("before")
         display.step("/images and /commands cross")
         for talker, _ in nodes.values():
-            talker.process.send_signal(signal.SIGUSR1)
+            talker.process.send(signal.SIGUSR1)
         time.sleep(pace.calm_s)
         display.step("the drone flies from the enterprise network to the university network")
         stage.drone.attach(university)
@@ -170,7 +159,7 @@ def _count(outcome: Outcome, topic: str, talker: _Node, listener: _Node) -> None
     """Wait until all messages have arrived, or for a minute, and count those that did as they were."""
     sent = talker.wait_for("done")["sent"]
     listener.wait_for("progress", lambda said: said["topics"][0]["received"] >= len(sent))
-    listener.process.send_signal(signal.SIGINT)
+    listener.process.send(signal.SIGINT)
     (report,) = listener.wait_for("done")["topics"]
     heard = report["heard"]
     lost, pause_s = len(set(sent) - set(heard)), (report["silent_ms"] or 0.0) / 1e3

@@ -14,12 +14,11 @@ environment of ROS is left out: sessions of this process take its place, with it
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -29,17 +28,17 @@ from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import LISTEN_PORT
 from gdp.enrolment.programs import programs_of
 from gdp.errors import GdpError, LocalError
-from gdp.host.processes import Process, end_all
 from gdp.management.control_client import ask_node, find_control_socket
-from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
-from gdp.stores.issue import delegate, install_delegation, make_owner
+from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, load_card
 from gdp.trust.right import Right
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
+from lab.process import LabProcess, end_processes, python_environment, until
+from lab.rights import grant
 
 __all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
 
@@ -47,10 +46,8 @@ WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"
 _DOMAIN: Final = "lab"
 _PATIENCE_S: Final = 60.0
-_LOOK_S: Final = 0.2
 _STATUS_S: Final = 2.0
 _SHOWN: Final = 40  # characters of a word
-_SCRIPTS: Final = Path(__file__).resolve().parent.parent
 _StageT = TypeVar("_StageT", bound="Stage")
 
 
@@ -92,7 +89,7 @@ class Stage:
         self._laboratory = laboratory
         self._folder = laboratory.run.directory
         self._delay_ms = delay_ms
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[LabProcess] = []
         self.machines: dict[str, Machine] = {}
         self.typed: list[str] = []
         self.environments: dict[str, Mapping[str, str]] = {}
@@ -111,9 +108,7 @@ class Stage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        end_all([Process.from_pid(each.pid) for each in self._processes if each.poll() is None], _PATIENCE_S / 6)
-        for process in self._processes:
-            process.wait()
+        end_processes(self._processes, _PATIENCE_S / 6)
 
     def add_site(self, label: str, access: Access) -> Site:
         """Attach one more network."""
@@ -154,12 +149,9 @@ class Stage:
                     self.start_program(host, program.argv)
 
     def wait_until_joined(self) -> None:
-        """Return when each machine has a tunnel to the border. Raises ``LocalError``: one has none in time."""
-        deadline_s = time.monotonic() + _PATIENCE_S
-        while waiting := [label for label, each in self.machines.items() if not self.links(each)]:
-            if time.monotonic() > deadline_s:
-                raise LocalError(f"no tunnel at {', '.join(waiting)}: {self.log(waiting[0])[-2_000:]}")
-            time.sleep(_LOOK_S)
+        """Return when each machine has a tunnel to the border. Raises ``FailedError``: one has none in time."""
+        for label, machine in self.machines.items():
+            until(partial(self.links, machine), partial(self._missing_tunnel, label), _PATIENCE_S)
 
     def links(self, machine: Machine) -> list[Link]:
         """Return the tunnels of a machine that are up; none while its switch starts."""
@@ -183,11 +175,7 @@ class Stage:
         owner = self._folder / "owner"
         make_owner(owner)
         for label, names in rights.items():
-            node = self.machines[label].directory / "proxy"
-            for name, given in names.items():
-                kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-                metadata = Metadata({"kind": kind, "name": name})
-                install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))
+            grant(owner, self.machines[label].directory / "proxy", names)
 
     def open_session(self, machine: Machine) -> gdp.Session:
         """Open a session of this process on a machine."""
@@ -196,6 +184,9 @@ class Stage:
     def log(self, label: str) -> str:
         """Return what the programs of a machine have logged."""
         return (self._folder / f"{label}.log").read_text(encoding="utf-8", errors="replace")
+
+    def _missing_tunnel(self, label: str) -> str:
+        return f"{self.log(label)[-2_000:]}\na tunnel at {label}"
 
     def _directory(self, host: Host) -> Path:
         return self._folder / host.label
@@ -214,26 +205,15 @@ class Stage:
 
     def _run(self, host: Host, *words: str) -> str:
         argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
-        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=self._environment(host))
+        environment = python_environment(self.environments.get(host.label, {}))
+        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=environment)
         if done.returncode:
             raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
         return done.stdout
 
-    def start_program(self, host: Host, argv: Sequence[str], output: int | None = None) -> subprocess.Popen[bytes]:
-        """Start a program of a machine; without ``output`` it goes to the machine's log, as its errors do."""
-        with (self._folder / f"{host.label}.log").open("ab") as log:
-            process = subprocess.Popen(
-                host.command(argv),
-                stdin=subprocess.DEVNULL,
-                stdout=log if output is None else output,
-                stderr=log,
-                env=self._environment(host),
-                start_new_session=True,
-            )
+    def start_program(self, host: Host, argv: Sequence[str], *, heard: bool = False) -> LabProcess:
+        """Start a program of a machine; what is not heard goes to the machine's log, as its errors do."""
+        environment = self.environments.get(host.label)
+        process = LabProcess(self._laboratory.run, host.label, host.command(argv), environment=environment, heard=heard)
         self._processes.append(process)
-        self._laboratory.run.note_process(process.pid)
         return process
-
-    def _environment(self, host: Host) -> dict[str, str]:
-        path = os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))
-        return {**os.environ, "PYTHONPATH": path, **self.environments.get(host.label, {})}

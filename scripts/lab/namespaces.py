@@ -10,14 +10,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
-from gdp.host.run_registry import Run, in_first_user_namespace
+from gdp.host.run_registry import Run
+from lab.namespace import Namespace
 from lab.topology import Link, Topology
 
 __all__ = ["Namespaces"]
@@ -38,30 +38,16 @@ class Namespaces:
     def __init__(self, topology: Topology, run: Run) -> None:
         self.topology = topology
         self._plugged = 0
-        if in_first_user_namespace():
-            self._paths = {node: netns_files.IP_NETNS_DIRECTORY / f"gdp-{run.id}-{node}" for node in topology.nodes}
-        else:
-            self._paths = {node: run.directory / "netns" / f"gdp-{run.id}-{node}" for node in topology.nodes}
-        for path in self._paths.values():
-            run.plan_namespace(path)
-            netns_files.create(path)
-            netns_files.inside(path, netns_files.disable_ipv6)
+        self._namespaces = {node: Namespace(run, node) for node in topology.nodes}
+        for namespace in self._namespaces.values():
+            namespace.inside(netns_files.disable_ipv6)
         self._join()
         for node in topology.nodes:
             self._inside(node, partial(_raise, [link.other(node) for link in topology.links_of(node)]))
 
-    def path(self, node: str) -> Path:
-        """Return the file that holds the namespace of a switch."""
-        return self._paths[node]
-
-    def command(self, node: str, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
-        """Return the command line that runs ``argv`` in the namespace of a switch, under the same process id.
-
-        Args:
-            dies_with_us: whether the kernel kills it when the thread that starts it ends in any way.
-        """
-        leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
-        return ["nsenter", f"--net={self._paths[node]}", "--", *leash, *argv]
+    def __getitem__(self, node: str) -> Namespace:
+        """Return the namespace of a switch."""
+        return self._namespaces[node]
 
     def cut(self, a: str, b: str) -> None:
         """Take the link between two switches down; both ends lose their carrier at once."""
@@ -75,7 +61,7 @@ class Namespaces:
         """Connect device ``ifname`` in one switch's namespace to a new ``ifname-s`` in another's, or its own."""
         self._plugged += 1
         mtu = max(link.mtu for link in self.topology.links)
-        far = os.open(self._paths[switch], os.O_RDONLY | os.O_CLOEXEC)
+        far = os.open(self[switch].path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             self._inside(home, partial(_plug, ifname, mtu, _PLUG_FROM + self._plugged, far))
         finally:
@@ -93,7 +79,7 @@ class Namespaces:
 
     def _join(self) -> None:
         number = {node: index for index, node in enumerate(self.topology.nodes, 1)}
-        files = {node: os.open(path, os.O_RDONLY | os.O_CLOEXEC) for node, path in self._paths.items()}
+        files = {node: os.open(each.path, os.O_RDONLY | os.O_CLOEXEC) for node, each in self._namespaces.items()}
         try:
             # The request may come from any namespace; in one of ours, no device name of the machine can clash.
             self._inside(self.topology.nodes[0], partial(_add, self.topology.links, number, files))
@@ -108,7 +94,7 @@ class Namespaces:
                 work(ipr)
 
         try:
-            netns_files.inside(self._paths[node], ask)
+            self[node].inside(ask)
         except Exception as error:  # pyroute2 raises NetlinkError, which is not an OSError
             raise LocalError(f"namespace of {node}: {error}") from error
 

@@ -36,7 +36,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["Popen", "Zygote", "install"]
+__all__ = ["Popen", "Zygote", "install", "run_command"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PRELOADED: Final = (
@@ -200,6 +200,13 @@ def install() -> None:
     if Popen.zygote is None:
         Popen.zygote = Zygote.start()
         subprocess.Popen = Popen  # type: ignore[misc]
+
+
+def run_command(module: str) -> None:
+    """Run a module's ``main`` in this process. No resource exists while it is imported: Ctrl-C then ends directly."""
+    signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    install()
+    importlib.import_module(module).main()
 
 
 class Popen(subprocess.Popen):  # type: ignore[type-arg]

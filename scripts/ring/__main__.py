@@ -1,16 +1,6 @@
-"""Module entry ``python -m ring``.
-
-I/O. Importing takes half a second, in which nothing is created yet: Ctrl-C then simply ends the process.
-"""
-
-import os
-import signal
+"""Entry point of ``python -m ring``."""
 
 from lab import zygote
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
-    zygote.install()
-    from ring.cli import main
-
-    main()
+    zygote.run_command("ring.cli")

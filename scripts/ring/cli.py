@@ -18,13 +18,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from gdp.errors import GdpError, LocalError
+from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.limits import ADVERTISEMENT_LEASE_S
+from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.child import ChildError
 from ring.cores import CORES_HELP
 from ring.faults import Cut, Kill, Roam
 from ring.hints import hints, live_hints
@@ -41,9 +41,6 @@ __all__ = ["main", "spelled_out"]
 ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
 PLANES: Final[tuple[RingPlane, ...]] = get_args(RingPlane)
 LIVES: Final[tuple[Live, ...]] = get_args(Live)
-_PASSED: Final = 0
-_FAILED: Final = 1
-_WRONG_INPUT: Final = 2
 _COLUMNS, _WIDE_COLUMNS = 100, 200  # where the terminal's width is unknown
 
 _EXAMPLES: Final = """\b
@@ -66,7 +63,7 @@ Examples:
 
 T = TypeVar("T")
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = new_app()
 
 
 @app.command(epilog=_EXAMPLES)
@@ -114,12 +111,13 @@ def ring(
     as wanted. The exit code is 0 only if every message came out identical and in order, and every call was answered.
     """
     errors = Console(stderr=True)
-    try:
+
+    def run() -> int:
         runs = RunRegistry()
         if down:
             taken = runs.take_down()
             errors.print(f"taken down: {', '.join(taken)}" if taken else "nothing was left up", highlight=False)
-            raise typer.Exit(_PASSED)
+            return PASSED
         options = Options(
             bag=_absolute(bag),
             rate=rate,
@@ -142,14 +140,9 @@ def ring(
         )
         for swept in runs.sweep():
             errors.print(f"took down what run {swept} had left behind", highlight=False)
-        code = _run(options, runs.start(), errors)
-    except ChildError as error:
-        errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}", highlight=False, soft_wrap=True)
-        code = _FAILED
-    except GdpError as error:
-        errors.print(escape(str(error)), highlight=False, soft_wrap=True)
-        code = _WRONG_INPUT
-    raise typer.Exit(code)
+        return _run(options, runs.start(), errors)
+
+    exit_with(run)
 
 
 def main() -> None:
@@ -170,7 +163,7 @@ def _run(options: Options, run: Run, errors: Console) -> int:
     kept = False
     try:
         code = asyncio.run(interruptible(_go(options, run, errors)))
-        kept = options.keep and code in (_PASSED, _FAILED)
+        kept = options.keep and code in (PASSED, FAILED)
     except Interrupted as interrupted:
         errors.print("interrupted; taking everything down")
         code = interrupted.exit_code
@@ -204,7 +197,7 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
     if options.keep:
         _hint(run, hints(standing, standing.start_again()), errors)
         standing.overlay.children.forget()
-    return _PASSED if result.passed else _FAILED
+    return PASSED if result.passed else FAILED
 
 
 async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> int:
@@ -220,7 +213,7 @@ async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> i
         standing.go_on()
         _hint(run, live_hints(standing), errors)
         standing.overlay.children.forget()
-    return _PASSED if result.passed else _FAILED
+    return PASSED if result.passed else FAILED
 
 
 def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
@@ -230,9 +223,7 @@ def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
 
 
 def _show(result: Result, *, is_wide: bool) -> None:
-    output = Console()
-    if not output.is_terminal:
-        output = Console(width=_WIDE_COLUMNS if is_wide else _COLUMNS)
+    output = console_of(columns=_WIDE_COLUMNS if is_wide else _COLUMNS)
     output.print(table(result, is_wide=is_wide))
     output.print(summary(result), highlight=False, soft_wrap=True)
 

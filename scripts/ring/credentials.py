@@ -10,7 +10,7 @@ I/O. Every run has new keys, which are deleted with it::
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
@@ -32,7 +32,7 @@ from ring.plan import Credentials, Topic, Yaml, proxy_yaml, rib_yaml, rule_yaml,
 
 __all__ = ["OverlayCredentials"]
 
-_SIDES: Final = {"expose": Right.PUBLISH, "import": Right.READ}
+_SIDES: Final[dict[Side, Right]] = {"expose": Right.PUBLISH, "import": Right.READ}
 
 
 class OverlayCredentials:
@@ -112,20 +112,8 @@ class OverlayCredentials:
         node = self._node(Role.PROXY, at.switch)
         for each in carried:
             self._delegate(node, each.metadata, each.right(side))
-        rules: dict[str, Sequence[Yaml]] = {side: [each.rule(self._owner / OWNER_PUBLIC, encoding) for each in carried]}
-        credentials = self._credentials(Role.PROXY, at.switch)
-        content = proxy_yaml(
-            at,
-            credentials,
-            node / DELEGATIONS,
-            2,
-            rules,
-            None,
-            metrics=self._metrics,
-            data_plane=self._data_plane,
-            lease_s=self._lease_s,
-        )
-        return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
+        rules = {side: [each.rule(self._owner / OWNER_PUBLIC, encoding) for each in carried]}
+        return self._write_proxy(at, rules, {"ros": graph})
 
     def of_proxy(self, switch: str) -> Credentials:
         """Return identity and trust anchors of the proxy at a switch."""
@@ -142,7 +130,7 @@ class OverlayCredentials:
     def _proxy(
         self,
         at: Attachment,
-        side: str,
+        side: Side,
         topics: Sequence[Topic],
         encoding: Encoding,
         ros: RosVersion,
@@ -151,22 +139,22 @@ class OverlayCredentials:
         node = self._node(Role.PROXY, at.switch)
         for topic in topics:
             self._delegate(node, Metadata(topic.metadata), _SIDES[side])
-        rules: dict[str, Sequence[Yaml]] = {
-            side: [rule_yaml(topic, self._owner / OWNER_PUBLIC, encoding) for topic in topics]
-        }
-        credentials = self._credentials(Role.PROXY, at.switch)
+        rules = {side: [rule_yaml(topic, self._owner / OWNER_PUBLIC, encoding) for topic in topics]}
+        form = "ros1" if ros == 1 else "mcap"
+        recorded: Yaml = {} if record is None else {"record": {"path": str(record), "format": form}}
+        return self._write_proxy(at, rules, recorded)
+
+    def _write_proxy(self, at: Attachment, rules: Mapping[Side, Sequence[Yaml]], further: Yaml) -> Path:
         content = proxy_yaml(
             at,
-            credentials,
-            node / DELEGATIONS,
-            ros,
+            self._credentials(Role.PROXY, at.switch),
+            self._node(Role.PROXY, at.switch) / DELEGATIONS,
             rules,
-            record,
             metrics=self._metrics,
             data_plane=self._data_plane,
             lease_s=self._lease_s,
         )
-        return self._write(Role.PROXY, at.switch, content)
+        return self._write(Role.PROXY, at.switch, {**content, **further})
 
     def _delegate(self, node: Path, metadata: Metadata, right: Right) -> None:
         given = delegate(self._owner, node / CARD, metadata, [right])

@@ -55,7 +55,7 @@ def common(overlay: Overlay) -> list[tuple[str, str]]:
 def inside(overlay: Overlay, node: str, command: str) -> str:
     """Return the shell command that runs a command in the namespace of a switch, from outside."""
     if in_first_user_namespace():
-        return f"ip netns exec {overlay.namespaces.path(node).name} {command}"
+        return f"ip netns exec {overlay.namespaces[node].path.name} {command}"
     return f"nsenter --target {overlay.switches[node].pid} --user --mount --net --preserve-credentials {command}"
 
 

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
-from ring.children import cancel
+from lab.children import cancel
 from ring.faults import Cut, Fault, Kill, Roam
 from ring.progress import ProgressReporter
 

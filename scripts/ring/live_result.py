@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from gdp.errors import LocalError
+from lab.events import Event
 from proxy.recordings.compare import TopicComparison, compare_digests
-from ring.events import Event
 from ring.nodes.content import LAMP, LAMP_TYPE
 from ring.result import Journey, TopicResult, put_together
 

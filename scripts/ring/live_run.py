@@ -6,6 +6,7 @@ I/O.
 from __future__ import annotations
 
 import importlib.util
+import signal
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,10 +15,10 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
+from lab.child import Child
+from lab.events import Event
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
-from ring.child import Child
-from ring.events import Event
 from ring.injection import Injection
 from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in, paces
 from ring.live_result import Heard, rows
@@ -82,7 +83,7 @@ class LiveRing:
         for end in self._ends:
             self._start_proxy(*end, heard=False)
         for node in self._nodes:
-            node.go()
+            node.send(signal.SIGUSR1)
 
     @property
     def directory(self) -> Path:
@@ -124,7 +125,7 @@ class LiveRing:
         """Request a proxy to end; return its final report."""
         children = self.overlay.children
         children.may_end(proxy)
-        proxy.interrupt()
+        proxy.send(signal.SIGINT)
         return await children.guarded(proxy.wait_for("done", ENDING_S))
 
     def _start_master(self, at: Attachment, graph: Graph) -> Child:

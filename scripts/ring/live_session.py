@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import time
 from collections.abc import Awaitable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from ring.child import Child
-from ring.children import Children, cancel, gathered
-from ring.events import Event
+from lab.child import Child
+from lab.children import Children, cancel, gathered
+from lab.events import Event
 from ring.live_result import Heard
 from ring.nodes.content import LAMP
 from ring.progress import ProgressReporter, Traffic
@@ -71,7 +72,7 @@ class LiveSession:
         lamp = asyncio.ensure_future(self._follow(live_nodes.lamp))
         try:
             for child in (*live_nodes.talkers, live_nodes.caller):
-                child.go()
+                child.send(signal.SIGUSR1)
             patience_s = seconds + ENDING_S
             speaking = [
                 _in_time(child, self._follow(child), patience_s) for child in (*live_nodes.talkers, live_nodes.caller)
@@ -79,8 +80,8 @@ class LiveSession:
             *talkers, caller = await self._children.guarded(gathered(speaking))
             self._answered = caller.count("answered")
             await self._children.guarded(self._until_quiet())
-            live_nodes.listener.interrupt()
-            live_nodes.lamp.interrupt()
+            live_nodes.listener.send(signal.SIGINT)
+            live_nodes.lamp.send(signal.SIGINT)
             nodes = ((live_nodes.listener, ear), (live_nodes.lamp, lamp))
             ending = gathered(_in_time(node, report, ENDING_S) for node, report in nodes)
             listener_said, lamp_said = await self._children.guarded(ending)

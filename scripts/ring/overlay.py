@@ -13,9 +13,9 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
+from lab.child import Child
+from lab.children import READY_S, Children
 from lab.namespaces import Namespaces
-from ring.child import Child
-from ring.children import READY_S, Children
 from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from ring.credentials import OverlayCredentials
 from ring.faults import Cut, Kill, Roam, roamers

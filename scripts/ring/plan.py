@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 from gdp.config.config import UplinkPlane
 from gdp.limits import ADVERTISEMENT_LEASE_S
@@ -141,9 +141,7 @@ def proxy_yaml(
     at: Attachment,
     credentials: Credentials,
     delegations: Path,
-    ros: int,
-    rules: Mapping[str, Sequence[Yaml]],
-    record: Path | None,
+    rules: Mapping[Literal["expose", "import"], Sequence[Yaml]],
     *,
     metrics: bool,
     data_plane: UplinkPlane = "raw",
@@ -152,10 +150,8 @@ def proxy_yaml(
     """Return ``proxy.yaml`` of one proxy.
 
     Args:
-        ros: 1 or 2, the form of the recording.
         rules: by ``expose`` and ``import``.
     """
-    form = "ros1" if ros == 1 else "mcap"
     return {
         **credentials.to_yaml(),
         "iface": at.ifname,
@@ -163,7 +159,6 @@ def proxy_yaml(
         "data_plane": data_plane,
         "lease_s": lease_s,
         **{side: list(each) for side, each in rules.items()},
-        **({"record": {"path": str(record), "format": form}} if record is not None else {}),
         **_metrics("proxy", wanted=metrics),
     }
 

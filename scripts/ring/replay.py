@@ -6,14 +6,16 @@ I/O.
 from __future__ import annotations
 
 import asyncio
+import signal
 import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
-from ring.child import Child, ChildError
-from ring.children import Children, cancel
-from ring.events import Event
+from lab.child import Child
+from lab.children import Children, cancel
+from lab.events import Event
+from lab.process import FailedError
 from ring.injection import Injection
 from ring.progress import ProgressReporter, Traffic
 from ring.silence import Silence
@@ -92,7 +94,7 @@ class Replay:
     async def _finish(self, heard: asyncio.Future[Event | None]) -> tuple[Event, int]:
         """Request the receiver to close its recording; return its last event and its exit code."""
         self._children.may_end(self._receiver)
-        self._receiver.interrupt()
+        self._receiver.send(signal.SIGINT)
         try:
             received = await self._children.guarded(asyncio.wait_for(heard, ENDING_S))
         except asyncio.TimeoutError:
@@ -140,7 +142,7 @@ class Replay:
                 done, _ = await asyncio.wait([task, moved], timeout=STALL_S, return_when=asyncio.FIRST_COMPLETED)
                 await cancel(moved)
                 if not done:
-                    raise ChildError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
+                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
             return task.result()
         finally:
             await cancel(task)

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 
+from lab.events import Event
 from proxy.recordings.compare import TopicComparison
-from ring.events import Event
 
 __all__ = ["Journey", "Result", "TopicResult", "put_together"]
 

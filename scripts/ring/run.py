@@ -12,11 +12,11 @@ from typing import Final
 
 from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
+from lab.child import Child
+from lab.children import READY_S, Children
 from proxy.recordings.compare import compare
 from proxy.recordings.reader import BagReader
 from proxy.serial.channel import RosVersion
-from ring.child import Child
-from ring.children import READY_S, Children
 from ring.injection import Injection
 from ring.options import Options
 from ring.overlay import Overlay

@@ -18,7 +18,6 @@ from faults.continuity import Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
 from faults.schedule import Fault, FaultKind, broken_by
-from peers.process import FailedError
 from topologies import ends_of
 
 from gdp.client.participant import Participant
@@ -27,6 +26,7 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.right import Right
 from lab.network import SimLink
+from lab.process import FailedError
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Topology
 

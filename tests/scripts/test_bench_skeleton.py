@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from machine import machine_state
-from peers.process import FailedError, Started, figures_of, floats_of
 from report import Rounds, markdown_table, write_json
 from skeleton import Outcome, command_line, finish, parse
 from topologies import ends_of, flat_topology, make_topology, single
 
 from gdp.host.run_registry import RunRegistry
+from lab.process import FailedError, LabProcess, figures_of, floats_of
 from lab.topology import Link
 
 COMMAND = "import sys; sys.path.insert(0, {!r}); from peers.jsonl import read_order, say; {}"
@@ -66,26 +67,26 @@ def test_a_missed_target_fails_a_strict_run_alone(words: list[str], value: float
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[[str], Started]]:
+def start(tmp_path: Path) -> Iterator[Callable[[str], LabProcess]]:
     """Yield a function that starts a process with this program, which takes commands."""
     run = RunRegistry(tmp_path / "runs").start()
 
-    def started(program: str) -> Started:
-        argv = ["-c", COMMAND.format(BENCH, program)]
-        return Started(run, "end", list[str], argv, has_orders=True)
+    def started(program: str) -> LabProcess:
+        argv = [sys.executable, "-c", COMMAND.format(BENCH, program)]
+        return LabProcess(run, "end", argv, has_orders=True)
 
     yield started
     run.end()
 
 
-def test_a_process_answers_commands_and_ends_when_there_are_no_more(start: Callable[[str], Started]) -> None:
+def test_a_process_answers_commands_and_ends_when_there_are_no_more(start: Callable[[str], LabProcess]) -> None:
     with start("\nwhile True: say(twice=2 * read_order()['number'])") as end:
         assert end.ask(number=4) == {"twice": 8}
         assert end.ask(number=5) == {"twice": 10}
     assert end.code == 0
 
 
-def test_a_process_that_refuses_is_an_error_with_its_reason(start: Callable[[str], Started]) -> None:
+def test_a_process_that_refuses_is_an_error_with_its_reason(start: Callable[[str], LabProcess]) -> None:
     with start("say(refused_because='no CAP_BPF')") as end, pytest.raises(FailedError, match="no CAP_BPF"):
         end.read(20.0)
 

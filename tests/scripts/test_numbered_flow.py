@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 from numbered_flow import NumberedFlow
-from peers.process import FailedError, until
+
+from lab.process import FailedError, until
 
 
 @pytest.fixture

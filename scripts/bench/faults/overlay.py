@@ -19,7 +19,6 @@ from typing import Final
 
 import yaml
 from devices import hand_over, received, set_up
-from peers.process import Started
 from pyroute2 import IPRoute
 from testbed import Lab
 
@@ -36,6 +35,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.process import LabProcess
 from ring.credentials import OverlayCredentials
 
 __all__ = ["Overlay"]
@@ -81,7 +81,7 @@ class Overlay:
         self._more = more or {}
         self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self._incarnation_ids: dict[str, int] = {}
-        self._processes: dict[str, Started] = {}
+        self._processes: dict[str, LabProcess] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = self._lab.namespaces
@@ -257,12 +257,12 @@ class Overlay:
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
         """Apply faults to the frames of a link, both ways."""
         for own, other in ((a, b), (b, a)):
-            self._links.set(self.spaces.path(own), other, faults)
+            self._links.set(self.spaces[own].path, other, faults)
 
     def calm(self, a: str, b: str) -> None:
         """Remove the faults of a link."""
         for own, other in ((a, b), (b, a)):
-            self._links.clear(self.spaces.path(own), other)
+            self._links.clear(self.spaces[own].path, other)
 
     def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
         """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
@@ -279,7 +279,7 @@ class Overlay:
 
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
-        there = os.open(self.spaces.path(to), os.O_RDONLY | os.O_CLOEXEC)
+        there = os.open(self.spaces[to].path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             self._lab.inside(self._at[mover], partial(hand_over, mover, there))
         finally:

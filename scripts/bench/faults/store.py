@@ -18,7 +18,6 @@ from typing import Final
 
 import yaml
 from devices import add_address, add_bridge, set_up
-from peers.process import FailedError, until
 from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
@@ -26,7 +25,9 @@ from redis.exceptions import RedisError
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
+from lab.namespace import Namespace
 from lab.namespaces import Namespaces
+from lab.process import FailedError, until
 
 __all__ = ["StoreCluster", "critical_lines", "has_server"]
 
@@ -62,17 +63,15 @@ class StoreCluster:
     def __init__(self, run: Run, spaces: Namespaces, ribs: Sequence[str]) -> None:
         self._run = run
         self._folder = run.directory / "store"
-        self._path = spaces.path(ribs[0]).with_name(f"gdp-{run.id}-store")
-        run.plan_namespace(self._path)
-        netns_files.create(self._path)
-        netns_files.inside(self._path, netns_files.disable_ipv6)
-        netns_files.inside(self._path, partial(set_up, "lo"))
-        netns_files.inside(self._path, partial(add_bridge, _BRIDGE))
-        netns_files.inside(self._path, partial(add_address, _BRIDGE, _ADDRESS))
+        self._namespace = Namespace(run, "store")
+        self._namespace.inside(netns_files.disable_ipv6)
+        self._namespace.inside(partial(set_up, "lo"))
+        self._namespace.inside(partial(add_bridge, _BRIDGE))
+        self._namespace.inside(partial(add_address, _BRIDGE, _ADDRESS))
         for at, node in enumerate(ribs, 2):
-            self._join(spaces.path(node), f"to-{node}", _OF_RIBS.format(at))
+            self._join(spaces[node], f"to-{node}", _OF_RIBS.format(at))
         started = subprocess.run(
-            [*self._entering(), str(_START_CLUSTER), str(self._folder), _ADDRESS],
+            self._namespace.command([str(_START_CLUSTER), str(self._folder), _ADDRESS], dies_with_us=False),
             capture_output=True, text=True, check=False, timeout=_START_S, start_new_session=True,
         )  # fmt: skip
         if started.returncode:
@@ -109,7 +108,7 @@ class StoreCluster:
         number = self._away.pop(fault)
         folder = self._folder / str(number)
         (folder / "server.pid").unlink(missing_ok=True)
-        argv = [*self._entering(), self._program, "server.conf"]
+        argv = self._namespace.command([self._program, "server.conf"], dies_with_us=False)
         if subprocess.run(argv, cwd=folder, check=False, stdout=subprocess.DEVNULL).returncode:
             raise FailedError(f"server {number} of the store does not start again")
         until(lambda: self._role(number) is not None, lambda: f"an answer of server {number} of the store", _WHOLE_S)
@@ -145,22 +144,19 @@ class StoreCluster:
 
     def _role(self, number: int) -> tuple[bool, bool] | None:
         """Return whether a server is a primary, and whether its counterpart is in step; None: it does not answer."""
-        return netns_files.inside(self._path, partial(_role_of, self._servers[number], self._password, self._folder))
+        return self._namespace.inside(partial(_role_of, self._servers[number], self._password, self._folder))
 
     def _pid(self, number: int) -> int:
         return int((self._folder / str(number) / "server.pid").read_text(encoding="ascii"))
 
-    def _entering(self) -> list[str]:
-        return ["nsenter", f"--net={self._path}", "--"]
-
-    def _join(self, rib: Path, ifname: str, address: str) -> None:
-        there = os.open(rib, os.O_RDONLY | os.O_CLOEXEC)
+    def _join(self, rib: Namespace, ifname: str, address: str) -> None:
+        there = os.open(rib.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            netns_files.inside(self._path, partial(_plug, ifname, there))
+            self._namespace.inside(partial(_plug, ifname, there))
         finally:
             os.close(there)
-        netns_files.inside(rib, partial(add_address, _IFNAME, address))
-        netns_files.inside(rib, partial(set_up, _IFNAME))
+        rib.inside(partial(add_address, _IFNAME, address))
+        rib.inside(partial(set_up, _IFNAME))
 
 
 def critical_lines(folder: Path) -> list[str]:

@@ -11,10 +11,10 @@ from typing import Protocol
 
 from testbed import Lab
 
+from lab.process import FailedError, LabProcess
 from peers.chain import LEFT, Chain
 from peers.exchange import Load
 from peers.jsonl import EndSettings
-from peers.process import FailedError, Started
 
 __all__ = ["Baseline", "Measured", "ask_end", "start_end"]
 
@@ -58,7 +58,7 @@ class Baseline(Protocol):
 
 def start_end(
     chain: Lab, module: str, node: str, load: Load, own: Mapping[str, str], pids: Mapping[str, Sequence[int]]
-) -> Started:
+) -> LabProcess:
     """Start an endpoint, ``ping`` at A or ``pong`` at B."""
     settings = EndSettings(
         "ping" if node == LEFT else "pong", load, {place: list(each) for place, each in pids.items()}, dict(own)
@@ -66,7 +66,7 @@ def start_end(
     return chain.start(node, module.rpartition(".")[2], ["-m", module, settings.to_argument()])
 
 
-def ask_end(ping: Started, labels: Mapping[str, str], patience_s: float = _MEASURED_S) -> list[Measured]:
+def ask_end(ping: LabProcess, labels: Mapping[str, str], patience_s: float = _MEASURED_S) -> list[Measured]:
     """Return the figures of A.
 
     Args:

@@ -8,10 +8,10 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from lab.process import LabProcess
 from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.chain import LEFT, NODES, RIGHT, Chain, address
 from peers.exchange import Load
-from peers.process import Started
 
 __all__ = ["CycloneNet", "cyclone_xml"]
 
@@ -47,7 +47,7 @@ class CycloneNet:
             return ask_end(ping, {"cyclone": self.name})
 
 
-def _end(chain: Chain, node: str, load: Load, pids: dict[str, list[int]]) -> Started:
+def _end(chain: Chain, node: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
     left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
     own, other = (left, right) if node == LEFT else (right, left)
     return start_end(chain, _MODULE, node, load, {"xml": cyclone_xml(own, other)}, pids)

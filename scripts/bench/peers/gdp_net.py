@@ -11,11 +11,11 @@ from typing import Final
 from testbed import OverlayNodes
 
 from gdp.trust.right import Right
+from lab.process import LabProcess
 from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.chain import LEFT, MIDDLE, RIGHT, Chain
 from peers.exchange import Load
 from peers.gdp_endpoint import PONG, ping_topic
-from peers.process import Started
 
 __all__ = ["ENCODINGS", "GdpNet"]
 
@@ -58,7 +58,7 @@ class GdpNet:
             ping = stack.enter_context(self._end(nodes, LEFT, load, pids))
             return ask_end(ping, dict(zip(self._encodings, self.labels, strict=True)))
 
-    def _end(self, nodes: OverlayNodes, node: str, load: Load, pids: dict[str, list[int]]) -> Started:
+    def _end(self, nodes: OverlayNodes, node: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
         pings = [ping_topic(encoding) for encoding in self._encodings]
         published, read = (pings, [PONG]) if node == LEFT else ([PONG], pings)
         rights = {Right.PUBLISH: published, Right.READ: read}

@@ -1,6 +1,6 @@
 """Process's side of a bench: its settings as one argument, commands to it and its replies as lines of JSON.
 
-I/O. Standard input and output. ``peers.process`` is the other side.
+I/O. Standard input and output. ``lab.process`` is the other side.
 """
 
 from __future__ import annotations

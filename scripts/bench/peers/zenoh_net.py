@@ -8,12 +8,12 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from lab.process import LabProcess
 from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.certificates import make_certificates
 from peers.chain import LEFT, MIDDLE, NODES, RIGHT, Chain, address
 from peers.exchange import Load
 from peers.jsonl import EndSettings
-from peers.process import Started
 
 __all__ = ["ZenohNet"]
 
@@ -49,7 +49,7 @@ class ZenohNet:
             ping = stack.enter_context(self._end(chain, LEFT, MIDDLE[0], load, {"receiver": [pong.pid], **pids}))
             return ask_end(ping, {"zenoh": self.name})
 
-    def _end(self, chain: Chain, node: str, router: str, load: Load, pids: dict[str, list[int]]) -> Started:
+    def _end(self, chain: Chain, node: str, router: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
         own = {"connect": self._at(router, node), **self._identity(chain, node)}
         return start_end(chain, _MODULE, node, load, own, pids)
 
@@ -67,6 +67,6 @@ class ZenohNet:
         return {"certificates": str(directory), "host": node}
 
 
-def _router(chain: Chain, node: str, own: dict[str, str]) -> Started:
+def _router(chain: Chain, node: str, own: dict[str, str]) -> LabProcess:
     settings = EndSettings("router", Load((), 0), {}, own)
     return chain.start(node, "zenoh_router", ["-m", _MODULE, settings.to_argument()])

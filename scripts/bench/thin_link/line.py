@@ -15,11 +15,11 @@ from typing import Any, Final
 
 from devices import add_address, add_neighbour, mac_addresses
 from machine import set_offloads
-from peers.process import FailedError, Started
 from testbed import Lab
 from topologies import flat_topology
 
 from gdp.host.run_registry import Run
+from lab.process import FailedError, LabProcess
 from thin_link.conditions import FRAME_BYTES, Conditions
 
 __all__ = ["ADDRESSES", "CLOUD", "LINE", "ROBOT", "Flow", "Line", "Used", "open_line", "thin_link_lab"]
@@ -63,7 +63,7 @@ class Used:
 class Line:
     """Running relay."""
 
-    def __init__(self, process: Started) -> None:
+    def __init__(self, process: LabProcess) -> None:
         self._process = process
         self._before: Mapping[str, Any] = self._ask()
 

@@ -13,10 +13,10 @@ from typing import Any, Final, Protocol
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from peers.certificates import make_certificates
-from peers.process import FailedError, Started
 from testbed import Lab, OverlayNodes
 
 from gdp.trust.right import Right
+from lab.process import FailedError, LabProcess
 from thin_link.line import ADDRESSES, CLOUD, ROBOT
 from thin_link.traffic import streams
 
@@ -28,7 +28,7 @@ _PORT: Final = 7_447
 _WIREGUARD_MTU: Final = 1_420
 _INNER: Final = {ROBOT: "fd00::1", CLOUD: "fd00::2"}
 
-Ends = tuple[Started, Started]
+Ends = tuple[LabProcess, LabProcess]
 
 
 class System(Protocol):
@@ -46,7 +46,7 @@ class System(Protocol):
         """
 
 
-def start_role(lab: Lab, node: str, role: str, settings: Mapping[str, Any], *, has_orders: bool = False) -> Started:
+def start_role(lab: Lab, node: str, role: str, settings: Mapping[str, Any], *, has_orders: bool = False) -> LabProcess:
     """Start a role of the endpoint process."""
     return lab.start(node, role, ["-m", _MODULE, role, json.dumps(settings)], has_orders=has_orders)
 

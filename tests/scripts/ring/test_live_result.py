@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from ring.events import Event
+from lab.events import Event
 from ring.live_result import Heard, rows
 from ring.options import Options
 from ring.result import Result

@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
+from lab.children import Children
+from lab.process import FailedError
 from ring import live_session
-from ring.child import ChildError
-from ring.children import Children
 from ring.live_result import Heard
 from ring.live_session import LiveNodes, LiveSession
 from ring.progress import ProgressReporter
@@ -78,10 +78,10 @@ def test_what_does_not_come_is_waited_for_only_while_something_moves(run: Run, m
 
 def test_a_node_that_does_not_report_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_session, "ENDING_S", 0.2)
-    with pytest.raises(ChildError, match=r"lamp did not report within 0\.2 s"):
+    with pytest.raises(FailedError, match=r"lamp did not report within 0\.2 s"):
         play(run, lamp=HEAD + "signal.pause()")
 
 
 def test_a_node_that_dies_ends_the_run_and_shows_its_last_lines(run: Run) -> None:
-    with pytest.raises(ChildError, match=r"(?s)talker ended with code 1.*no such topic"):
+    with pytest.raises(FailedError, match=r"(?s)talker ended with code 1.*no such topic"):
         play(run, talker=HEAD + "wait(signal.SIGUSR1); sys.exit('no such topic')")

@@ -12,9 +12,10 @@ import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
+from lab.child import Child
+from lab.children import Children
+from lab.process import FailedError
 from ring import replay as replay_module
-from ring.child import Child, ChildError
-from ring.children import Children
 from ring.injection import Injection
 from ring.progress import ProgressReporter
 from ring.replay import Replay, Report
@@ -99,25 +100,25 @@ def test_an_end_that_ends_badly_is_a_complaint(run: Run) -> None:
 
 
 def test_a_sender_that_dies_in_the_middle_is_reported_with_its_last_lines(run: Run) -> None:
-    with pytest.raises(ChildError, match=r"(?s)sender ended with code 1 in the middle\n    a boom"):
+    with pytest.raises(FailedError, match=r"(?s)sender ended with code 1 in the middle\n    a boom"):
         play(run, HEAD + "say(event='ready'); sys.exit('a boom')", RECEIVER)
 
 
 def test_a_process_that_never_gets_ready_is_reported_with_its_last_lines(run: Run) -> None:
-    with pytest.raises(ChildError, match=r"(?s)receiver ended with code 1 before it said 'ready'\n    no such key"):
+    with pytest.raises(FailedError, match=r"(?s)receiver ended with code 1 before it said 'ready'\n    no such key"):
         play(run, SENDER, "import sys; sys.exit('no such key')")
 
 
 def test_the_death_of_a_process_that_must_stand_ends_the_wait_at_once(run: Run) -> None:
     dying = HEAD + "say(event='ready'); sys.exit('fell over')"
     waiting = HEAD + "say(event='ready'); signal.pause()"
-    with pytest.raises(ChildError, match=r"receiver ended with code 1\n    fell over"):
+    with pytest.raises(FailedError, match=r"receiver ended with code 1\n    fell over"):
         play(run, waiting, dying)
 
 
 def test_traffic_that_stands_still_ends_the_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_module, "STALL_S", 0.2)
-    with pytest.raises(ChildError, match=r"nothing moved for 0\.2 s: .*delivered 2"):
+    with pytest.raises(FailedError, match=r"nothing moved for 0\.2 s: .*delivered 2"):
         play(run, HEAD + "say(event='ready'); signal.pause()", RECEIVER)
 
 
@@ -132,5 +133,5 @@ def test_a_child_that_does_not_answer_in_time_is_reported(run: Run, tmp_path: Pa
         await child.wait_for("ready", 0.05)
         raise AssertionError
 
-    with pytest.raises(ChildError, match=r"mute did not say 'ready' within 0\.05 s"):
+    with pytest.raises(FailedError, match=r"mute did not say 'ready' within 0\.05 s"):
         within(run, impatient)

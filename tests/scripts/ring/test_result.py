@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from gdp.errors import LocalError
+from lab.events import Event
 from proxy.recordings.compare import TopicComparison
-from ring.events import Event
 from ring.options import Options
 from ring.result import Journey, Result, put_together
 from ring.table import hops_in_words, summary, table

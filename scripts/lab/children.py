@@ -6,14 +6,15 @@ I/O.
 from __future__ import annotations
 
 import asyncio
+import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.host.run_registry import Run
+from lab.child import Child
+from lab.events import Event
 from lab.namespaces import Namespaces
-from ring.child import Child
-from ring.events import Event
 
 __all__ = ["READY_S", "Children", "cancel", "gathered"]
 
@@ -39,10 +40,16 @@ class Children:
         self._standing: list[Child] = []
         self._changed = asyncio.Event()  # set when the set of required processes changes
 
-    def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
-        """Start a process; its log is named after its label."""
-        child = Child(label, argv, self._run.directory / f"{label.replace(' ', '-')}.log", heard=heard)
-        self._run.note_process(child.pid)
+    def start(
+        self,
+        label: str,
+        argv: Sequence[str],
+        *,
+        heard: bool = True,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start a process; ``environment`` extends the present one."""
+        child = Child(self._run, label, argv, heard=heard, environment=environment)
         self._all.append(child)
         return child
 
@@ -57,9 +64,8 @@ class Children:
         environment: Mapping[str, str] | None = None,
     ) -> Child:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
-        prefix = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
-        argv = namespaces.command(node, [*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
-        child = self.start(f"{role} {node}", argv, heard=heard)
+        argv = namespaces[node].command([sys.executable, *arguments], dies_with_us=not self._kept)
+        child = self.start(f"{role} {node}", argv, heard=heard, environment=environment)
         if self._started is not None:
             self._started(node, child.pid)
         return child
@@ -79,7 +85,7 @@ class Children:
     async def kill(self, child: Child) -> None:
         """Kill a required process; return when it has ended."""
         self.may_end(child)
-        child.kill()
+        child.send(signal.SIGKILL)
         await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:

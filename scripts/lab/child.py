@@ -1,4 +1,4 @@
-"""Child process of the ring: one of the project's commands, started, read and ended.
+"""Child process of an asyncio program: one of the project's commands, whose lines are events.
 
 I/O. Built on ``subprocess`` and a pidfd rather than on asyncio's own subprocesses, whose transports kill running
 processes when they are garbage-collected. A kept ring must outlive this process.
@@ -10,55 +10,32 @@ import asyncio
 import contextlib
 import os
 import signal
-import subprocess
-from collections import deque
-from collections.abc import AsyncGenerator, Sequence
-from pathlib import Path
-from typing import IO, Final
+from collections.abc import AsyncGenerator, Mapping, Sequence
+from typing import Final
 
-from gdp.errors import GdpError, LocalError
-from ring.events import Event
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run
+from lab.events import Event
+from lab.process import FailedError, LabProcess
 
-__all__ = ["Child", "ChildError"]
+__all__ = ["Child"]
 
 _LINE_MAX_BYTES: Final = 16 << 20  # the report on a recording of many topics
 _TAIL_LINES: Final = 12
 
 
-class ChildError(GdpError):
-    """A process ended too early, or did not report the awaited event in time; the text shows its last lines.
+class Child(LabProcess):
+    """One process; every method that waits for it may raise ``FailedError``, with its last lines."""
 
-    Every method of the harness that waits for processes may raise it.
-    """
-
-
-class Child:
-    """One process, leader of its own group. Its standard error goes to ``log``, its standard output is read as events.
-
-    Args:
-        label: display name, such as ``switch nuc1``.
-        argv: the command line; inherited by exec, so that the process id stays.
-        heard: False: its standard output is not read, and goes to the log too.
-    """
-
-    def __init__(self, label: str, argv: Sequence[str], log: Path, *, heard: bool = True) -> None:
-        self.label = label
-        self.log = log
+    def __init__(
+        self, run: Run, label: str, argv: Sequence[str], *, heard: bool, environment: Mapping[str, str] | None
+    ) -> None:
+        super().__init__(run, label, argv, heard=heard, environment=environment)
         self.ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._lines: asyncio.StreamReader | None = None
         self._transport: asyncio.BaseTransport | None = None
-        with log.open("wb") as errors:
-            output = subprocess.PIPE if heard else errors
-            self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=errors, start_new_session=True
-            )
         self._pidfd = os.pidfd_open(self.pid)
         asyncio.get_running_loop().add_reader(self._pidfd, self._reap)
-
-    @property
-    def pid(self) -> int:
-        """Return the process id, which is also its group's."""
-        return self._process.pid
 
     async def events(self) -> AsyncGenerator[Event, None]:
         """Yield the events of the process, until it closes its output.
@@ -84,26 +61,14 @@ class Child:
         except asyncio.TimeoutError:
             raise self.failed(f"still runs after {patience_s:g} s") from None
 
-    def interrupt(self) -> None:
-        """Request the process to finish its work and end."""
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the process, unless it has ended."""
         if not self.ended.done():
-            self._process.send_signal(signal.SIGINT)
+            super().send(number)
 
-    def kill(self) -> None:
-        """Kill the process immediately."""
-        if not self.ended.done():
-            self._process.kill()
-
-    def go(self) -> None:
-        """Signal a node of a live run to begin, or to continue after its report."""
-        if not self.ended.done():
-            self._process.send_signal(signal.SIGUSR1)
-
-    def failed(self, how: str) -> ChildError:
+    def failed(self, how: str) -> FailedError:
         """Return the error for this process's failure, with the last lines of its log."""
-        with self.log.open(encoding="utf-8", errors="replace") as file:
-            tail = deque((line.rstrip() for line in file), maxlen=_TAIL_LINES)
-        return ChildError("\n".join([f"{self.label} {how}", *(f"    {line}" for line in tail if line)]))
+        return FailedError("\n    ".join([f"{self.label} {how}", *self.last_lines(_TAIL_LINES)]))
 
     def forget(self) -> None:
         """Close the descriptors here; the process itself continues."""
@@ -125,19 +90,14 @@ class Child:
 
     async def _open(self) -> asyncio.StreamReader:
         if self._lines is None:
-            output = self._process.stdout
-            if output is None:
+            if self._process.stdout is None:
                 raise LocalError(f"{self.label} has no output to read")
-            self._lines = await self._connect(output)
+            loop = asyncio.get_running_loop()
+            lines = self._lines = asyncio.StreamReader(limit=_LINE_MAX_BYTES, loop=loop)
+            self._transport, _ = await loop.connect_read_pipe(
+                lambda: asyncio.StreamReaderProtocol(lines, loop=loop), self._process.stdout
+            )
         return self._lines
-
-    async def _connect(self, output: IO[bytes]) -> asyncio.StreamReader:
-        loop = asyncio.get_running_loop()
-        lines = asyncio.StreamReader(limit=_LINE_MAX_BYTES, loop=loop)
-        self._transport, _ = await loop.connect_read_pipe(
-            lambda: asyncio.StreamReaderProtocol(lines, loop=loop), output
-        )
-        return lines
 
     def _reap(self) -> None:
         """Read the exit code; the loop calls it when the process has ended."""
