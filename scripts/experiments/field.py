@@ -185,9 +185,9 @@ class Field:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> Started:
-        """Start a client at the robot, or at a server: a role of ``program`` and its settings."""
-        return self.process(place, role, [str(program), role, json.dumps(settings)])
+    def client(self, place: str, role: str, **settings: object) -> Started:
+        """Start a client at the robot, or at a server: a role of ``robot.py`` and its settings."""
+        return self.process(place, role, [str(_HERE / "robot.py"), role, json.dumps(settings)])
 
     def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
         """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""

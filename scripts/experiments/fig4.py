@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, run_experiment
+from asking import Asking
+from experiment import Finding, Options, Report, command_line, run_experiment
 from recovery_stage import DEDICATED, REPLICA
 from samples import Sample
 from series import Series

@@ -20,9 +20,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Final
 
+from asking import Asking
 from experiment import (
     CASES,
-    Asking,
     Finding,
     Options,
     Report,

@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Final
 
+from asking import Asking
 from experiment import (
     CASES,
-    Asking,
     Finding,
     Options,
     Report,

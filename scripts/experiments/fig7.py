@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from asking import Asking
 from experiment import (
     CASES,
-    Asking,
     Finding,
     Options,
     Report,

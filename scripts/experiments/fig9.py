@@ -12,7 +12,8 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, run_experiment
+from asking import Asking
+from experiment import Finding, Options, Report, command_line, run_experiment
 from pictures import Span, save_timeline
 from recovery_stage import DEDICATED
 from report import progress

@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, field_of, run_experiment, work_of
+from asking import Asking
+from experiment import Finding, Options, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
 from pictures import Span, save_timeline
 from samples import Sample
