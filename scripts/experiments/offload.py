@@ -2,7 +2,7 @@
 
     sudo .venv/bin/python scripts/experiments/offload.py               # all; writes docs/experiments/offload.*
     sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
-    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --part network     # a piece; the rest is kept
+    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM       # a piece; the rest is kept
 
 Robot and server are nodes of ROS 2 on the first and the last machine of the ring, with its three trust domains. The
 unsecured ROS 2 takes as many links over Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes
@@ -80,12 +80,10 @@ def measure(options: Options) -> Computed:
         tasks = json.loads(held.read_text(encoding="utf-8"))["tasks"]
     for name in names:
         machine = {"machine": asdict(machine_state())}
-        figures = tasks.setdefault(name, {})
-        if options.part != "alone":
-            rounds = 1 if quick else options.rounds
-            figures["network"] = _network(name, rounds, quick=quick, is_limited=options.cores) | machine
-        if options.part != "network":
-            figures["alone"] = _alone(name, quick=quick) | machine
+        tasks[name] = {
+            "network": _network(name, 1 if quick else options.rounds, quick=quick, is_limited=options.cores) | machine,
+            "alone": _alone(name, quick=quick) | machine,
+        }
     document = {"slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     title = "FogROS G: Table I and Figure 5"
@@ -195,7 +193,6 @@ def _short(value: object) -> object:
 if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
-    parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
     parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)
