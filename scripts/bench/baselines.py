@@ -25,8 +25,6 @@ from pyroute2 import IPRoute
 
 from gdp.frame.kinds import ETHERTYPE
 
-__all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
-
 _READY_S: Final = 120.0
 _IPV4: Final = 0x0800
 _ABSENT: Final = "02:67:64:70:ff:ff"

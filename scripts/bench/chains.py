@@ -25,8 +25,6 @@ from testbed import Lab
 from gdp.host.run_registry import RunRegistry
 from lab.topology import chain
 
-__all__ = ["ROLES", "Chain"]
-
 ROLES: Final = Path(__file__).with_name("roles.py")
 _SOURCE_CPU, _SINK_CPU = 0, 1
 _READY_S: Final = 120.0

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 
 from pyroute2 import IPRoute
 
-__all__ = ["add_address", "add_bridge", "add_neighbour", "hand_over", "mac_addresses", "received", "set_mtu", "set_up"]
-
 
 def add_address(device: str, address: str, *, prefix_bits: int = 24) -> None:
     """Give a device an IPv4 address."""

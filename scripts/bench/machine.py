@@ -27,20 +27,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-__all__ = [
-    "ROOT",
-    "MachineState",
-    "git",
-    "machine_state",
-    "offload_text",
-    "offloads",
-    "processor_s",
-    "resident_bytes",
-    "set_offloads",
-    "soft_interrupts_s",
-    "thread_s",
-]
-
 ROOT: Final = Path(__file__).resolve().parents[2]
 _SIOCETHTOOL: Final = 0x8946
 _GET_SET: Final = {"tso": (0x1E, 0x1F), "gso": (0x23, 0x24), "gro": (0x2B, 0x2C), "tx-checksum": (0x16, 0x17)}
@@ -166,15 +152,6 @@ def _ask(ifname: str, command: int, value: int) -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         fcntl.ioctl(asked, _SIOCETHTOOL, argument)
     return int(struct.unpack("=II", request.raw)[1])
-
-
-def resident_bytes(pid: int | None = None) -> int:
-    """Return the present resident memory of a process, by default of this one.
-
-    Its recorded maximum would include the parent's, from before exec.
-    """
-    pages = Path(f"/proc/{pid or 'self'}/statm").read_text(encoding="ascii").split()[1]
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 def processor_s(pid: int) -> float:

@@ -20,8 +20,6 @@ from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import load_delegations
 
-__all__ = ["End"]
-
 PATIENCE_S: Final = 20.0
 
 

@@ -15,8 +15,6 @@ from peers.process import FailedError
 
 import gdp
 
-__all__ = ["HZ", "NumberedFlow"]
-
 HZ: Final = 100.0
 _STEADY_S: Final = 0.5
 _PATIENCE_S: Final = 60.0

@@ -29,8 +29,6 @@ from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
 
-__all__ = ["DEDICATED", "ECHO", "REPLICA", "ROBOT", "Cluster"]
-
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 DEDICATED, REPLICA = "dedicated", "replica"
 ROBOT: Final = "robot"

@@ -35,20 +35,6 @@ from machine import MachineState
 from rich.console import Console
 from rich.table import Table
 
-__all__ = [
-    "Rounds",
-    "Settings",
-    "Spread",
-    "Target",
-    "markdown_table",
-    "number_text",
-    "percentile",
-    "print_table",
-    "progress",
-    "show",
-    "write_json",
-]
-
 Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
 _CONSOLE_COLUMNS = 165
 

@@ -31,8 +31,6 @@ try:
 except ImportError:  # before Kilted and late Jazzy
     from rclpy.executors import SingleThreadedExecutor as BestExecutor
 
-__all__ = ["End", "Settings", "reliable", "run_role"]
-
 _STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never checks the future
 
 Settings = Mapping[str, object]

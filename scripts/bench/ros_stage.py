@@ -19,13 +19,13 @@ from background_load import LOADS, SHARE, load_of
 from peers.process import FailedError, figures_of
 from plot import Panel, panel_of
 from report import Rounds, Target
-from ros_row import BUFFER_BYTES, LEFT, READY_S, RIGHT, Carried, Row
+from ros_environment import BUFFER_BYTES
+from ros_row import READY_S, Carried, Row
 from skeleton import Options
+from topologies import LEFT, RIGHT
 
 from gdp.host.run_registry import RunRegistry
 from proxy.config.config import Encoding
-
-__all__ = ["CORES", "DIRECT", "MEDIAN", "P99", "Bench", "Call", "Measured", "Options", "Turn", "main", "parse"]
 
 DIRECT: Final = "direct"
 MEDIAN: Final = "p50, ms"

@@ -13,8 +13,6 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-__all__ = ["TYPES", "Message", "number_of", "set_number"]
-
 Message: TypeAlias = "CameraInfo | Float64MultiArray | Image | PoseStamped | UInt8MultiArray"
 
 TYPES: Final = {

@@ -18,8 +18,10 @@ from functools import partial
 from typing import Final
 
 from report import Rounds, Target
-from ros_row import RIGHT, Carried, Row
-from ros_stage import DIRECT, MEDIAN, Bench, Call, Measured, Options, Turn, main
+from ros_row import Carried, Row
+from ros_stage import DIRECT, MEDIAN, Bench, Call, Measured, Turn, main
+from skeleton import Options
+from topologies import RIGHT
 
 from proxy.config.config import Encoding
 

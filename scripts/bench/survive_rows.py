@@ -25,8 +25,6 @@ from topologies import ends_of, make_topology
 
 from lab.topology import Link
 
-__all__ = ["NEW_TOPICS", "ROWS", "Row"]
-
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40
 _DEARER: Final = 12

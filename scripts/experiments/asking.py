@@ -15,8 +15,6 @@ from report import progress
 from samples import Sample
 from series import Series
 
-__all__ = ["Asking"]
-
 _ROBOT: Final = "robot"
 _BEGIN_S: Final = 90.0
 _SILENT_S: Final = 20.0  # silence of a client between two samples

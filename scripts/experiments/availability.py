@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from experiment import Computed, Options, command_line, run_experiment
+from experiment import Computed, command_line, run_experiment
 from preconditions import data_folder
 from report import print_table
+from skeleton import Options
 
 from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text

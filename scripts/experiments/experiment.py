@@ -27,20 +27,6 @@ from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit, new_run
 
-__all__ = [
-    "CASES",
-    "OUTPUT",
-    "Computed",
-    "Finding",
-    "Options",
-    "Report",
-    "command_line",
-    "field_of",
-    "latencies_of",
-    "run_experiment",
-    "work_of",
-]
-
 OUTPUT: Final = ROOT / "docs" / "experiments"
 CASES: Final = ("one server", "two replicas")
 _COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")

@@ -33,8 +33,6 @@ from gdp.metadata import Metadata
 from gdp.trust.right import Right
 from lab.topology import Topology
 
-__all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
-
 ROBOT: Final = "robot"
 READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from asking import Asking
-from experiment import Finding, Options, Report, command_line, run_experiment
+from experiment import Finding, Report, command_line, run_experiment
 from recovery_stage import DEDICATED, REPLICA
 from samples import Sample
 from series import Series
+from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 
 REQUESTS, QUICK = 100, 10

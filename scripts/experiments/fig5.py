@@ -21,23 +21,14 @@ from statistics import fmean
 from typing import Final
 
 from asking import Asking
-from experiment import (
-    CASES,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from pictures import save_distributions
 from preconditions import DATA, RefusedError, data_folder
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Summary, least_of_two, p99
 from series import Series
+from skeleton import Options
 
 TYPE: Final = "nav_msgs/srv/GetPlan"
 TRIALS: Final = {"Home": 12, "Cubicles": 60, "Twistycool": 5}

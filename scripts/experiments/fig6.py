@@ -14,23 +14,14 @@ from statistics import median
 from typing import Final
 
 from asking import Asking
-from experiment import (
-    CASES,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Summary, least_of_two, p99
 from series import Contention, Series
+from skeleton import Options
 from vision import require_networks
 
 REQUESTS: Final = 300

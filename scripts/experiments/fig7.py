@@ -10,22 +10,13 @@ from __future__ import annotations
 from typing import Final
 
 from asking import Asking
-from experiment import (
-    CASES,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
 from samples import Sample, Summary
 from series import Series
+from skeleton import Options
 from vision import require_networks
 
 DELAY_S: Final = 0.1

@@ -13,12 +13,13 @@ from dataclasses import replace
 from typing import Final
 
 from asking import Asking
-from experiment import Finding, Options, Report, command_line, run_experiment
+from experiment import Finding, Report, command_line, run_experiment
 from pictures import Span, save_timeline
 from recovery_stage import DEDICATED
 from report import progress
 from samples import Sample, Summary
 from series import Series
+from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 
 MINUTES: Final = 2.0

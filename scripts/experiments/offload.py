@@ -21,13 +21,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Final
 
 from bench_path import ROOT
-from experiment import OUTPUT, Computed, Options, command_line, run_experiment
+from experiment import OUTPUT, Computed, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from peers.process import Started
 from report import progress
-from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from skeleton import new_run
+from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
+from skeleton import Options, new_run
+from topologies import LEFT, RIGHT
 
 from gdp.host.cgroups import Cgroup
 from lab.topology import ring5

@@ -14,20 +14,6 @@ from typing import Any, Final
 from machine import MachineState
 from report import markdown_table, percentile
 
-__all__ = [
-    "CDR",
-    "CYCLONE",
-    "FAST",
-    "JSON",
-    "PAPER",
-    "PAPER_ADDED_S",
-    "added_s",
-    "page_of",
-    "save_picture",
-    "seconds_text",
-    "share_text",
-]
-
 CYCLONE: Final = "ROS 2, Cyclone DDS"
 FAST: Final = "ROS 2, Fast DDS"
 JSON: Final = "overlay, JSON"

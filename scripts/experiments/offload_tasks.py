@@ -29,8 +29,6 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 if TYPE_CHECKING:
     from planning import Problem
 
-__all__ = ["TASKS", "OffloadTask"]
-
 _FRAMES: Final = (2, 3, 4, 5)  # the first of the five recorded frames is too far from the second to be matched well
 _NEAR_M: Final = 0.1
 _TURNED_RAD: Final = 0.1

@@ -17,15 +17,14 @@ from dataclasses import dataclass
 from typing import Final
 
 from asking import Asking
-from experiment import Finding, Options, Report, command_line, field_of, run_experiment, work_of
+from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
 from pictures import Span, save_timeline
 from samples import Sample
 from series import Series
+from skeleton import Options
 
 from fog.plan.failure import chance_down, joint
-
-__all__ = ["Outage", "draw_outages", "share_unanswered"]
 
 SECONDS: Final = 180.0
 QUICK_S: Final = 6.0

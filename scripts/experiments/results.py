@@ -18,8 +18,6 @@ from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seco
 from report import markdown_table
 from samples import p99
 
-__all__ = ["THIS_RUN", "Row", "machines_of", "page_of", "rows_of"]
-
 THIS_RUN: Final = "this run"
 
 _RESAMPLES: Final = 2_000

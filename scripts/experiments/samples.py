@@ -13,8 +13,6 @@ from statistics import fmean
 import bench_path  # noqa: F401 - finds ``report``
 from report import percentile
 
-__all__ = ["Sample", "Summary", "least_of_two", "p99"]
-
 
 @dataclass(frozen=True, slots=True)
 class Sample:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Contention", "Series"]
-
 
 @dataclass(frozen=True, slots=True)
 class Series:

@@ -14,8 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from experiment import Computed, Options, command_line, run_experiment
+from experiment import Computed, command_line, run_experiment
 from report import markdown_table, print_table
+from skeleton import Options
 
 from fog.catalog.aws import aws_prices
 from fog.hardware import Hardware

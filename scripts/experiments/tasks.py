@@ -15,8 +15,6 @@ from rcl_interfaces.srv import ListParameters, SetParameters
 if TYPE_CHECKING:
     from vision import Grey, Scene
 
-__all__ = ["TASKS", "WARM_UP", "Judged", "Request", "Response", "Task"]
-
 Request: TypeAlias = "GetPlan.Request | ListParameters.Request | SetParameters.Request"
 Response: TypeAlias = "GetPlan.Response | ListParameters.Response | SetParameters.Response"
 

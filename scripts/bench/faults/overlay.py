@@ -38,8 +38,6 @@ from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from ring.credentials import OverlayCredentials
 
-__all__ = ["Overlay"]
-
 READY_S: Final = 60.0
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 _OWNER: Final = "owner"

@@ -28,8 +28,6 @@ from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from lab.namespaces import Namespaces
 
-__all__ = ["StoreCluster", "critical_lines", "has_server"]
-
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
 _KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
 _BRIDGE: Final = "servers"

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from testbed import Lab
+from topologies import LEFT
 
-from peers.chain import LEFT, Chain
+from peers.chain import Chain
 from peers.exchange import Load
 from peers.jsonl import EndSettings
 from peers.process import FailedError, Started
-
-__all__ = ["Baseline", "Measured", "ask_end", "start_end"]
 
 READY_S = 20.0
 _MEASURED_S = 180.0

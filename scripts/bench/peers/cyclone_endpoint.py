@@ -29,8 +29,6 @@ from cyclonedds.topic import Topic
 from peers.exchange import ANSWER, answer_to, exchange
 from peers.jsonl import EndSettings, say
 
-__all__ = ["main"]
-
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE: Final = 16
 _FOREVER_S: Final = 3_600.0

@@ -8,12 +8,12 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from topologies import LEFT, RIGHT
+
 from peers.baseline import READY_S, Measured, ask_end, start_end
-from peers.chain import LEFT, NODES, RIGHT, Chain, address
+from peers.chain import NODES, Chain, address
 from peers.exchange import Load
 from peers.process import Started
-
-__all__ = ["CycloneNet", "cyclone_xml"]
 
 _MODULE: Final = "peers.cyclone_endpoint"
 

@@ -29,8 +29,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.standard_types import standard_definition
 
-__all__ = ["PONG", "main", "ping_topic"]
-
 PONG: Final = "/pong"
 _FOREVER_S: Final = 3_600.0
 

@@ -9,15 +9,14 @@ from contextlib import ExitStack
 from typing import Final
 
 from testbed import OverlayNodes
+from topologies import LEFT, MIDDLE, RIGHT
 
 from gdp.trust.right import Right
 from peers.baseline import READY_S, Measured, ask_end, start_end
-from peers.chain import LEFT, MIDDLE, RIGHT, Chain
+from peers.chain import Chain
 from peers.exchange import Load
 from peers.gdp_endpoint import PONG, ping_topic
 from peers.process import Started
-
-__all__ = ["ENCODINGS", "GdpNet"]
 
 ENCODINGS: Final = ("json", "cbor", "cdr")
 _MODULE: Final = "peers.gdp_endpoint"

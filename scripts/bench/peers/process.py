@@ -21,8 +21,6 @@ from typing import Final, TypeVar
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 
-__all__ = ["FailedError", "Started", "figures_of", "floats_of", "until"]
-
 _BENCH: Final = Path(__file__).resolve().parents[1]
 _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0

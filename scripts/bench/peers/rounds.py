@@ -23,8 +23,6 @@ from peers.exchange import Load
 from peers.figures import CPU, MEDIAN, P99, case_of
 from peers.process import FailedError
 
-__all__ = ["Plan", "Turns"]
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:

@@ -19,8 +19,6 @@ import zenoh
 from peers.exchange import answer_to, exchange
 from peers.jsonl import EndSettings, say
 
-__all__ = ["main"]
-
 _PING: Final = "bench/ping"
 _PONG: Final = "bench/pong"
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Final
 
+from topologies import LEFT, MIDDLE, RIGHT
+
 from peers.baseline import READY_S, Measured, ask_end, start_end
 from peers.certificates import make_certificates
-from peers.chain import LEFT, MIDDLE, NODES, RIGHT, Chain, address
+from peers.chain import NODES, Chain, address
 from peers.exchange import Load
 from peers.jsonl import EndSettings
 from peers.process import Started
-
-__all__ = ["ZenohNet"]
 
 _MODULE: Final = "peers.zenoh_endpoint"
 _PORT: Final = 7447

@@ -10,8 +10,6 @@ from typing import Protocol
 
 from thin_link.traffic import Stream
 
-__all__ = ["Arrival", "Carrier"]
-
 Arrival = Callable[[Stream, bytes, int], None]  # stream, message, monotonic ns; any thread
 
 

@@ -18,8 +18,6 @@ from itertools import pairwise
 from random import Random
 from typing import Final, Protocol
 
-__all__ = ["OPPORTUNITY_BYTES", "Channel", "ConstantRate", "Counters", "Loss", "Rate", "TraceRate"]
-
 OPPORTUNITY_BYTES: Final = 1_500  # of one line of a trace; mahimahi, NSDI/ATC 2015, section 3.2
 _MS_NS: Final = 1_000_000
 _SLOT_NS: Final = 100 * _MS_NS

@@ -23,8 +23,6 @@ from peers.cyclone_endpoint import Opaque
 from thin_link.carrier import Arrival
 from thin_link.traffic import Stream
 
-__all__ = ["CycloneCarrier"]
-
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian
 _AT_ONCE: Final = 16

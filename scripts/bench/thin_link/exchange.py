@@ -16,8 +16,6 @@ from typing import Final
 from thin_link.carrier import Carrier
 from thin_link.traffic import Direction, Stream, make_message, open_message
 
-__all__ = ["Exchange", "Window"]
-
 _QUEUE: Final = 1_024
 
 

@@ -17,8 +17,6 @@ from gdp.runtime.memory_tuning import tune_memory
 from thin_link.carrier import Arrival
 from thin_link.traffic import Stream
 
-__all__ = ["GdpCarrier"]
-
 _PATIENCE_S: Final = 30.0
 _QUEUE: Final = 4_096
 

@@ -16,10 +16,6 @@ from thin_link.conditions import Conditions
 from thin_link.line import Used
 from thin_link.traffic import Stream, wire_bytes
 
-__all__ = ["AGE_P50", "AGE_P99", "ARRIVED", "DROPS", "DUE", "FRACTION", "LINK_COLUMNS", "OF_LINK", "OVER_IDLE",
-           "QUEUE_P50", "RELAY_LATE", "SENT", "SHARE", "SHARE_BOTH", "STREAM_COLUMNS", "TCP_ALONE", "TCP_BOTH",
-           "WHOLE",            "Report", "link_figures", "merged", "stream_figures", "whole_share"]  # fmt: skip
-
 DUE: Final = "due"
 SENT: Final = "sent"
 ARRIVED: Final = "arrived whole"

@@ -20,8 +20,6 @@ from gdp.trust.right import Right
 from thin_link.line import ADDRESSES, CLOUD, ROBOT
 from thin_link.traffic import streams
 
-__all__ = ["SYSTEMS", "System", "start_role"]
-
 _READY_S: Final = 45.0
 _MODULE: Final = "uplink_endpoint"
 _PORT: Final = 7_447

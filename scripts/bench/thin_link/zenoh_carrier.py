@@ -16,8 +16,6 @@ import zenoh
 from thin_link.carrier import Arrival
 from thin_link.traffic import Stream
 
-__all__ = ["ZenohCarrier"]
-
 
 class ZenohCarrier:
     """Session of a peer."""
