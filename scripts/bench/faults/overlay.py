@@ -19,7 +19,7 @@ from typing import Final
 
 import yaml
 from devices import hand_over, received, set_up
-from peers.process import Started
+from peers.process import FailedError, Started
 from pyroute2 import IPRoute
 from testbed import Lab
 
@@ -206,6 +206,17 @@ class Overlay:
             if (member, incarnation_id) not in self._records:
                 self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
             yield incarnation_id, self._records[member, incarnation_id].read()
+
+    def new_records(self, member: str) -> Iterator[Record]:
+        """Yield what all incarnations of a member recorded since the last call.
+
+        Raises:
+            FailedError: a process ended by itself.
+        """
+        for who in self.died():
+            raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
+        for _, records in self.read(member):
+            yield from records
 
     def signal(self, who: str, number: signal.Signals) -> None:
         """Send a signal.
