@@ -29,10 +29,10 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from baselines import Baseline, Bridge, Direct, IPv4, Plane
+from baselines import Baseline, Bridge, IPv4, Plane
 from chains import Chain
 from machine import offload_text
-from peers.process import FailedError
+from peers.process import FailedError, Started
 from plot import Panel, panel_of
 from rate_search import LOSS_MAX, highest
 from report import Rounds, Target, percentile, progress
@@ -75,20 +75,22 @@ class Bench:
         """
         if baseline.name in self.over.reasons:
             return
-        try:
-            standing = baseline.stand(chain)
-        except (LocalError, FailedError) as error:
-            self.over.absent(baseline.name, str(error))
-            return
-        with standing:
+        with ExitStack() as undo:
+            try:
+                workers = undo.enter_context(baseline.stand(chain))
+            except (LocalError, FailedError) as error:
+                self.over.absent(baseline.name, str(error))
+                return
             for size in sizes:
-                figures = self._figures(baseline, chain, size)
+                figures = self._figures(baseline, chain, workers, size)
                 for length in lengths:
                     for column, value in figures.items():
                         self.over.add(baseline.name, case_of(size, length), column, value)
 
-    def _figures(self, baseline: Baseline, chain: Chain, size: int) -> dict[str, float | None]:
-        wire, workers = baseline.wire(chain, size), baseline.workers()
+    def _figures(
+        self, baseline: Baseline, chain: Chain, workers: Sequence[Started], size: int
+    ) -> dict[str, float | None]:
+        wire = baseline.wire(chain, size)
         pings = min(self._pings, 50) if baseline.name == "scapy" else self._pings
         slept = chain.round_trips(wire, pings, poll=False)
         apart = not baseline.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
@@ -127,7 +129,8 @@ def case_of(size: int, switches: int) -> str:
 
 def baselines_of(only: Sequence[str]) -> list[Baseline]:
     """Return the selected baselines, by default all; those to compare are adjacent."""
-    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
+    others = [Bridge("bridge"), IPv4("IPv4")]
+    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), *others]
     known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
     return [each for each in known if not only or each.name in only]
 
@@ -164,7 +167,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 for chain in chains.values():
                     chain.set_mtu(mtu)
                 progress(f"{where}: ends alone")
-                bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
+                bench.measure(Baseline("ends alone"), chains[0], bytes_each, LENGTHS)
                 for length in LENGTHS:
                     for baseline in baselines_of(options.only):
                         progress(f"{where}, {length} in the middle: {baseline.name}")
