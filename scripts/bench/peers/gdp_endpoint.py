@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol, get_args
+from typing import Final, TypeAlias, get_args
 
 from member_endpoint import End
 
@@ -36,25 +36,6 @@ _FOREVER_S: Final = 3_600.0
 def ping_topic(encoding: str) -> str:
     """Return the topic that carries messages in an encoding."""
     return f"/ping/{encoding}"
-
-
-class Endpoint(Protocol):
-    """One side: publishes some topics and reads others."""
-
-    def advertise(self, topic: str) -> Callable[[bytes], None]:
-        """Publish a topic, reliably; return what sends a message."""
-
-    def subscribe(self, topic: str) -> None:
-        """Read a topic."""
-
-    def wait_for_readers(self, deadline_s: float) -> None:
-        """Wait until each published topic is read; raises ``TimeoutError``."""
-
-    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
-        """Return the next message with its topic; None when the monotonic second passed."""
-
-    def resent(self, topic: str) -> int:
-        """Return how many parts of a published topic were sent again."""
 
 
 class LibraryEndpoint:
@@ -159,6 +140,9 @@ class UnicastEndpoint:
     def _flush(self) -> None:
         self._end.member.flush(time.monotonic())
         self._end.runtime.send()
+
+
+Endpoint: TypeAlias = "LibraryEndpoint | UnicastEndpoint"
 
 
 class GdpWay:

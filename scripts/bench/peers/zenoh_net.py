@@ -64,7 +64,7 @@ class ZenohNet:
             links = chain.topology.links
             hosts = {host: [address(host, link.other(host)) for link in links if host in link.ends()] for host in NODES}
             make_certificates(directory, hosts)
-        return {"certificates": str(directory), "host": node}
+        return {"certificate": str(directory / node)}
 
 
 def _router(chain: Chain, node: str, own: dict[str, str]) -> Started:
