@@ -11,6 +11,7 @@ empty folders. A camera on the robot and a viewer on the server are ordinary rcl
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -110,7 +111,9 @@ def _follow(commands: Sequence[TypedCommand], runs: RunRegistry, delay_ms: float
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
             command = tutorial.machines[label].command
-            nodes[role] = stack.enter_context(Started(run, role, command, [_ENDPOINT, role, TOPIC]))
+            nodes[role] = stack.enter_context(
+                Started(run, role, command, [_ENDPOINT, role, json.dumps({"topic": TOPIC})])
+            )
             nodes[role].read(_PATIENCE_S)
         begun_s = at_s = time.monotonic()
         for each in commands:

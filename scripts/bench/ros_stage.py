@@ -20,9 +20,8 @@ from peers.process import FailedError, figures_of
 from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_environment import BUFFER_BYTES
-from ros_row import READY_S, Carried, Row
+from ros_row import Carried, Row
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
 from gdp.host.run_registry import RunRegistry
 from proxy.config.config import Encoding
@@ -77,28 +76,6 @@ class Turn:
         found = {MEDIAN: 1e3 * figures["p50_s"], P99: 1e3 * figures["p99_s"]}
         found |= {column: figures[key] for column, key in self.counts.items()}
         return found if self.encoding is None else {**found, CORES: cores}
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """Client at A and server at B, both from one module; the client reports when it begins and when it ends."""
-
-    module: str
-    server: str
-    client: str
-    seconds: float
-    done_s: float
-
-    def measure(self, row: Row, *, direct: bool, **settings: object) -> Measured:
-        """Run both for ``seconds``; ``done_s`` is the time that the last answers may take."""
-        settings["seconds"] = self.seconds
-        with row.node(RIGHT, self.module, self.server, direct=direct, **settings) as server:
-            server.read(READY_S)
-            with row.node(LEFT, self.module, self.client, direct=direct, **settings) as client:
-                begun = client.read(READY_S)
-                cpu_s = row.proxies_cpu_s()
-                said = {**begun, **client.read(self.seconds + self.done_s)}
-                return said, (row.proxies_cpu_s() - cpu_s) / self.seconds
 
 
 @dataclass(frozen=True, slots=True)

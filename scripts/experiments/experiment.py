@@ -169,6 +169,21 @@ def work_of(served: Iterable[Served], role: str, settings: Mapping[str, Mapping[
     return {each: Work(role, {**own, "services": names[each]}) for each, own in settings.items()}
 
 
+def gains(
+    label: str,
+    one: Sequence[Sample],
+    two: Sequence[Sample],
+    paper: Sequence[str] = ("", ""),
+    targets: Sequence[float | None] = (None, None),
+) -> tuple[Finding, Finding]:
+    """Return mean and p99 of one server over those of two replicas; ``label`` has ``{}`` in place of either word."""
+    single, pair = Summary.of(one), Summary.of(two)
+    return (
+        Finding(label.format("mean"), single.mean_s / pair.mean_s, targets[0], paper=paper[0]),
+        Finding(label.format("p99"), single.p99_s / pair.p99_s, targets[1], paper=paper[1]),
+    )
+
+
 def latencies_of(groups: Mapping[str, Sequence[Sample]], label: str, names: Iterable[str], scale: float) -> Panels:
     """Return the latencies of both cases for each panel.
 

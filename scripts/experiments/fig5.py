@@ -21,12 +21,12 @@ from statistics import fmean
 from typing import Final
 
 from asking import Asking
-from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from pictures import save_distributions
 from preconditions import DATA, RefusedError, data_folder
 from recorded import FASTER, LIMIT_S, draw, load
-from samples import Sample, Summary, least_of_two, p99
+from samples import Sample, least_of_two, p99
 from series import Series
 from skeleton import Options
 
@@ -148,33 +148,28 @@ def _ask(here: Field, problem: str, count: int, *, patience_s: float) -> dict[st
 
 
 def _planning_findings(name: str, found: Mapping[str, Sequence[Sample]]) -> list[Finding]:
-    one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
     alone = [each.latency_s for each in found[_ONE]]
-    pairs = least_of_two(alone) or alone
-    mean_gain, p99_gain = _PAPER.get(name, ("", ""))
+    offline = p99(alone) / p99(least_of_two(alone) or alone)
     return [
-        Finding(f"{name}, computed: mean gain", one.mean_s / two.mean_s, paper=mean_gain),
-        Finding(f"{name}, computed: p99 gain", one.p99_s / two.p99_s, paper=p99_gain),
-        Finding(
-            f"{name}, computed: p99 gain offline, least of any two of one server's samples", p99(alone) / p99(pairs)
-        ),
+        *gains(f"{name}, computed: {{}} gain", found[_ONE], found[_TWO], _PAPER.get(name, ("", ""))),
+        Finding(f"{name}, computed: p99 gain offline, least of any two of one server's samples", offline),
     ]
 
 
 def _waiting_findings(
     name: str, found: Mapping[str, Sequence[Sample]], both: Sequence[Sequence[float]]
 ) -> list[Finding]:
-    one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
+    paper = _PAPER.get(name.partition(",")[0], ("", ""))
+    mean_gain, p99_gain = gains(f"{name}: {{}} gain", found[_ONE], found[_TWO], paper)
     least = [min(each) for each in zip(*both, strict=True)]
     offline = p99(both[0]) / p99(least)
-    added_ms = 1e3 * (one.mean_s - fmean(both[0]))
-    mean_gain, p99_gain = _PAPER.get(name.partition(",")[0], ("", ""))
+    added_ms = 1e3 * (fmean(each.latency_s for each in found[_ONE]) - fmean(both[0]))
     return [
-        Finding(f"{name}: mean gain", one.mean_s / two.mean_s, paper=mean_gain),
+        mean_gain,
         Finding(f"{name}: mean gain offline", fmean(both[0]) / fmean(least)),
-        Finding(f"{name}: p99 gain", one.p99_s / two.p99_s, paper=p99_gain),
+        p99_gain,
         Finding(f"{name}: p99 gain offline", offline),
-        Finding(f"{name}: p99 gain / p99 gain offline", one.p99_s / two.p99_s / offline, 0.95),
+        Finding(f"{name}: p99 gain / p99 gain offline", p99_gain.measured / offline, 0.95),
         Finding(f"{name}: latency less wait, one server, mean, ms", added_ms),
     ]
 

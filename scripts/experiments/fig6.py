@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import random
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
 from asking import Asking
-from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
-from samples import Sample, Summary, least_of_two, p99
-from series import Contention, Series
+from samples import Sample, least_of_two, p99
+from series import Series
 from skeleton import Options
 from vision import require_networks
 
@@ -92,22 +92,18 @@ def measure(options: Options) -> Report:
     counts = {what: count for what in chosen if (count := wanted[_SETTINGS[what].role])}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]
     groups: dict[str, list[Sample]] = {}
-    findings = []
+    findings: list[Finding] = []
     for what, count in counts.items():
         setting = _SETTINGS[what]
         series = Series(setting.role, (_ONE, _TWO), 2 * count, _MACHINES, _PATIENCE_S, gap_s=_GAP_S)
         work = work_of(served, setting.role, {each: {"takes_s": times} for each, times in _times().items()})
         with field_of(served, work) as here:
-            contention = asdict(Contention(setting.role, _ONE, ON_S, OFF_S))
+            contention = {"task": setting.role, "service": _ONE, "on_s": ON_S, "off_s": OFF_S}
             conflict = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
             with conflict, Asking(here, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
         groups |= {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
-        one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
-        findings += [
-            Finding(f"mean gain, {what}", one.mean_s / two.mean_s, paper=setting.paper[0]),
-            Finding(f"p99 gain, {what}", one.p99_s / two.p99_s, paper=setting.paper[1]),
-        ]
+        findings += gains(f"{{}} gain, {what}", found[_ONE], found[_TWO], setting.paper)
     findings.append(Finding("p99 gain offline, least of any two recorded runs", _OFFLINE, paper="1.3"))
     panels = latencies_of(groups, "{name}, {case}", counts, 1e3)
     return Report(

@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import Final
 
 from asking import Asking
-from experiment import CASES, Finding, Report, command_line, field_of, latencies_of, run_experiment, work_of
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
-from samples import Sample, Summary
+from samples import Sample
 from series import Series
 from skeleton import Options
 from vision import require_networks
@@ -97,18 +97,14 @@ def measure(options: Options) -> Report:
 def _compared(found: dict[str, list[Sample]], *, has_target: bool) -> tuple[dict[str, list[Sample]], list[Finding]]:
     """Return the cases, and the gains. The near machine's requests are shared out between the links in turn."""
     groups: dict[str, list[Sample]] = {}
-    findings = []
+    findings: list[Finding] = []
     near = found[f"/detect/{_NEAR}"]
     for at, (machine, (link, _)) in enumerate(_LINKS.items()):
         one = near[at :: len(_LINKS)] + found[f"/detect/{machine}"]
         two = found[f"/detect/both/{machine}"]
         groups |= {f"{case}, {link}": samples for case, samples in zip(CASES, (one, two), strict=True)}
-        single, pair = Summary.of(one), Summary.of(two)
-        mean, tail = (2.1, 3.9) if has_target else (None, None)
-        findings += [
-            Finding(f"mean gain, {link}", single.mean_s / pair.mean_s, mean, paper="2.1"),
-            Finding(f"p99 gain, {link}", single.p99_s / pair.p99_s, tail, paper="3.9 (2.0 in the abstract)"),
-        ]
+        targets = (2.1, 3.9) if has_target else (None, None)
+        findings += gains(f"{{}} gain, {link}", one, two, ("2.1", "3.9 (2.0 in the abstract)"), targets)
     return groups, findings
 
 

@@ -2,7 +2,7 @@
 
 Process of its own, started by ``field.py`` at the robot or at a server: ``robot.py ROLE SETTINGS``.
 
-``ask`` makes a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
+``ask`` makes a series of calls (``series.py``), ``busy`` is the second client of figure 6.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
 from ros_endpoint import End, Settings, reliable, run_role
 from samples import Sample
-from series import Contention, Series
+from series import Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
 
@@ -153,16 +153,15 @@ def ask(end: End, settings: Settings) -> None:
 
 
 def busy(end: End, settings: Settings) -> None:
-    """Run as the second client, until killed."""
-    contention = Contention(**settings)  # type: ignore[arg-type]
-    client = _Client(end.node, TASKS[contention.task](""), [contention.service])
+    """Call one service, one call after the other for ``on_s``, none for ``off_s``, and so on, until killed."""
+    on_s, off_s = float(str(settings["on_s"])), float(str(settings["off_s"]))
+    client = _Client(end.node, TASKS[str(settings["task"])](""), [str(settings["service"])])
     client.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)
 
     def tick() -> None:
-        period_s = contention.on_s + contention.off_s
-        if (time.monotonic() - begun_s) % period_s < contention.on_s and not client.under_way:
+        if (time.monotonic() - begun_s) % (on_s + off_s) < on_s and not client.under_way:
             client.ask(tick)
 
     end.every(_TICK_S, tick)

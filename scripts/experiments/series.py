@@ -1,4 +1,4 @@
-"""Settings of a client at the robot: a series of calls, and the load of the second client of figure 6.
+"""Settings of a client at the robot: a series of calls.
 
 Sans-I/O. They are passed to the process of the client as JSON.
 """
@@ -34,13 +34,3 @@ class Series:
     warm_up: int = 4
     problem: str = ""
     counts_answers: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Contention:
-    """Calls of one service, one after the other for ``on_s``, none for ``off_s``, and so on."""
-
-    task: str
-    service: str
-    on_s: float
-    off_s: float

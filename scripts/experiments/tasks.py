@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import ListParameters, SetParameters
@@ -34,20 +34,6 @@ class Judged:
     worked_s: float
     is_right: bool
     note: float = 0.0
-
-
-class Task(Protocol):
-    """Kind of a request."""
-
-    kind: type[GetPlan] | type[ListParameters] | type[SetParameters]
-
-    def request(self, number: int) -> Request:
-        """Return the request with this number."""
-        ...
-
-    def judge(self, number: int, response: Response) -> Judged:
-        """Return the value of an answer to the request with that number."""
-        ...
 
 
 class Plan:
@@ -163,6 +149,8 @@ def _said(response: Response) -> dict[str, object]:
 def _judged(said: Mapping[str, object], *, is_right: bool, note: float = 0.0) -> Judged:
     return Judged(str(said["machine"]), float(str(said["worked_s"])), is_right, note)
 
+
+Task: TypeAlias = "Plan | Number | Look | Tag"
 
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
