@@ -154,8 +154,6 @@ def targets_of(over: Rounds) -> list[Target]:
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every chain, round by round."""
-    if options.realtime:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     sizes = {1_500: (1_400,)} if options.quick else SIZES
     bench = Bench(options.seconds, 200 if options.quick else PINGS)
     with ExitStack() as undo:
@@ -179,7 +177,6 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         "loss below": LOSS_MAX,
         "MTU": list(sizes),
         "cores": "source 0, sink 1, switches anywhere",
-        "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
         "offloads of the devices (none touches AF_PACKET frames)": found,
     }
     return Outcome(
@@ -211,5 +208,4 @@ if __name__ == "__main__":
         has_plot=True,
     )
     parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
-    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for every process alike")
     run_bench(parser, measure)

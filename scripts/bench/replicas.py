@@ -34,8 +34,7 @@ from field import READY_S, Field, Served, Server, Work  # noqa: E402
 from peers.process import FailedError  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
-from samples import Sample  # noqa: E402
-from series import Series  # noqa: E402
+from samples import Sample, Series  # noqa: E402
 from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
 
 from gdp.host.run_registry import RunRegistry  # noqa: E402

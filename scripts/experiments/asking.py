@@ -12,8 +12,7 @@ from typing import Final, Protocol
 import bench_path  # noqa: F401 - finds ``peers``
 from peers.process import Started
 from report import progress
-from samples import Sample
-from series import Series
+from samples import Sample, Series
 
 _ROBOT: Final = "robot"
 _BEGIN_S: Final = 90.0

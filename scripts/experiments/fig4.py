@@ -14,8 +14,7 @@ from typing import Final
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
 from recovery_stage import DEDICATED, REPLICA
-from samples import Sample
-from series import Series
+from samples import Sample, Series
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 

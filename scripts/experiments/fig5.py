@@ -26,8 +26,7 @@ from field import Field, Served, Work
 from pictures import save_distributions
 from preconditions import DATA, RefusedError, data_folder
 from recorded import FASTER, LIMIT_S, draw, load
-from samples import Sample, least_of_two, p99
-from series import Series
+from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
 
 TYPE: Final = "nav_msgs/srv/GetPlan"

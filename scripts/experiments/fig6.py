@@ -19,8 +19,7 @@ from field import Served
 from image_request import TYPE
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
-from samples import Sample, least_of_two, p99
-from series import Series
+from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
 from vision import require_networks
 

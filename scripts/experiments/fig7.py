@@ -14,8 +14,7 @@ from experiment import CASES, Finding, Report, command_line, field_of, gains, la
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
-from samples import Sample
-from series import Series
+from samples import Sample, Series
 from skeleton import Options
 from vision import require_networks
 

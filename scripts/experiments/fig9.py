@@ -17,8 +17,7 @@ from experiment import Finding, Report, command_line, run_experiment
 from pictures import Span, save_timeline
 from recovery_stage import DEDICATED
 from report import progress
-from samples import Sample, Summary
-from series import Series
+from samples import Sample, Series, Summary
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 

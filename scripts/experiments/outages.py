@@ -20,8 +20,7 @@ from asking import Asking
 from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
 from pictures import Span, save_timeline
-from samples import Sample
-from series import Series
+from samples import Sample, Series
 from skeleton import Options
 
 from fog.plan.failure import chance_down, joint

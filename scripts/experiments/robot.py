@@ -2,7 +2,7 @@
 
 Process of its own, started by ``field.py`` at the robot or at a server: ``robot.py ROLE SETTINGS``.
 
-``ask`` makes a series of calls (``series.py``), ``busy`` is the second client of figure 6.
+``ask`` makes a series of calls (``samples.py``), ``busy`` is the second client of figure 6.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from rclpy.node import Node
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
 from ros_endpoint import End, Settings, reliable, run_role
-from samples import Sample
-from series import Series
+from samples import Sample, Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
 

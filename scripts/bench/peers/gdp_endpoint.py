@@ -1,6 +1,6 @@
 """Endpoint process of GDP at A and B: a session of the library, or a member of the overlay without it.
 
-Process of its own, started by ``gdp_net.py``; or a client and a server without the library, for requests and
+Process of its own, started by ``systems.py``; or a client and a server without the library, for requests and
 responses. Each message is encoded, encrypted, signed, verified, ordered,
 acknowledged and decoded. That is all that a proxy does except for ROS.
 

@@ -17,11 +17,11 @@ from background_load import load_of
 from report import Rounds, percentile, progress
 
 from gdp.host.run_registry import RunRegistry
-from peers.baseline import Baseline, Measured
 from peers.chain import Chain
 from peers.exchange import Load
 from peers.figures import CPU, MEDIAN, P99, case_of
 from peers.process import FailedError
+from peers.systems import Baseline, Measured
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Endpoint and router processes of Zenoh; the endpoints are as a user would write them (a callback and an Event).
 
-Process of its own, started by ``zenoh_net.py``.
+Process of its own, started by ``systems.py``.
 """
 
 from __future__ import annotations

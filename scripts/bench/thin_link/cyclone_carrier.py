@@ -20,7 +20,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from peers.cyclone_endpoint import Opaque
 
-from thin_link.carrier import Arrival
+from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
 
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any

@@ -13,8 +13,8 @@ from typing import Any, Final, TypeAlias
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from peers.certificates import make_certificates
-from peers.cyclone_net import cyclone_xml
 from peers.process import FailedError, Started
+from peers.systems import cyclone_xml
 from testbed import Lab, OverlayNodes
 
 from gdp.trust.right import Right

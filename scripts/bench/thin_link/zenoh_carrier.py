@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 from peers.zenoh_config import zenoh_config
 
-from thin_link.carrier import Arrival
+from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
 
 
