@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import mac_addresses, set_mtu
+from devices import mac_addresses, set_link
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from peers.process import Started, figures_of, floats_of
@@ -92,7 +92,7 @@ class Chain(Lab):
         """Set the MTU of every device, in bytes."""
         for node in self.nodes:
             for device in self.devices(node):
-                self.inside(node, partial(set_mtu, device, mtu))
+                self.inside(node, partial(set_link, device, mtu=mtu))
 
     def offloads(self) -> list[dict[str, bool]]:
         """Return the offloads of every device."""

@@ -179,7 +179,7 @@ def _kill(last: str, **ways: str) -> Both:
 
 def _again(overlay: Overlay, *names: str) -> None:
     for who in names:
-        overlay.restart(who)
+        overlay.start(who)
     for who in names:
         overlay.await_ready(who)
 

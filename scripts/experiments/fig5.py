@@ -202,16 +202,12 @@ def _notes(counts: Mapping[str, int], timeout_s: float) -> list[str]:
         " A tail is known no better than so many runs show it.",
         f"Gains of the least of any two recorded runs, by arithmetic: {'; '.join(gains)}. The p99 of two servers is the"
         " p90 of one. So a p99 gain of 5.53 needs a p99 that is 5.53 times the p90.",
-        "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is"
-        " not: it"
-        " weighs more here than in the paper (last figure of each).",
+        "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is not:"
+        " it weighs more here than in the paper (last figure of each).",
         f"Computed trials: {counted or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
-        " the p99 is"
-        " the slowest one. A problem without a solution counts with its timeout, as failed."
-        " The replicas share two cores"
-        " with each"
-        " other, the robot and the overlay, and the planner calls back into Python for each check: gains of computed"
-        " trials are less than those of two machines.",
+        " the p99 is the slowest one. A problem without a solution counts with its timeout, as failed. The replicas"
+        " share two cores with each other, the robot and the overlay, and the planner calls back into Python for each"
+        " check: gains of computed trials are less than those of two machines.",
         "The paper's planner is not named in what is at hand; the gains depend on how heavy a planner's tail is.",
     ]
 

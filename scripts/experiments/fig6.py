@@ -57,8 +57,7 @@ _SETTING: Final = (
     "A robot calls a service that finds the words in frames of 640 x 480 bytes. *Contended*: a second client of the"
     f" same service, next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for"
     f" {OFF_S:g} s. The node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and"
-    " no other client asks."
-    " Both cases take turns, request by request, with the same frames.",
+    " no other client asks. Both cases take turns, request by request, with the same frames.",
     "*Servers compute*: each runs DBNet, a neural network that gives every pixel its probability of being text, and"
     " answers the mask. *Servers wait*: they run no network, count the words by their brightness, and wait for the rest"
     " of the time, as if a processor of their own worked. The time is drawn, for each request and replica, from"

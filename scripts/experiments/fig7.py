@@ -33,8 +33,7 @@ _SETTING: Final = (
     "A robot calls a service that looks for words in frames of 640 x 480 bytes. The link of one of its two servers is"
     " slowed down, the other one's is not. *One server*: requests go to the two servers in turn, as where a load"
     " balancer or an anycast address picks the server. So half of them meet the slow link. *Two replicas*: each"
-    " request goes to both, and the first answer wins. All cases take turns, request by request, with the same"
-    " frames.",
+    " request goes to both, and the first answer wins. All cases take turns, request by request, with the same frames.",
     "The gain depends on the server's time. A call of the near server takes a, one of the slow server a + d. One server"
     " then has a mean of a + d / 2 and a p99 of a + d; two replicas have a for both. The gains are 1 + d / 2a and"
     f" 1 + d / a. With d = {1e3 * DELAY_S:g} ms a mean gain of 2.1 needs a call of {1e3 * DELAY_S / 2.2:.0f} ms"

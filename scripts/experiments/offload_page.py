@@ -179,10 +179,9 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         " Answers are checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a"
         " grasp on the object.",
         "*Robot only* is the same computation in a control group with the stated share of a core, as the paper's robot"
-        f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's,"
-        " not a"
-        " result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core, as"
-        " the server has.",
+        f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's, not"
+        " a result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core,"
+        " as the server has.",
         "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
         " robot, switches, proxies and server; `--cores` bounds each. Links are veth pairs, without the time of a"
         " cable, and the switches forward in the kernel.",

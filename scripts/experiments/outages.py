@@ -41,21 +41,18 @@ _SEED: Final = 15
 _STEP_S: Final = 0.01
 _SETTING: Final = (
     "A robot asks two services ten times a second each. One is on machine m1 alone, the other one on m1 and m2. Each"
-    " machine stops (SIGSTOP to its node and its proxy at once: its input waits) and goes on, independently."
-    f" The times up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers"
-    " answer"
-    f" at once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
+    " machine stops (SIGSTOP to its node and its proxy at once: its input waits) and goes on, independently. The times"
+    f" up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers answer at"
+    f" once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
     "*By the list*: the share of requests during whose whole patience all their machines are down, computed from the"
     " times drawn, without any overlay. *By arithmetic*: the machines' shares of time down, multiplied.",
 )
 _NOTES: Final = (
     "The paper's times (15 h up, 20 min down) would need months, so the shares here are larger ones. What is tested is"
-    " that shares multiply as the arithmetic says, and that the overlay adds little to it. A service is back as"
-    " soon as a"
-    " machine of it is.",
+    " that shares multiply as the arithmetic says, and that the overlay adds little to it. A service is back as soon"
+    " as a machine of it is.",
     "The machines stop and do not die: a new machine needs time to start, which figure 9 shows. Outages of spot"
-    " machines"
-    " that come together are in availability.md.",
+    " machines that come together are in availability.md.",
 )
 
 

@@ -149,9 +149,8 @@ def page_of(rows: Sequence[Row], machines: Sequence[str], missing: Sequence[str]
 
 
 _NOTES: Final = (
-    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs"
-    " (G), and"
-    " AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
+    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs (G),"
+    " and AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
     " are.",
     "Stand-ins: visual odometry for ORB-SLAM2, geometric ranking for Dex-Net's GQ-CNN, and DBNet on a CPU for SAM and"
     " YOLOv8, run or as recorded. Their answers are checked against known truth. Motion planning is OMPL with FCL on"

@@ -191,15 +191,13 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
         "# Table I: the price of a replica",
         "Made by `python scripts/experiments/table1.py`.",
         "## By application",
-        "USD an hour. *Here*: the cheapest machines on the list that have what the application needs; one"
-        " on-demand in the "
-        f"cheaper of {' and '.join(REGIONS)}, two as one in either region.",
+        "USD an hour. *Here*: the cheapest machines on the list that have what the application needs; one on-demand in"
+        f" the cheaper of {' and '.join(REGIONS)}, two as one in either region.",
         markdown_table(_HEAD, _application_rows(needed)),
         "The paper's prices for MPT are those of m5.8xlarge and m5.16xlarge in us-west-1 on this list (1.792 and"
-        " 3.584), "
-        "and that for SAM is g4dn.xlarge in us-west-2 (0.526). Here c6i in us-west-2 is cheaper for MPT. No"
-        " machine of 16 "
-        "cores on this list costs the paper's 0.40. Spot prices are those of other days, so they differ most.",
+        " 3.584), and that for SAM is g4dn.xlarge in us-west-2 (0.526). Here c6i in us-west-2 is cheaper for MPT. No"
+        " machine of 16 cores on this list costs the paper's 0.40. Spot prices are those of other days, so they differ"
+        " most.",
         "## Ratios",
         markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
         "The paper's abstract says that the cost is up to 2.2 times lower. Over two on-demand machines its own prices"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 import yaml
-from devices import add_address, add_bridge, set_up
+from devices import add_address, add_bridge, set_link
 from peers.process import FailedError, until
 from pyroute2 import IPRoute
 from redis import Redis
@@ -64,7 +64,7 @@ class StoreCluster:
         run.plan_namespace(self._path)
         netns_files.create(self._path)
         netns_files.inside(self._path, netns_files.disable_ipv6)
-        netns_files.inside(self._path, partial(set_up, "lo"))
+        netns_files.inside(self._path, partial(set_link, "lo", state="up"))
         netns_files.inside(self._path, partial(add_bridge, _BRIDGE))
         netns_files.inside(self._path, partial(add_address, _BRIDGE, _ADDRESS))
         for at, node in enumerate(ribs, 2):
@@ -158,7 +158,7 @@ class StoreCluster:
         finally:
             os.close(there)
         netns_files.inside(rib, partial(add_address, _IFNAME, address))
-        netns_files.inside(rib, partial(set_up, _IFNAME))
+        netns_files.inside(rib, partial(set_link, _IFNAME, state="up"))
 
 
 def critical_lines(folder: Path) -> list[str]:

@@ -130,7 +130,8 @@ class UnicastEndpoint:
 
     def resent(self, topic: str) -> int:
         """Return how many parts of the streams to all servers were sent again: nothing is sent on them."""
-        return sum(each.repairs for each in self._end.member.publishers() if each.topic == self._end.name_of(topic))
+        del topic
+        return 0
 
     def _respond(self, message: bytes) -> None:
         if self._asked is not None:

@@ -200,7 +200,7 @@ def start_end(
     return chain.start(node, module.rpartition(".")[2], ["-m", module, settings.to_argument()])
 
 
-def ask_end(ping: Started, labels: Mapping[str, str], patience_s: float = _MEASURED_S) -> list[Measured]:
+def ask_end(ping: Started, labels: Mapping[str, str]) -> list[Measured]:
     """Return the figures of A.
 
     Args:
@@ -211,7 +211,7 @@ def ask_end(ping: Started, labels: Mapping[str, str], patience_s: float = _MEASU
     """
     found: list[Measured] = []
     for series, label in labels.items():
-        said = ping.read(patience_s)
+        said = ping.read(_MEASURED_S)
         sizes, resent = said.get("sizes"), said.get("resent", 0)
         if said.get("series") != series or not isinstance(sizes, list) or not isinstance(resent, int):
             raise FailedError(f"figures of {series} were expected, not {said}")

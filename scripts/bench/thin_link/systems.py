@@ -53,9 +53,6 @@ class Gdp:
 
     name = "gdp"
 
-    def __init__(self, plane: str = "kernel") -> None:
-        self._plane = plane
-
     @contextmanager
     def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
         """Run both ends, robot first, matched and waiting for a window; raises FailedError if one did not come up."""
@@ -63,7 +60,7 @@ class Gdp:
         up = [each.name for each in mix if each.direction == "up"]
         down = [each.name for each in mix if each.direction == "down"]
         with ExitStack() as stack:
-            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane=self._plane)
+            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane="kernel")
             stack.callback(nodes.close)
             robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
             cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
