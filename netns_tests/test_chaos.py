@@ -99,7 +99,7 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
             disk.fill()
             until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
             overlay.kill("rib s1")
-            overlay.restart("rib s1")
+            overlay.start("rib s1")
             overlay.await_ready("rib s1")
             assert "snapshot read live=0" not in rib_log(overlay)
             assert "snapshot read live=" in rib_log(overlay)
@@ -154,7 +154,7 @@ def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Ove
     assert Process.from_pid(overlay.pid("member P")).alive
     overlay.kill("member P")
     assert not overlay.is_running("member P")
-    overlay.restart("member P")
+    overlay.start("member P")
     overlay.await_ready("member P")
     assert overlay.incarnation_id("member P") == 2
     until(lambda: numbers(overlay, "R"), "a message of its new life")

@@ -16,8 +16,6 @@ from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import Final
 
-__all__ = ["LOADS", "SHARE", "BackgroundLoad", "load_of"]
-
 SHARE: Final = 0.5  # of each core
 LOADS: Final = {"none": (False,), "half": (True,), "both": (False, True)}  # of ``--load``: with or without, in turn
 _PERIOD_S: Final = 0.01

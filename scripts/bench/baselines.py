@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from socket import AF_INET
-from typing import Final, Protocol
+from typing import Final
 
 from chains import Chain
 from devices import add_bridge
@@ -25,8 +25,6 @@ from pyroute2 import IPRoute
 from gdp.frame.kinds import ETHERTYPE
 from lab.process import LabProcess
 
-__all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
-
 _READY_S: Final = 120.0
 _IPV4: Final = 0x0800
 _ABSENT: Final = "02:67:64:70:ff:ff"
@@ -34,66 +32,35 @@ _BRIDGE: Final = "bridge"
 _IP_SETTINGS: Final = Path("/proc/sys/net/ipv4")
 
 
-class Baseline(Protocol):
-    """A way to forward.
+class Baseline:
+    """A way to forward; this one has no forwarder: the endpoints are joined directly, for the cost of these.
 
     Attributes:
         name: as it stands in tables.
         processes: user processes in the middle that every frame goes through.
     """
 
-    name: str
-    processes: bool
+    processes = False
+
+    def __init__(self, name: str) -> None:
+        self.name = name
 
     def wire(self, chain: Chain, size: int) -> Wire:
-        """Return frames of ``size`` bytes, Ethernet header included."""
+        """Return frames of ``size`` bytes, Ethernet header included; of GDP, addressed to the next node."""
+        nodes = chain.nodes
+        return _gdp_wire(chain, size, chain.mac(nodes[1], nodes[0]), chain.mac(nodes[-2], nodes[-1]))
 
-    def stand(self, chain: Chain) -> ExitStack:
-        """Set it up in every middle of the chain; closing the returned stack removes it.
+    @contextmanager
+    def stand(self, chain: Chain) -> Iterator[list[LabProcess]]:  # noqa: ARG002
+        """Set it up in every middle of the chain for a context; yield the processes that forward.
 
         Raises:
             LocalError: it is not available here; the text gives the reason.
         """
-
-    def workers(self) -> list[LabProcess]:
-        """Return the processes that forward while it is set up."""
+        yield []
 
 
-def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
-    """Return GDP frames, addressed to the next node, or (``far``) to the other endpoint, as a bridge needs them."""
-    nodes = chain.nodes
-    source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
-    first = sink if far else chain.mac(nodes[1], nodes[0])
-    last = source if far else chain.mac(nodes[-2], nodes[-1])
-    out, back = gdp_frame(first + source, size, SINK, SOURCE), gdp_frame(last + sink, size, SOURCE, SINK)
-    return Wire(ETHERTYPE, out, back)
-
-
-class _ByKernel:
-    """Baseline without processes in the middle."""
-
-    processes = False
-
-    def workers(self) -> list[LabProcess]:
-        """Return no process: the kernel forwards."""
-        return []
-
-
-class Direct(_ByKernel):
-    """No forwarder: the endpoints are joined directly. The figures are the cost of the endpoints."""
-
-    name = "ends alone"
-
-    def wire(self, chain: Chain, size: int) -> Wire:
-        """Return GDP frames of ``size`` bytes, Ethernet header included."""
-        return _gdp_wire(chain, size, far=False)
-
-    def stand(self, chain: Chain) -> ExitStack:  # noqa: ARG002
-        """Set up nothing."""
-        return ExitStack()
-
-
-class Plane:
+class Plane(Baseline):
     """A plane of this project, by its name in ``roles.py``.
 
     Args:
@@ -102,59 +69,47 @@ class Plane:
     """
 
     def __init__(self, name: str, *, processes: bool) -> None:
-        self.name = name
+        super().__init__(name)
         self.processes = processes
-        self._workers: list[LabProcess] = []
 
-    def wire(self, chain: Chain, size: int) -> Wire:
-        """Return GDP frames of ``size`` bytes, Ethernet header included."""
-        return _gdp_wire(chain, size, far=False)
-
-    def stand(self, chain: Chain) -> ExitStack:
-        """Start a switch in every middle; closing the returned stack ends them."""
+    @contextmanager
+    def stand(self, chain: Chain) -> Iterator[list[LabProcess]]:
+        """Run a switch in every middle."""
         with ExitStack() as undo:
-            self._workers = []
-            undo.callback(self._workers.clear)
+            workers = []
             for node in chain.middles:
                 left, right = chain.devices(node)
                 ways = {
                     "left": f"{left} {chain.mac(left, node).hex()}",
                     "right": f"{right} {chain.mac(right, node).hex()}",
                 }
-                worker = chain.worker(node, "switch", plane=self.name, ways=ways)
-                self._workers.append(undo.enter_context(worker))
-            for worker in self._workers:
+                workers.append(undo.enter_context(chain.worker(node, "switch", plane=self.name, ways=ways)))
+            for worker in workers:
                 worker.read(_READY_S)
-            return undo.pop_all()
-
-    def workers(self) -> list[LabProcess]:
-        """Return the switch processes."""
-        return self._workers
+            yield workers
 
 
-class Bridge(_ByKernel):
+class Bridge(Baseline):
     """The Linux bridge: one in each middle namespace, with that node's two devices."""
 
-    name = "bridge"
-
     def wire(self, chain: Chain, size: int) -> Wire:
-        """Return GDP frames addressed to the other endpoint."""
-        return _gdp_wire(chain, size, far=True)
+        """Return GDP frames addressed to the other endpoint, as a bridge needs them."""
+        nodes = chain.nodes
+        return _gdp_wire(chain, size, chain.mac(nodes[-1], nodes[-2]), chain.mac(nodes[0], nodes[1]))
 
-    def stand(self, chain: Chain) -> ExitStack:
-        """Make a bridge in every middle; closing the returned stack removes them."""
+    @contextmanager
+    def stand(self, chain: Chain) -> Iterator[list[LabProcess]]:
+        """Make a bridge in every middle."""
         with ExitStack() as undo:
             for node in chain.middles:
                 undo.callback(chain.inside, node, _remove_bridge)
                 chain.inside(node, partial(add_bridge, _BRIDGE, chain.devices(node)))
             chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
-            return undo.pop_all()
+            yield []
 
 
-class IPv4(_ByKernel):
+class IPv4(Baseline):
     """The kernel's IPv4 forwarding, with static routes and neighbours. Link n is 10.99.n.0/24."""
-
-    name = "IPv4"
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return IPv4 frames of ``size`` bytes, Ethernet header included."""
@@ -167,13 +122,22 @@ class IPv4(_ByKernel):
             ip_frame(chain.mac(nodes[-2], nodes[-1]) + sink, size, near, far),
         )
 
-    def stand(self, chain: Chain) -> ExitStack:
-        """Make every middle a router; closing the returned stack restores it."""
+    @contextmanager
+    def stand(self, chain: Chain) -> Iterator[list[LabProcess]]:
+        """Make every middle a router."""
         with ExitStack() as undo:
             for at, node in enumerate(chain.middles, 1):
                 undo.callback(chain.inside, node, partial(_clear_addresses, chain.devices(node)))
                 chain.inside(node, partial(_route, chain, node, at))
-            return undo.pop_all()
+            yield []
+
+
+def _gdp_wire(chain: Chain, size: int, first: bytes, last: bytes) -> Wire:
+    """Return GDP frames; the source sends to the address ``first``, the sink to ``last``."""
+    nodes = chain.nodes
+    source, sink = chain.mac(nodes[0], nodes[1]), chain.mac(nodes[-1], nodes[-2])
+    out, back = gdp_frame(first + source, size, SINK, SOURCE), gdp_frame(last + sink, size, SOURCE, SINK)
+    return Wire(ETHERTYPE, out, back)
 
 
 @contextmanager

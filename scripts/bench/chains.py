@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import mac_addresses, set_mtu
+from devices import mac_addresses, set_link
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from rate_search import Try
@@ -24,8 +24,6 @@ from testbed import Lab
 from gdp.host.run_registry import RunRegistry
 from lab.process import LabProcess, figures_of, floats_of
 from lab.topology import chain
-
-__all__ = ["ROLES", "Chain"]
 
 ROLES: Final = Path(__file__).with_name("roles.py")
 _SOURCE_CPU, _SINK_CPU = 0, 1
@@ -94,7 +92,7 @@ class Chain(Lab):
         """Set the MTU of every device, in bytes."""
         for node in self.nodes:
             for device in self.devices(node):
-                self.inside(node, partial(set_mtu, device, mtu))
+                self.inside(node, partial(set_link, device, mtu=mtu))
 
     def offloads(self) -> list[dict[str, bool]]:
         """Return the offloads of every device."""

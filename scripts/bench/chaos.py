@@ -228,7 +228,7 @@ class Chaos:
             overlay.disk.fill()
             for rib in targets[1:]:
                 overlay.kill(rib)
-                overlay.restart(rib)
+                overlay.start(rib)
                 self._await(rib)
         elif overlay.store is not None and targets[0] == STORE:
             self._begin_in_store(overlay.store, fault)
@@ -251,7 +251,7 @@ class Chaos:
             for link in targets[1:]:
                 overlay.restore_link(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
-            overlay.restart(targets[0])
+            overlay.start(targets[0])
             self._await(targets[0])
         elif kind is FaultKind.FREEZE:
             overlay.thaw(targets[0])

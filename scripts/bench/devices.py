@@ -9,14 +9,12 @@ from collections.abc import Sequence
 
 from pyroute2 import IPRoute
 
-__all__ = ["add_address", "add_bridge", "add_neighbour", "hand_over", "mac_addresses", "received", "set_mtu", "set_up"]
 
-
-def add_address(device: str, address: str, *, prefix_bits: int = 24) -> None:
-    """Give a device an IPv4 address."""
+def add_address(device: str, address: str) -> None:
+    """Give a device an IPv4 address of a network of 24 bits."""
     with IPRoute() as here:
         (index,) = here.link_lookup(ifname=device)
-        here.addr("add", index=index, address=address, prefixlen=prefix_bits)
+        here.addr("add", index=index, address=address, prefixlen=24)
 
 
 def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
@@ -36,22 +34,10 @@ def add_neighbour(device: str, address: str, mac: bytes) -> None:
         here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=index, state="permanent")
 
 
-def set_up(device: str) -> None:
-    """Set a device up."""
+def set_link(device: str, **change: str | int) -> None:
+    """Change a device: ``state``, ``mtu`` in bytes, or ``net_ns_fd``, the namespace of a descriptor to move it to."""
     with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], state="up")
-
-
-def set_mtu(device: str, mtu: int) -> None:
-    """Set the MTU of a device, in bytes."""
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], mtu=mtu)
-
-
-def hand_over(device: str, namespace: int) -> None:
-    """Move a device to the namespace of a descriptor."""
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], net_ns_fd=namespace)
+        here.link("set", index=here.link_lookup(ifname=device)[0], **change)
 
 
 def received(devices: Sequence[str]) -> dict[str, int]:

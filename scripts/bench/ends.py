@@ -24,8 +24,6 @@ from gdp.frame.codec import ETHER_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
 from gdp.ports.sockets import kernel_drops
 
-__all__ = ["Counted", "Sent", "answer_pings", "count_frames", "open_end", "ping", "send"]
-
 _SOL_PACKET, _QDISC_BYPASS = 263, 20
 _SO_ATTACH_FILTER, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 26, 32, 33
 _RETURN: Final = 0x06  # BPF_RET | BPF_K

@@ -11,6 +11,7 @@ empty folders. A camera on the robot and a viewer on the server are ordinary rcl
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import sys
 import time
@@ -110,7 +111,8 @@ def _follow(commands: Sequence[TypedCommand], runs: RunRegistry, delay_ms: float
         tutorial = Tutorial(laboratory, stack, delay_ms)
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
-            argv = tutorial.machines[label].command([sys.executable, _ENDPOINT, role, TOPIC])
+            settings = [_ENDPOINT, role, json.dumps({"topic": TOPIC})]
+            argv = tutorial.machines[label].command([sys.executable, *settings])
             nodes[role] = stack.enter_context(LabProcess(run, role, argv))
             nodes[role].read(_PATIENCE_S)
         begun_s = at_s = time.monotonic()

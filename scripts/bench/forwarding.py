@@ -29,7 +29,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from baselines import Baseline, Bridge, Direct, IPv4, Plane
+from baselines import Baseline, Bridge, IPv4, Plane
 from chains import Chain
 from machine import offload_text
 from plot import Panel, panel_of
@@ -39,7 +39,7 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError
+from lab.process import FailedError, LabProcess
 
 PINGS: Final = 1_000
 SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
@@ -75,20 +75,22 @@ class Bench:
         """
         if baseline.name in self.over.reasons:
             return
-        try:
-            standing = baseline.stand(chain)
-        except (LocalError, FailedError) as error:
-            self.over.absent(baseline.name, str(error))
-            return
-        with standing:
+        with ExitStack() as undo:
+            try:
+                workers = undo.enter_context(baseline.stand(chain))
+            except (LocalError, FailedError) as error:
+                self.over.absent(baseline.name, str(error))
+                return
             for size in sizes:
-                figures = self._figures(baseline, chain, size)
+                figures = self._figures(baseline, chain, workers, size)
                 for length in lengths:
                     for column, value in figures.items():
                         self.over.add(baseline.name, case_of(size, length), column, value)
 
-    def _figures(self, baseline: Baseline, chain: Chain, size: int) -> dict[str, float | None]:
-        wire, workers = baseline.wire(chain, size), baseline.workers()
+    def _figures(
+        self, baseline: Baseline, chain: Chain, workers: Sequence[LabProcess], size: int
+    ) -> dict[str, float | None]:
+        wire = baseline.wire(chain, size)
         pings = min(self._pings, 50) if baseline.name == "scapy" else self._pings
         slept = chain.round_trips(wire, pings, poll=False)
         apart = not baseline.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
@@ -127,7 +129,8 @@ def case_of(size: int, switches: int) -> str:
 
 def baselines_of(only: Sequence[str]) -> list[Baseline]:
     """Return the selected baselines, by default all; those to compare are adjacent."""
-    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), Bridge(), IPv4()]
+    others = [Bridge("bridge"), IPv4("IPv4")]
+    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), *others]
     known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
     return [each for each in known if not only or each.name in only]
 
@@ -151,8 +154,6 @@ def targets_of(over: Rounds) -> list[Target]:
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every chain, round by round."""
-    if options.realtime:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     sizes = {1_500: (1_400,)} if options.quick else SIZES
     bench = Bench(options.seconds, 200 if options.quick else PINGS)
     with ExitStack() as undo:
@@ -164,7 +165,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 for chain in chains.values():
                     chain.set_mtu(mtu)
                 progress(f"{where}: ends alone")
-                bench.measure(Direct(), chains[0], bytes_each, LENGTHS)
+                bench.measure(Baseline("ends alone"), chains[0], bytes_each, LENGTHS)
                 for length in LENGTHS:
                     for baseline in baselines_of(options.only):
                         progress(f"{where}, {length} in the middle: {baseline.name}")
@@ -176,7 +177,6 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         "loss below": LOSS_MAX,
         "MTU": list(sizes),
         "cores": "source 0, sink 1, switches anywhere",
-        "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
         "offloads of the devices (none touches AF_PACKET frames)": found,
     }
     return Outcome(
@@ -208,5 +208,4 @@ if __name__ == "__main__":
         has_plot=True,
     )
     parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
-    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for every process alike")
     run_bench(parser, measure)

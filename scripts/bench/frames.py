@@ -14,8 +14,6 @@ from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, OVERHEAD_
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.limits import HOPS_MAX
 
-__all__ = ["NAME_AT", "SINK", "SOURCE", "Wire", "gdp_frame", "ip_frame"]
-
 SOURCE, SINK = bytes([0xA0]) * 32, bytes([0xB0]) * 32
 NAME_AT: Final = ETHER_BYTES + DESTINATION_AT
 _IPV4: Final = 0x0800

@@ -27,19 +27,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-__all__ = [
-    "ROOT",
-    "MachineState",
-    "git",
-    "machine_state",
-    "offload_text",
-    "offloads",
-    "processor_s",
-    "set_offloads",
-    "soft_interrupts_s",
-    "thread_s",
-]
-
 ROOT: Final = Path(__file__).resolve().parents[2]
 _SIOCETHTOOL: Final = 0x8946
 _GET_SET: Final = {"tso": (0x1E, 0x1F), "gso": (0x23, 0x24), "gro": (0x2B, 0x2C), "tx-checksum": (0x16, 0x17)}

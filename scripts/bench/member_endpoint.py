@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import secrets
-import time
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
@@ -19,10 +16,6 @@ from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import load_delegations
-
-__all__ = ["End"]
-
-PATIENCE_S: Final = 20.0
 
 
 class End:
@@ -46,9 +39,9 @@ class End:
             grants = {epoch: grant.secret for epoch, grant in each.open(identity).items()}
             self.topics[str(each.metadata["name"])] = Topic(each, grants)
 
-    def advertise(self, topic: str, *, reliable: bool, urgent: bool = False) -> Publisher:
+    def advertise(self, topic: str, *, reliable: bool) -> Publisher:
         """Publish a topic."""
-        return self.member.advertise(self.topics[topic], b"bench", reliable=reliable, urgent=urgent)
+        return self.member.advertise(self.topics[topic], b"bench", reliable=reliable)
 
     def subscribe(self, topic: str) -> Name:
         """Read a topic; return its name."""
@@ -67,17 +60,6 @@ class End:
     def name_of(self, name: str) -> Name:
         """Return the overlay name of a topic or service."""
         return self.topics[name].name
-
-    def wait_for_readers(self, publishers: Iterable[Publisher], deadline_s: float | None = None) -> None:
-        """Return when every publisher has a reader.
-
-        Raises:
-            TimeoutError: not by the deadline, in monotonic seconds; None: 20 s from now.
-        """
-        wanted = list(publishers)
-        latest_s = time.monotonic() + PATIENCE_S if deadline_s is None else deadline_s
-        if not self.runtime.run(lambda: all(each.readers for each in wanted), latest_s):
-            raise TimeoutError("no reader: the overlay did not come up")
 
     def leave(self) -> None:
         """Withdraw and close."""

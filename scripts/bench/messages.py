@@ -12,7 +12,6 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py                     # the whole; writes docs/benchmarks/messages.*
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
     sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
-    sudo .venv/bin/python scripts/bench/messages.py --realtime          # every baseline under SCHED_FIFO
     sudo .venv/bin/python scripts/bench/messages.py --load half         # other processes take half of each core
 
 Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages. The table
@@ -23,18 +22,14 @@ docs/benchmarks by itself; a part of it writes to the paths of --json and --plot
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from typing import Final
 
 from background_load import LOADS, SHARE
-from peers.baseline import Baseline
-from peers.cyclone_net import CycloneNet
 from peers.exchange import ANSWER, SIZE_MIN, Load
 from peers.figures import MEDIAN, P99, case_of, targets_of
-from peers.gdp_net import ENCODINGS, GdpNet
 from peers.rounds import Plan, Turns
-from peers.zenoh_net import ZenohNet
+from peers.systems import ENCODINGS, Baseline, CycloneNet, GdpNet, ZenohNet
 from plot import Panel, panel_of
 from report import Rounds
 from skeleton import Options, Outcome, command_line, parse, perform
@@ -93,7 +88,6 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument(
         "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
-    parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
     return parser
 
 
@@ -136,8 +130,6 @@ def plan_of(options: argparse.Namespace) -> Plan:
 def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every case, round by round."""
     plan = plan_of(options)
-    if options.realtime:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))  # children inherit it
     turns = Turns(plan)
     turns.run(runs)
     return Outcome(
@@ -149,7 +141,6 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
             "rounds": plan.rounds,
             "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
             "answer, B": ANSWER.size,
-            "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
             "ends of gdp spin, us": options.busy_poll_us,
             "shared memory": "off everywhere",
             "load": f"{SHARE:.0%} of each core" if True in plan.loads else "none",

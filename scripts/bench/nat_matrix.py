@@ -12,15 +12,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from report import print_table
+from skeleton import new_run
 
-from rich.console import Console
-from rich.table import Table
-
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.laboratory import Laboratory
 from internet.matrix import Outcome, Pair, batches, measure
@@ -39,33 +34,18 @@ def main() -> int:
     kinds = [Access(each) for each in options.kinds]
     found: dict[Pair, Outcome] = {}
     for batch in batches(kinds):
-        found = {**_measured(batch), **found}
+        with new_run() as run, Laboratory(run) as laboratory:
+            found = {**measure(laboratory, batch), **found}
     if options.json:
-        rows = [{"pair": [a.value, b.value], **outcome._asdict()} for (a, b), outcome in found.items()]
-        print(json.dumps(rows, indent=1))
+        pairs = [{"pair": [a.value, b.value], **outcome._asdict()} for (a, b), outcome in found.items()]
+        print(json.dumps(pairs, indent=1))
     else:
-        _show(found, kinds)
+        rows = [(one.value, *(_cell((one, other), found[one, other]) for other in kinds)) for one in kinds]
+        print_table(("first call answered after", *(each.value for each in kinds)), rows)
+        connected = [each for each in found.values() if each.reached_s is not None]
+        direct = sum(each.direct_s is not None for each in connected)
+        print(f"{len(connected)} of {len(found)} pairs connect, {direct} directly")
     return 0 if all(outcome.is_as_expected(pair) for pair, outcome in found.items()) else 1
-
-
-def _measured(kinds: Sequence[Access]) -> dict[Pair, Outcome]:
-    run = RunRegistry().start()
-    try:
-        with Laboratory(run) as laboratory:
-            return measure(laboratory, kinds)
-    finally:
-        run.end()
-
-
-def _show(found: Mapping[Pair, Outcome], kinds: Sequence[Access]) -> None:
-    table = Table("first call answered after", *(each.value for each in kinds))
-    for one in kinds:
-        table.add_row(one.value, *(_cell((one, other), found[one, other]) for other in kinds))
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    console.print(table)
-    connected = [each for each in found.values() if each.reached_s is not None]
-    direct = [each for each in connected if each.direct_s is not None]
-    console.print(f"{len(connected)} of {len(found)} pairs connect, {len(direct)} directly")
 
 
 def _cell(pair: Pair, outcome: Outcome) -> str:

@@ -8,18 +8,48 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from itertools import pairwise
 from typing import Final
 
 import gdp
+from gdp.trust.right import Right
+from internet.host import Host
+from internet.overlay import Overlay
 from lab.process import FailedError
-
-__all__ = ["HZ", "NumberedFlow"]
 
 HZ: Final = 100.0
 _STEADY_S: Final = 0.5
 _PATIENCE_S: Final = 60.0
 _NUMBER: Final = struct.Struct("!q92x")
+
+
+def open_sessions(
+    overlay: Overlay,
+    stack: ExitStack,
+    hosts: tuple[Host, Host, Host],
+    topics: Iterable[str],
+    *,
+    has_direct: bool,
+    uplinks: Sequence[str] = (),
+) -> list[gdp.Session]:
+    """Start switches at a border, a robot and a server, and return sessions that publish and read the topics.
+
+    Args:
+        has_direct: robot and server open a tunnel to each other.
+        uplinks: of the robot; none: the usual one.
+    """
+    border, robot, server = hosts
+    overlay.add_switch(border, is_border=True)
+    for host, own in ((robot, uplinks), (server, ())):
+        overlay.add_switch(host, borders=[border], uplinks=own, links={"direct": has_direct})
+    overlay.start(border)
+    overlay.start_rib(border)
+    overlay.start(robot, server)
+    sides = ((robot, Right.PUBLISH), (server, Right.READ))
+    nodes = [(host, overlay.add_node(host, {topic: [right] for topic in topics})) for host, right in sides]
+    return [stack.enter_context(overlay.open_session(host, node)) for host, node in nodes]
 
 
 class NumberedFlow:

@@ -23,8 +23,6 @@ from pathlib import Path
 
 from report import Rounds, number_text
 
-__all__ = ["Bar", "Panel", "panel_of", "require_plot", "save_bars"]
-
 _COLOURS = ("#1f6f8b", "#99a8b2")  # ours, the others
 _BAR_INCHES, _PANEL_INCHES, _WIDTH_INCHES, _PER_ROW = 0.3, 1.1, 6.0, 2
 _DOTS_PER_INCH = 110

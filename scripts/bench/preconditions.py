@@ -12,8 +12,6 @@ from typing import Final
 
 from machine import ROOT, MachineState
 
-__all__ = ["DATA", "RefusedError", "data_folder", "require_trust", "require_writable"]
-
 DATA: Final = ROOT / "scripts" / "data"
 
 

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["LATE_MAX_S", "LOSS_MAX", "Try", "highest"]
-
 LOSS_MAX: Final = 0.001
 LATE_MAX_S: Final = 0.05
 _CLOSE: Final = 1.05  # bracket narrow enough

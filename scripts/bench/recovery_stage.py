@@ -27,9 +27,7 @@ from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
-from lab.process import FailedError, LabProcess
-
-__all__ = ["DEDICATED", "ECHO", "REPLICA", "ROBOT", "Cluster"]
+from lab.process import FailedError, LabProcess, until
 
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 DEDICATED, REPLICA = "dedicated", "replica"
@@ -39,7 +37,6 @@ _REPORT_S: Final = 1.0
 _DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
 _PATIENCE_S: Final = 90.0
 _LAUNCH_S: Final = 200.0
-_STEP_S: Final = 0.02
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Cluster")
@@ -77,7 +74,7 @@ class Cluster:
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             if (missing := machines - len(self.machines())) > 0:
                 self._fog("scale", "up", str(missing))
-            self._until(lambda: all(each.is_serving for each in self.machines()) or None, "all machines that serve")
+            _until(lambda: all(each.is_serving for each in self.machines()), "all machines that serve")
             self._runs = local_provider(self._site).runs
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
@@ -93,10 +90,7 @@ class Cluster:
         parameters = {"rate_hz": rate_hz, "report_s": _REPORT_S, "depth": _DEPTH}
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
         self._caller = self._undo.enter_context(self._start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
-        end_s = time.monotonic() + _PATIENCE_S
-        while not self._caller.read(_PATIENCE_S)["answered"]:
-            if time.monotonic() > end_s:
-                raise FailedError("the robot's node is not answered")
+        _until(lambda: self._caller.read(_PATIENCE_S)["answered"], "an answer to the robot's node")
 
     def oldest(self) -> Record:
         """Return the machine that has served for longest."""
@@ -105,7 +99,7 @@ class Cluster:
 
     def gateway_machine(self) -> Record:
         """Return the machine that is the gateway."""
-        return self._until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
+        return _until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
 
     def longest_silence(self, after_s: float) -> float:
         """Return the longest time without an answer from this moment until now, in seconds."""
@@ -136,7 +130,7 @@ class Cluster:
         if pid is None:
             raise FailedError("no supervisor lives")
         os.kill(pid, signal.SIGKILL)
-        self._until(lambda: pid_of(self._site) is None or None, "the supervisor's end")
+        _until(lambda: pid_of(self._site) is None, "the supervisor's end")
 
     def start_supervisor(self) -> float:
         """Start a supervisor; return the time, in seconds since 1970."""
@@ -156,7 +150,7 @@ class Cluster:
 
     def await_replacement(self, after_s: float) -> Record:
         """Return the replacement when it serves."""
-        return self._until(lambda: self.replacement(after_s), "a replacement that serves")
+        return _until(lambda: self.replacement(after_s), "a replacement that serves")
 
     def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
         """Return when one of these events was recorded of a machine, or of any, in seconds since 1970."""
@@ -165,17 +159,17 @@ class Cluster:
             found = (e for e in self._journal.events() if machine in (None, e.machine) and e.what in what)
             return next((each.unix_s for each in found if each.unix_s >= after_s), None)
 
-        return self._until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
+        return _until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
 
     def await_whole(self, victim: Record) -> None:
         """Return when this machine is gone and the wanted number of other machines serve."""
 
-        def is_whole() -> bool | None:
+        def is_whole() -> bool:
             there = self.machines()
             is_rid = all(each.name != victim.name for each in there)
-            return (is_rid and len(there) == self._machines_wanted and all(each.is_serving for each in there)) or None
+            return is_rid and len(there) == self._machines_wanted and all(each.is_serving for each in there)
 
-        self._until(is_whole, "as many machines as are wanted that serve, and no other")
+        _until(is_whole, "as many machines as are wanted that serve, and no other")
 
     def end_caller(self) -> dict[str, float]:
         """End the robot's node; return how many requests it made, and how many failed."""
@@ -197,11 +191,9 @@ class Cluster:
     def _start(self, what: str, arguments: Sequence[str]) -> LabProcess:
         return self._lab.start(ROBOT, what, arguments, self._environment)
 
-    def _until(self, found: Callable[[], T | None], what: str) -> T:
-        """Poll until a state is reached that sends no event."""
-        end_s = time.monotonic() + _PATIENCE_S
-        while (value := found()) is None:
-            if time.monotonic() > end_s:
-                raise FailedError(f"waited {_PATIENCE_S:g} s for {what}")
-            time.sleep(_STEP_S)
-        return value
+
+def _until(found: Callable[[], T | None], what: str) -> T:
+    """Poll until a state is reached that sends no event."""
+    value = until(found, lambda: what, _PATIENCE_S)
+    assert value
+    return value

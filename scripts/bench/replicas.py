@@ -29,13 +29,15 @@ from typing import Final
 _HERE: Final = Path(__file__).resolve().parent
 sys.path.append(str(_HERE.parent / "experiments"))
 
-from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it lies with the experiments
+from asking import Asking  # noqa: E402 - it lies with the experiments
+from field import READY_S, Field, Served, Server, Work  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
+from samples import Sample, Series  # noqa: E402
 from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
 
 from gdp.host.run_registry import RunRegistry  # noqa: E402
-from lab.process import FailedError, figures_of  # noqa: E402
+from lab.process import FailedError  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
 CASES: Final = {
@@ -51,7 +53,7 @@ ROUNDS: Final = {KILLED: 1, ADDED: 7, HEDGED: 3}
 RATE: Final = 300  # the load that two cores carry with three replicas, one of them starting
 MEDIAN, P99, P999 = "p50, ms", "p99, ms", "p99.9, ms"
 COUNT: Final = "requests"
-COUNTS: Final = {"failed": "failed", "answered wrongly": "wrong", "answers": "heard", "answers too many": "twice"}
+FAILED, WRONG, TWICE = "failed", "answered wrongly", "answers too many"
 KILLS: Final = "replicas killed"
 EXTRA: Final = "requests too many, %"
 ADDED_MS: Final = 0.2
@@ -65,13 +67,11 @@ _APART_S: Final = 1.5  # upper limit from one death of a turn to the next
 _AWAY_S: Final = 2.0  # upper limit until the next restart
 _REST_S: Final = 1.0  # time in which all serve, between two turns
 _STEP_S: Final = 0.5
-_TELL_S: Final = 10.0
+_WARM_UP: Final = 50  # calls of each service
 _RESTFUL: Final = 80.0  # calls a second
 _BRISK: Final = 200.0
 _BUDGET: Final = 0.02
-_SLOW: Final = {"slow_in": 100, "slow_s": 0.2}
-
-Said = Mapping[str, object]
+_SLOW: Final = {"slow_in": 100, "slow_s": 0.2, "threads": 8}
 
 
 class Kills:
@@ -151,20 +151,24 @@ class Bench:
         """Call three replicas while two of them are killed repeatedly."""
         served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
         with self._field(served) as here, Kills(here, self._draw) as kills:
-            series = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
-            said = _ask(here, ["/number"], count, series)
-        counts = figures_of(said)
-        figures = {column: counts.get(key) for column, key in COUNTS.items()}
-        figures |= {COUNT: count, KILLS: kills.count, **_latencies(_times(said, "/number"))}
+            found, asking = _ask(here, ["/number"], count, lanes=_LANES, rate=self._rate, counts_answers=True)
+        samples = found["/number"]
+        figures: dict[str, float | None] = {
+            FAILED: sum(not each.machine for each in samples),
+            WRONG: sum(bool(each.machine) and not each.is_right for each in samples),
+            "answers": asking.heard,
+            TWICE: asking.twice,
+        }
+        figures |= {COUNT: count, KILLS: kills.count, **_latencies(samples)}
         self._add(KILLED, THREE, figures)
 
     def added(self, count: int) -> None:
         """Call one server and two replicas in turn; all are idle between two calls."""
         names = {ONE: "/one", TWO: "/two"}
         with self._field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
-            said = _ask(here, list(names.values()), count, {"lanes": 1, "rate": _RESTFUL})
+            found, _ = _ask(here, list(names.values()), count, rate=_RESTFUL)
         for who, name in names.items():
-            self._add(ADDED, who, _latencies(_times(said, name)))
+            self._add(ADDED, who, _latencies(found[name]))
 
     def hedged(self, count: int) -> None:
         """Call a server that is slow sometimes, two of them, and the second one only if the first is late."""
@@ -177,17 +181,17 @@ class Bench:
         ]
         turns = ["/one/m1", "/both", "/late", "/one/m2", "/both", "/late"]
         with self._field(served, _SLOW) as here:
-            said = _ask(here, turns, count, {"lanes": 1, "rate": _BRISK})
+            found, asking = _ask(here, turns, count, rate=_BRISK)
         for who, its in names.items():
-            times_s = [each for name in its for each in _times(said, name)]
-            had, asked = (sum(_counted(said, key, name) for name in its) for key in ("had", "asked"))
-            self._add(HEDGED, who, {**_latencies(times_s), EXTRA: 100 * (had / asked - 1)})
+            had = sum(_had(found[name]) for name in its)
+            asked = sum(asking.warm_up[name] + len(found[name]) for name in its)
+            samples = [each for name in its for each in found[name]]
+            self._add(HEDGED, who, {**_latencies(samples), EXTRA: 100 * (had / asked - 1)})
 
     @contextmanager
     def _field(self, served: Sequence[Served], settings: Mapping[str, object] | None = None) -> Iterator[Field]:
         names = {each: " ".join(one.name for one in served if each in one.machines) for each in _MACHINES}
-        role = "serve" if settings is None else "straggle"
-        work = {each: Work(role, {**(settings or {}), "services": its}, _END) for each, its in names.items() if its}
+        work = {each: Work("serve", {**(settings or {}), "services": its}, _END) for each, its in names.items() if its}
         with new_run(self._runs) as run, Field(run, served, work) as here:
             yield here
 
@@ -201,7 +205,7 @@ def targets_of(over: Rounds) -> list[Target]:
     killed, added, hedged = CASES.values()
     targets = []
     if killed in over.cases():
-        for column in ("failed", "answered wrongly", "answers too many"):
+        for column in (FAILED, WRONG, TWICE):
             targets.append(over.target(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
     if added in over.cases():
         targets.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
@@ -249,32 +253,28 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     )
 
 
-def _ask(here: Field, services: Sequence[str], count: int, series: Mapping[str, object]) -> Said:
-    """Return the final report of the robot's client."""
-    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **series}
-    with here.client(ROBOT, "ask", _END, **own) as client:
-        client.read(READY_S)
-        reported_s = time.monotonic()
-        while (said := client.read(2 * _CALL_S))["event"] == "asked":
-            if time.monotonic() - reported_s >= _TELL_S:
-                reported_s = time.monotonic()
-                progress(f"    {said['ended']} of {count}, failed: {said['failed']}")
-    return said
+def _ask(
+    here: Field, services: Sequence[str], count: int, *, rate: float, lanes: int = 1, counts_answers: bool = False
+) -> tuple[dict[str, list[Sample]], Asking]:
+    """Call so many services in turn; return the samples of each, and the series with its counts."""
+    warm_up = _WARM_UP * len(set(services))
+    series = Series(
+        "number", tuple(services), count, (), _CALL_S, lanes, 1 / rate, warm_up, counts_answers=counts_answers
+    )
+    with Asking(here, series) as asking:
+        return asking.by_service("    requests"), asking
 
 
-def _times(said: Said, name: str) -> list[float]:
-    all_of = said["times_s"]
-    return all_of[name] if isinstance(all_of, dict) else []
+def _had(samples: Sequence[Sample]) -> float:
+    """Return how many requests the machines of a service had, as the answers said."""
+    had: dict[str, float] = {}
+    for each in samples:
+        had[each.machine] = max(had.get(each.machine, 0.0), each.note)
+    return sum(had.values())
 
 
-def _counted(said: Said, key: str, name: str) -> int:
-    """Return how often the client called a service, or how many calls its machines received."""
-    by_name = said[key]
-    found = by_name[name] if isinstance(by_name, dict) else 0
-    return sum(found.values()) if isinstance(found, dict) else int(found)
-
-
-def _latencies(times_s: Sequence[float]) -> dict[str, float | None]:
+def _latencies(samples: Sequence[Sample]) -> dict[str, float | None]:
+    times_s = [each.latency_s for each in samples if each.machine]
     return {column: 1e3 * percentile(times_s, share) for column, share in ((MEDIAN, 0.5), (P99, 0.99), (P999, 0.999))}
 
 

@@ -35,20 +35,6 @@ from machine import MachineState
 from rich.console import Console
 from rich.table import Table
 
-__all__ = [
-    "Rounds",
-    "Settings",
-    "Spread",
-    "Target",
-    "markdown_table",
-    "number_text",
-    "percentile",
-    "print_table",
-    "progress",
-    "show",
-    "write_json",
-]
-
 Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
 _CONSOLE_COLUMNS = 165
 
@@ -156,12 +142,10 @@ class Rounds:
         values = self._pairwise(one, other, case, column, lambda a, b: a / b if b else None)
         return _target(what, asked, at_most, values, self._why_not(one, case) or self._why_not(other, case))
 
-    def difference(
-        self, what: str, one: str, other: str, case: str, column: str, asked: float | None, *, at_most: bool = True
-    ) -> Target:
-        """Return a bound on ``one - other``, round by round."""
+    def difference(self, what: str, one: str, other: str, case: str, column: str, asked: float | None) -> Target:
+        """Return an upper bound on ``one - other``, round by round."""
         values = self._pairwise(one, other, case, column, lambda a, b: a - b)
-        return _target(what, asked, at_most, values, self._why_not(one, case) or self._why_not(other, case))
+        return _target(what, asked, True, values, self._why_not(one, case) or self._why_not(other, case))
 
     def _pairwise(
         self, one: str, other: str, case: str, column: str, of: Callable[[float, float], float | None]

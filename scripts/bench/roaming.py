@@ -17,12 +17,11 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from numbered_flow import NumberedFlow
+from numbered_flow import NumberedFlow, open_sessions
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
 from gdp.host.run_registry import RunRegistry
-from gdp.trust.right import Right
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
@@ -75,17 +74,8 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 
 
 def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host], *, has_direct: bool) -> NumberedFlow:
-    border, robot, server = hosts
-    overlay.add_switch(border, is_border=True)
-    for host in (robot, server):
-        overlay.add_switch(host, borders=[border], links={"direct": has_direct})
-    overlay.start(border)
-    overlay.start_rib(border)
-    overlay.start(robot, server)
-    nodes = [overlay.add_node(robot, {TOPIC: [Right.PUBLISH]}), overlay.add_node(server, {TOPIC: [Right.READ]})]
-    sender, reader = (
-        stack.enter_context(overlay.open_session(host, node)) for host, node in zip((robot, server), nodes, strict=True)
-    )
+    _, robot, _ = hosts
+    sender, reader = open_sessions(overlay, stack, hosts, [TOPIC], has_direct=has_direct)
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)

@@ -1,6 +1,6 @@
 """Processes of the forwarding bench, each in a namespace of its own: ``switch`` and ``end``.
 
-Started by ``chains.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
+LabProcess by ``chains.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
 """
 
 from __future__ import annotations

@@ -24,8 +24,10 @@ from functools import partial
 from typing import Final
 
 from report import Rounds, Target
-from ros_row import LEFT, READY_S, RIGHT, Carried, Row
-from ros_stage import CORES, DIRECT, MEDIAN, Bench, Measured, Options, Turn, main
+from ros_row import READY_S, Carried, Row
+from ros_stage import CORES, DIRECT, MEDIAN, Bench, Measured, Turn, main
+from skeleton import Options
+from topologies import LEFT, RIGHT
 
 from proxy.config.config import Encoding
 

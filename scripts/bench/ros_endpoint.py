@@ -10,24 +10,26 @@ has, and would distort the measurement.
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
+import time
 from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Final
 
 import rclpy
 from peers.jsonl import say
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from rclpy.timer import Timer
 
 try:
     from rclpy.experimental import EventsExecutor as BestExecutor
 except ImportError:  # before Kilted and late Jazzy
     from rclpy.executors import SingleThreadedExecutor as BestExecutor
-
-__all__ = ["End", "Settings", "reliable", "run_role"]
 
 _STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never checks the future
 
@@ -35,11 +37,11 @@ Settings = Mapping[str, object]
 
 
 class End:
-    """Node at A or B."""
+    """Node at A or B; more ``threads`` than one have rclpy's executor for that."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, threads: int = 1) -> None:
         self.node = Node(name)
-        self._executor = BestExecutor()
+        self._executor = BestExecutor() if threads == 1 else MultiThreadedExecutor(threads)
         self._executor.add_node(self.node)
         self._done: Future[None] = Future()
         self._may_start = False
@@ -55,15 +57,16 @@ class End:
         if not self._done.done():
             self._done.set_result(None)
 
-    def run(self) -> None:
-        """Work until ``finish``."""
-        while not self._done.done():
-            self._executor.spin_until_future_complete(self._done, timeout_sec=_STEP_S)
+    def run(self, patience_s: float = math.inf) -> None:
+        """Work until ``finish``, or for so long."""
+        end_s = time.monotonic() + patience_s
+        while not self._done.done() and (left_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_until_future_complete(self._done, timeout_sec=min(_STEP_S, left_s))
         self._done = Future()
 
-    def every(self, seconds: float, work: Callable[[], None]) -> None:
-        """Call a function at a steady rate; within ``run``."""
-        self.node.create_timer(seconds, work)
+    def every(self, seconds: float, work: Callable[[], None]) -> Timer:
+        """Call a function at a steady rate; within ``run``, until the returned timer is cancelled."""
+        return self.node.create_timer(seconds, work)
 
     def _go(self, number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -76,10 +79,10 @@ def reliable(depth: int = 10) -> QoSProfile:
 
 
 def run_role(roles: Mapping[str, Callable[[End, Settings], None]]) -> None:
-    """Run the role of the first argument, with the settings of the second, until killed."""
+    """Run the role of the first argument, with the settings of the second, until killed; ``threads`` is one."""
     role, settings = sys.argv[1], json.loads(sys.argv[2])
     rclpy.init()
-    end = End(f"bench_{role}")
+    end = End(f"bench_{role}", settings.get("threads", 1))
     roles[role](end, settings)
     say(event="over")
     end.run()  # a reliable writer must stay to retransmit losses

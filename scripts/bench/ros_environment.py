@@ -9,8 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-__all__ = ["BUFFER_BYTES", "ros_environment"]
-
 BUFFER_BYTES: Final = 4 << 20  # of a socket, and of a segment of shared memory: both hold a camera image
 _UDP: Final = f"""<transport_descriptor>
   <transport_id>udp</transport_id><type>UDPv4</type>

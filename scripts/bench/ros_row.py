@@ -44,8 +44,6 @@ from lab.process import LabProcess
 from lab.topology import DomainPlan, Link, Topology
 from proxy.config.config import Encoding
 
-__all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]
-
 READY_S: Final = 30.0
 _BRIDGES: Final = ("p1", "p2", "p3")
 _ADDRESSES: Final = {LEFT: "10.98.0.1", RIGHT: "10.98.0.2"}

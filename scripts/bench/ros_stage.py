@@ -15,17 +15,15 @@ from pathlib import Path
 from typing import Final
 
 import skeleton
-from background_load import LOADS, SHARE, load_of
 from plot import Panel, panel_of
 from report import Rounds, Target
-from ros_row import BUFFER_BYTES, LEFT, READY_S, RIGHT, Carried, Row
+from ros_environment import BUFFER_BYTES
+from ros_row import Carried, Row
 from skeleton import Options
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError, figures_of
 from proxy.config.config import Encoding
-
-__all__ = ["CORES", "DIRECT", "MEDIAN", "P99", "Bench", "Call", "Measured", "Options", "Turn", "main", "parse"]
 
 DIRECT: Final = "direct"
 MEDIAN: Final = "p50, ms"
@@ -80,28 +78,6 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
-    """Client at A and server at B, both from one module; the client reports when it begins and when it ends."""
-
-    module: str
-    server: str
-    client: str
-    seconds: float
-    done_s: float
-
-    def measure(self, row: Row, *, direct: bool, **settings: object) -> Measured:
-        """Run both for ``seconds``; ``done_s`` is the time that the last answers may take."""
-        settings["seconds"] = self.seconds
-        with row.node(RIGHT, self.module, self.server, direct=direct, **settings) as server:
-            server.read(READY_S)
-            with row.node(LEFT, self.module, self.client, direct=direct, **settings) as client:
-                begun = client.read(READY_S)
-                cpu_s = row.proxies_cpu_s()
-                said = {**begun, **client.read(self.seconds + self.done_s)}
-                return said, (row.proxies_cpu_s() - cpu_s) / self.seconds
-
-
-@dataclass(frozen=True, slots=True)
 class Bench:
     """A bench, as data. ``targets_of`` returns the targets at one MTU."""
 
@@ -131,12 +107,6 @@ def parse(description: str | None, *, seconds: float, mtus: Sequence[int], quick
         description, rounds=rounds, seconds=seconds, quick=quick, has_record=True, has_plot=True
     )
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
-    parser.add_argument(
-        "--load",
-        choices=tuple(LOADS),
-        default="none",
-        help="none, or processes that take half of each core, or each in turn (default: %(default)s)",
-    )
     options = skeleton.parse(parser)
     options.mtus = tuple(dict.fromkeys(options.mtu or mtus))
     return options
@@ -163,14 +133,8 @@ def _measure(bench: Bench, options: Options, runs: RunRegistry) -> skeleton.Outc
             run = stack.enter_context(skeleton.new_run(runs))
             rows[mtu] = stack.enter_context(Row(run, bench.carried, mtu=mtu))
         trials = [
-            skeleton.Trial(
-                each.case + (", cores half taken" if loaded else ""),
-                each.contender,
-                each.columns,
-                partial(_measure_turn, each, rows[each.mtu], loaded),
-            )
+            skeleton.Trial(each.case, each.contender, each.columns, partial(each.measure, rows[each.mtu]))
             for each in bench.turns
-            for loaded in LOADS[options.load]
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
@@ -178,15 +142,9 @@ def _measure(bench: Bench, options: Options, runs: RunRegistry) -> skeleton.Outc
         "rounds": options.rounds,
         "seconds": options.seconds,
         **bench.settings,
-        "load": f"{SHARE:.0%} of each core" if options.load != "none" else "none",
         "socket buffers, B": min(BUFFER_BYTES, int(_RMEM_MAX.read_text(encoding="ascii"))),
         "trouble": recorder.notes or "none",
     }
     return skeleton.Outcome(
         bench.name, bench.title, over, bench.targets(over), settings, lambda: list(bench.panels(over))
     )
-
-
-def _measure_turn(turn: Turn, row: Row, loaded: bool, number: int) -> dict[str, float]:
-    with load_of(loaded):
-        return turn.measure(row, number)

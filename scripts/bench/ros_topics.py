@@ -20,8 +20,6 @@ from ros_endpoint import End, Settings, reliable, run_role
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-__all__ = ["IMAGE_BYTES", "TEXT_BYTES"]
-
 TEXT_BYTES: Final = 100  # in CDR: prefix 4, length 4, 91 characters, one 0
 IMAGE_BYTES: Final = 921_600  # 640 x 480, rgb8; its header comes on top
 _TEXT_CHARS: Final = TEXT_BYTES - 9

@@ -5,32 +5,24 @@ topic each; one after the other loses its delegation (``gdp delegate revoke``) o
 The file is handed to one switch, of neither end's domain, by SIGHUP. Measured is the time from the signal, and from the
 start of the command, to the last message that a reader got.
 
-    sudo .venv/bin/python scripts/bench/security.py revocation                        # docs/benchmarks/security.json
-    sudo .venv/bin/python scripts/bench/security.py revocation --rounds 1 --no-save
+    sudo .venv/bin/python scripts/bench/security.py              # writes docs/benchmarks/security.json
+    sudo .venv/bin/python scripts/bench/security.py --rounds 1 --no-save
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import random
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
-from itertools import chain
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
-from machine import MachineState, machine_state
-from preconditions import require_trust, require_writable
-from report import percentile, print_table, progress
-from skeleton import OUTPUT, clean_exit, command_line, new_run
+from report import Rounds, percentile, progress
+from skeleton import Options, Outcome, command_line, new_run, run_bench
 from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
@@ -39,7 +31,9 @@ from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
 from lab.process import FailedError, until
 
-TARGET_S: Final = 1.0  # target at the 99th percentile, from the signal to the last message
+TARGET_MS: Final = 1_000.0
+CASE: Final = "until the last message of the closed flow"
+SIGNAL, COMMAND, P99, OPEN = "from the signal, ms", "from the command, ms", "p99 from the signal, ms", "left open"
 HZ: Final = 100.0
 TOPICS: Final = 24
 VICTIMS: Final = 6
@@ -63,18 +57,24 @@ def _plan(hz: float) -> Plan:
     return Plan(topology, members, flows=tuple(flows))
 
 
-def _closed(options: argparse.Namespace) -> dict[str, Any]:
-    found: dict[str, list[float]] = {"delegation": [], "delegation_command": [], "membership": []}
-    found["membership_command"] = []
-    late = 0
-    runs = RunRegistry()
-    runs.sweep()
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Close the flows of one network in each round."""
+    over = Rounds()
     for number in range(options.rounds):
-        progress(f"closed: network {number + 1} of {options.rounds}")
-        with new_run(runs) as run_, Overlay(run_, _plan(options.hz), plane=options.plane) as overlay:
+        progress(f"network {number + 1} of {options.rounds}")
+        with new_run(runs) as run, Overlay(run, _plan(options.hz), plane=options.plane) as overlay:
             overlay.start_all()
-            late += _Closing(overlay).measure(found)
-    return {"target_s": TARGET_S, "hz": options.hz, "not_closed": late, **found}
+            _Closing(overlay).measure(over)
+    targets = []
+    for what in over.values:
+        seconds = [each for each in over.column(what, CASE, SIGNAL) if each is not None]
+        over.add(what, CASE, P99, percentile(seconds, 0.99))
+        targets += [
+            over.target(f"{what}: {P99}", what, CASE, P99, TARGET_MS, at_most=True),
+            over.target(f"{what}: {OPEN}", what, CASE, OPEN, 0.0, at_most=True),
+        ]
+    settings = {"rounds": options.rounds, "messages a second and flow": options.hz, "data plane": options.plane}
+    return Outcome("security", "From a revocation to the last message, three tiers", over, targets, settings)
 
 
 class _Closing:
@@ -84,8 +84,8 @@ class _Closing:
         self._overlay = overlay
         self._last_ns: dict[int, int] = {}  # by channel: when R got the last message
 
-    def measure(self, found: dict[str, list[float]]) -> int:
-        """Add the measurements; return how many flows were not closed.
+    def measure(self, over: Rounds) -> None:
+        """Add the measurements.
 
         Raises:
             FailedError: the flows did not come up, or a process ended by itself.
@@ -99,18 +99,17 @@ class _Closing:
         )
         order = list(range(len(flows)))
         random.Random(1).shuffle(order)
-        late = 0
         for channel in order:
             what = "delegation" if flows[channel].publisher == "P" else "membership"
             time.sleep(0.2 + random.random() * 0.5)
             begun_ns, signalled_ns = self._revoke(channel)
             self._watch(AFTER_S)
             last_ns = self._last_ns[channel]
-            late += last_ns > signalled_ns + round((AFTER_S - 0.5) * 1e9)
-            found[what].append(max(last_ns - signalled_ns, 0) / 1e9)
-            found[f"{what}_command"].append((last_ns - begun_ns) / 1e9)
-            progress(f"  {flows[channel].topic}: {found[what][-1] * 1e3:.0f} ms")
-        return late
+            took_ms = max(last_ns - signalled_ns, 0) / 1e6
+            over.add(what, CASE, SIGNAL, took_ms)
+            over.add(what, CASE, COMMAND, (last_ns - begun_ns) / 1e6)
+            over.add(what, CASE, OPEN, float(last_ns > signalled_ns + round((AFTER_S - 0.5) * 1e9)))
+            progress(f"  {flows[channel].topic}: {took_ms:.0f} ms")
 
     def _revoke(self, channel: int) -> tuple[int, int]:
         """Revoke by the command, and hand the file in; return when each began, in monotonic nanoseconds."""
@@ -138,72 +137,13 @@ class _Closing:
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             time.sleep(0.1)
-            self._look()
-
-    def _look(self) -> None:
-        for who in self._overlay.died():
-            raise FailedError(f"{who} ended by itself: {self._overlay.log_tail(who)}")
-        for each in chain.from_iterable(records for _, records in self._overlay.read("R")):
-            if each.kind == Kind.DELIVERED:
-                self._last_ns[each.channel] = max(each.at_ns, self._last_ns.get(each.channel, 0))
-        for member in self._overlay.plan.members:
-            if member != "R":
-                for _ in chain.from_iterable(records for _, records in self._overlay.read(member)):
-                    continue
-
-
-def _show_closed(found: dict[str, Any]) -> bool:
-    rows = list[tuple[str, ...]]()
-    has_met = not found["not_closed"]
-    for what in ("delegation", "membership"):
-        for since, key, target_s in (("the signal", what, found["target_s"]), ("the command", f"{what}_command", None)):
-            seconds = found[key]
-            p50, p99 = percentile(seconds, 0.5), percentile(seconds, 0.99)
-            is_met = target_s is None or p99 <= target_s
-            has_met = has_met and is_met
-            figures = (f"{p50 * 1e3:.0f}", f"{p99 * 1e3:.0f}", f"{max(seconds) * 1e3:.0f}")
-            asked = "" if target_s is None else f"≤ {target_s * 1e3:g}"
-            rows.append((what, since, asked, str(len(seconds)), *figures, "" if target_s is None else _yes(is_met)))
-    head = ("revoked", "from", "to reach", "flows", "p50 ms", "p99 ms", "max ms", "met")
-    print_table(head, rows, title="From a revocation to the last message of the closed flow, three tiers", words=2)
-    print(f"flows that were not closed: {found['not_closed']}")
-    return has_met
-
-
-def _yes(is_met: bool) -> str:
-    return "yes" if is_met else "NO"
-
-
-def save(path: Path, figures: Mapping[str, object], state: MachineState) -> None:
-    """Write the figures under the name of the subcommand."""
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    document |= {"bench": "security", "revocation": {"closed": figures, "machine": asdict(state)}}
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-
-
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = command_line(__doc__, rounds=3, has_record=True)
-    parser.add_argument("command", choices=["revocation"])
-    parser.add_argument("--hz", type=float, default=HZ, help="messages a second and flow (default: %(default)s)")
-    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
-    return parser
-
-
-def main() -> None:
-    """Measure, show and save."""
-    options, state = arguments().parse_args(), machine_state()
-    path = options.json or OUTPUT / "security.json"
-    with clean_exit():
-        if not options.no_save:
-            require_writable(path.parent)
-            require_trust(state, allow_load=options.allow_load)
-        closed = _closed(options)
-    has_met = _show_closed(closed)
-    if not options.no_save:
-        save(path, closed, state)
-    sys.exit(options.strict and not has_met)
+            for each in self._overlay.new_records("R"):
+                if each.kind == Kind.DELIVERED:
+                    self._last_ns[each.channel] = max(each.at_ns, self._last_ns.get(each.channel, 0))
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1}, has_record=True)
+    parser.add_argument("--hz", type=float, default=HZ, help="messages a second and flow (default: %(default)s)")
+    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
+    run_bench(parser, measure)

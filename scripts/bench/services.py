@@ -18,8 +18,10 @@ from functools import partial
 from typing import Final
 
 from report import Rounds, Target
-from ros_row import RIGHT, Carried, Row
-from ros_stage import DIRECT, MEDIAN, Bench, Call, Measured, Options, Turn, main
+from ros_row import READY_S, Carried, Row
+from ros_stage import DIRECT, MEDIAN, Bench, Measured, Turn, main
+from skeleton import Options
+from topologies import LEFT, RIGHT
 
 from proxy.config.config import Encoding
 
@@ -48,10 +50,25 @@ def measure(
         FailedError: a node did not come up.
     """
     del number
-    count = round(RATE * seconds)
-    call = Call(MODULE, "serve", "call" if case == ONE else "load", seconds, _DONE_S)
-    service = service_of(encoding or "cdr", variant)
-    return call.measure(row, direct=encoding is None, service=service, clients=CLIENTS, rate=RATE, count=count)
+    service, role, is_direct = (
+        service_of(encoding or "cdr", variant),
+        "call" if case == ONE else "load",
+        encoding is None,
+    )
+    settings = {
+        "service": service,
+        "clients": CLIENTS,
+        "rate": RATE,
+        "count": round(RATE * seconds),
+        "seconds": seconds,
+    }
+    with row.node(RIGHT, MODULE, "serve", direct=is_direct, **settings) as server:
+        server.read(READY_S)
+        with row.node(LEFT, MODULE, role, direct=is_direct, **settings) as client:
+            client.read(READY_S)
+            cpu_s = row.proxies_cpu_s()
+            said = client.read(seconds + _DONE_S)
+            return said, (row.proxies_cpu_s() - cpu_s) / seconds
 
 
 def service_of(encoding: Encoding, variant: str = "") -> str:
@@ -82,23 +99,14 @@ def bench_of(options: Options) -> Bench:
     """Return the bench that the command line selects."""
     encodings: tuple[Encoding, ...] = ("cdr", "json")
     turns = [
-        Turn(case_of(case, mtu), mtu, encoding, COUNTS, partial(measure, case, options.seconds))
-        for mtu in options.mtus
-        for case, own in ENCODINGS.items()
-        for encoding in (None, *own)
-    ]
-    turns += [
         Turn(
-            case_of(case, mtu),
-            mtu,
-            "cdr",
-            COUNTS,
-            partial(measure, case, options.seconds, variant=SESSION),
-            variant=SESSION,
+            case_of(case, mtu), mtu, encoding, COUNTS,
+            partial(measure, case, options.seconds, variant=variant), variant=variant,
         )
         for mtu in options.mtus
-        for case in ENCODINGS
-    ]
+        for case, own in ENCODINGS.items()
+        for encoding, variant in ((None, ""), *((each, "") for each in own), ("cdr", SESSION))
+    ]  # fmt: skip
     carried = [Carried(service_of(encoding), TYPE, encoding, source=RIGHT, kind="service") for encoding in encodings]
     carried.append(Carried(service_of("cdr", SESSION), TYPE, "cdr", source=RIGHT, kind="service", sign="session"))
     return Bench("services", "Calls of a ROS 2 service over three kernel switches", carried, turns, targets_of)

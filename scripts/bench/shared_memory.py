@@ -15,8 +15,6 @@ from typing import Final
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 
-__all__ = ["SharedMemory"]
-
 _SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
 _ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
 

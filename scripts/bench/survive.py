@@ -17,13 +17,12 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.records import Kind, Record
+from faults.records import Kind
 from report import Rounds, Spread, Target, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 from survive_rows import NEW_TOPICS, ROWS, Row
@@ -83,9 +82,7 @@ class Flowing:
         Raises:
             FailedError: one did.
         """
-        for who in self._overlay.died():
-            raise FailedError(f"{who} ended by itself: {self._overlay.log_tail(who)}")
-        for each in self._records("R"):
+        for each in self._overlay.new_records("R"):
             if each.kind == Kind.DELIVERED:
                 self.first_of.setdefault(each.channel, each.at_ns)
                 if each.channel == 0:
@@ -95,12 +92,9 @@ class Flowing:
                 self.reported_lost += each.number
             elif each.kind == Kind.WRONG:
                 raise FailedError(f"R had a message of channel {each.other} on channel {each.channel}")
-        for each in self._records("P"):
+        for each in self._overlay.new_records("P"):
             if each.kind == Kind.PUBLISHED and each.channel == 0:
                 self.published.add((each.incarnation_id, each.number))
-
-    def _records(self, member: str) -> Iterator[Record]:
-        return chain.from_iterable(records for _, records in self._overlay.read(member))
 
     def is_steady(self, since_ns: int) -> bool:
         """Return whether the flow has been steady for ``STEADY_S``, all of it after a moment."""

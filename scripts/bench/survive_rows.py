@@ -25,8 +25,6 @@ from topologies import ends_of, make_topology
 
 from lab.topology import Link
 
-__all__ = ["NEW_TOPICS", "ROWS", "Row"]
-
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40
 _DEARER: Final = 12
@@ -181,7 +179,7 @@ def _kill(last: str, **ways: str) -> Both:
 
 def _again(overlay: Overlay, *names: str) -> None:
     for who in names:
-        overlay.restart(who)
+        overlay.start(who)
     for who in names:
         overlay.await_ready(who)
 

@@ -11,8 +11,6 @@ from typing import Final
 
 from lab.topology import Attachment, DomainPlan, Link, Topology
 
-__all__ = ["LEFT", "MIDDLE", "RIGHT", "ROW", "ends_of", "flat_topology", "make_topology", "row", "single"]
-
 LEFT: Final = "a"
 MIDDLE: Final = ("s1", "s2", "s3")
 RIGHT: Final = "b"

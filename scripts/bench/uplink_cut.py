@@ -20,12 +20,11 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Final, Literal
 
-from numbered_flow import NumberedFlow
+from numbered_flow import NumberedFlow, open_sessions
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
 from gdp.host.run_registry import RunRegistry
-from gdp.trust.right import Right
 from internet.access import Access
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
@@ -104,19 +103,8 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
     robot = laboratory.add_host("robot", homes[0], UPLINKS[0])
     robot.attach(homes[1], UPLINKS[1])
     server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    overlay.add_switch(border, is_border=True)
-    overlay.add_switch(robot, borders=[border], uplinks=UPLINKS, links={"direct": False})
-    overlay.add_switch(server, borders=[border], links={"direct": False})
-    overlay.start(border)
-    overlay.start_rib(border)
-    overlay.start(robot, server)
-    nodes = [
-        overlay.add_node(robot, {topic: [Right.PUBLISH] for topic in TOPICS}),
-        overlay.add_node(server, {topic: [Right.READ] for topic in TOPICS}),
-    ]
-    sender, reader = (
-        stack.enter_context(overlay.open_session(host, node)) for host, node in zip((robot, server), nodes, strict=True)
-    )
+    hosts = border, robot, server
+    sender, reader = open_sessions(overlay, stack, hosts, TOPICS, has_direct=False, uplinks=UPLINKS)
     flows: dict[int, NumberedFlow] = {}
     for topic, paths in TOPICS.items():
         subscription = reader.subscribe(topic, paths=paths)

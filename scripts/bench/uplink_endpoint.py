@@ -20,8 +20,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from peers.jsonl import read_order, say
-from thin_link.carrier import Arrival, Carrier
-from thin_link.exchange import Exchange, Window
+from thin_link.exchange import Arrival, Carrier, Exchange, Window
 from thin_link.relay import MARKED_PORT
 from thin_link.traffic import Direction, streams
 

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Final
 
-__all__ = ["BENCHES", "ROOT"]
-
 ROOT: Final = Path(__file__).resolve().parents[2]
 BENCHES: Final = ROOT / "scripts" / "bench"
 

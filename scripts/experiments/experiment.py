@@ -20,34 +20,15 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from field import ROBOT, Field, Served, Work
+from field import Field, Served, Work
 from machine import MachineState, machine_state
 from preconditions import require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
-from series import Series
 from skeleton import Options, add_allow_load, clean_exit, new_run
-from tag_cluster import TagCluster
-
-__all__ = [
-    "CASES",
-    "OUTPUT",
-    "Asking",
-    "Computed",
-    "Finding",
-    "Options",
-    "Report",
-    "command_line",
-    "field_of",
-    "latencies_of",
-    "run_experiment",
-    "work_of",
-]
 
 OUTPUT: Final = ROOT / "docs" / "experiments"
 CASES: Final = ("one server", "two replicas")
-_BEGIN_S: Final = 90.0
-_SILENT_S: Final = 20.0  # silence of a client between two samples
 _COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
 Panels = dict[str, dict[str, list[float]]]  # by panel and case
 _FIGURES: Final = ("figure", "here", "target", "", "paper")
@@ -181,51 +162,26 @@ def field_of(
         yield place
 
 
-class Asking:
-    """Series in progress, read a sample at a time; a context manager that ends its client.
-
-    Attributes:
-        twice: surplus answers that reached a call; None until the end, or where they were not counted.
-        heard: answers in all; the same.
-    """
-
-    def __init__(self, place: Field | TagCluster, series: Series) -> None:
-        self._series = series
-        self._client = place.client(ROBOT, "ask", **asdict(series))
-        self.twice: int | None = None
-        self.heard: int | None = None
-
-    def __enter__(self) -> Asking:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._client.__exit__(None, None, None)
-
-    def __iter__(self) -> Iterator[Sample]:
-        """Yield each sample as it comes; raises FailedError if none comes in time."""
-        self._client.read(_BEGIN_S)
-        while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
-            fields = said["sample"]
-            if isinstance(fields, dict):
-                yield Sample(**fields)
-        twice, heard = said["twice"], said["heard"]
-        self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
-
-    def by_service(self, what: str) -> dict[str, list[Sample]]:
-        """Return all samples of each service, and report progress at intervals."""
-        found: dict[str, list[Sample]] = {}
-        for number, sample in enumerate(self, 1):
-            found.setdefault(sample.service, []).append(sample)
-            if number % max(self._series.count // 5, 1) == 0:
-                progress(f"{what}: {number} of {self._series.count}")
-        return found
-
-
 def work_of(served: Iterable[Served], role: str, settings: Mapping[str, Mapping[str, object]]) -> dict[str, Work]:
     """Return the work of each machine: the role, its services, and its settings."""
     offers = list(served)
     names = {each: " ".join(one.name for one in offers if each in one.machines) for each in settings}
     return {each: Work(role, {**own, "services": names[each]}) for each, own in settings.items()}
+
+
+def gains(
+    label: str,
+    one: Sequence[Sample],
+    two: Sequence[Sample],
+    paper: Sequence[str] = ("", ""),
+    targets: Sequence[float | None] = (None, None),
+) -> tuple[Finding, Finding]:
+    """Return mean and p99 of one server over those of two replicas; ``label`` has ``{}`` in place of either word."""
+    single, pair = Summary.of(one), Summary.of(two)
+    return (
+        Finding(label.format("mean"), single.mean_s / pair.mean_s, targets[0], paper=paper[0]),
+        Finding(label.format("p99"), single.p99_s / pair.p99_s, targets[1], paper=paper[1]),
+    )
 
 
 def latencies_of(groups: Mapping[str, Sequence[Sample]], label: str, names: Iterable[str], scale: float) -> Panels:

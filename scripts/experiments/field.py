@@ -33,11 +33,10 @@ from gdp.trust.right import Right
 from lab.process import LabProcess
 from lab.topology import Topology
 
-__all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
-
 ROBOT: Final = "robot"
 READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
+_MTU: Final = 1_500
 _HERE: Final = ROOT / "scripts" / "experiments"
 _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 
@@ -142,7 +141,6 @@ class Field:
         served: the services; all machines that any of them names exist.
         work: work of every machine's node.
         delays: one-way delay of a machine's link, in seconds.
-        mtu: of every link.
 
     Raises:
         LocalError: the kernel refuses.
@@ -156,11 +154,10 @@ class Field:
         work: Mapping[str, Work],
         *,
         delays: Mapping[str, float] | None = None,
-        mtu: int = 1_500,
     ) -> None:
         self._machines = tuple(work)
         self._relays = {machine: f"x{machine}" for machine in delays or {}}
-        self._lab = Lab(run, self._topology(mtu))
+        self._lab = Lab(run, self._topology())
         with ExitStack() as undo:
             for machine, seconds in (delays or {}).items():
                 relay = [str(_HERE / "relay.py"), _GATE, machine, str(1e3 * seconds)]
@@ -185,9 +182,9 @@ class Field:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def client(self, place: str, role: str, program: Path = _HERE / "robot.py", **settings: object) -> LabProcess:
-        """Start a client at the robot, or at a server: a role of ``program`` and its settings."""
-        return self.process(place, role, [str(program), role, json.dumps(settings)])
+    def client(self, place: str, role: str, **settings: object) -> LabProcess:
+        """Start a client at the robot, or at a server: a role of ``robot.py`` and its settings."""
+        return self.process(place, role, [str(_HERE / "robot.py"), role, json.dumps(settings)])
 
     def process(self, node: str, what: str, arguments: Sequence[str]) -> LabProcess:
         """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""
@@ -209,10 +206,10 @@ class Field:
                 rules.append(each.rule(self._nodes.owner_key, further))
         return str(self._nodes.admit_proxy(node, self._domain(node), {side: rules}))
 
-    def _topology(self, mtu: int) -> Topology:
+    def _topology(self) -> Topology:
         links = [(ROBOT, _NEAR), (_NEAR, _GATE)]
         for machine in self._machines:
             relay = self._relays.get(machine)
             links += [(_GATE, machine)] if relay is None else [(_GATE, relay), (relay, machine)]
         nodes = (ROBOT, _NEAR, _GATE, *self._relays.values(), *self._machines)
-        return flat_topology(links, mtu=mtu, rib=_GATE, members=(ROBOT, *self._machines), switches=nodes)
+        return flat_topology(links, mtu=_MTU, rib=_GATE, members=(ROBOT, *self._machines), switches=nodes)

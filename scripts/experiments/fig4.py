@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, run_experiment
+from asking import Asking
+from experiment import Finding, Report, command_line, run_experiment
 from recovery_stage import DEDICATED, REPLICA
-from samples import Sample
-from series import Series
+from samples import Sample, Series
+from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 
 REQUESTS, QUICK = 100, 10

@@ -20,24 +20,14 @@ from pathlib import Path
 from statistics import fmean
 from typing import Final
 
-from experiment import (
-    CASES,
-    Asking,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from asking import Asking
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from pictures import save_distributions
 from preconditions import DATA, RefusedError, data_folder
 from recorded import FASTER, LIMIT_S, draw, load
-from samples import Sample, Summary, least_of_two, p99
-from series import Series
+from samples import Sample, Series, least_of_two, p99
+from skeleton import Options
 
 TYPE: Final = "nav_msgs/srv/GetPlan"
 TRIALS: Final = {"Home": 12, "Cubicles": 60, "Twistycool": 5}
@@ -157,33 +147,28 @@ def _ask(here: Field, problem: str, count: int, *, patience_s: float) -> dict[st
 
 
 def _planning_findings(name: str, found: Mapping[str, Sequence[Sample]]) -> list[Finding]:
-    one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
     alone = [each.latency_s for each in found[_ONE]]
-    pairs = least_of_two(alone) or alone
-    mean_gain, p99_gain = _PAPER.get(name, ("", ""))
+    offline = p99(alone) / p99(least_of_two(alone) or alone)
     return [
-        Finding(f"{name}, computed: mean gain", one.mean_s / two.mean_s, paper=mean_gain),
-        Finding(f"{name}, computed: p99 gain", one.p99_s / two.p99_s, paper=p99_gain),
-        Finding(
-            f"{name}, computed: p99 gain offline, least of any two of one server's samples", p99(alone) / p99(pairs)
-        ),
+        *gains(f"{name}, computed: {{}} gain", found[_ONE], found[_TWO], _PAPER.get(name, ("", ""))),
+        Finding(f"{name}, computed: p99 gain offline, least of any two of one server's samples", offline),
     ]
 
 
 def _waiting_findings(
     name: str, found: Mapping[str, Sequence[Sample]], both: Sequence[Sequence[float]]
 ) -> list[Finding]:
-    one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
+    paper = _PAPER.get(name.partition(",")[0], ("", ""))
+    mean_gain, p99_gain = gains(f"{name}: {{}} gain", found[_ONE], found[_TWO], paper)
     least = [min(each) for each in zip(*both, strict=True)]
     offline = p99(both[0]) / p99(least)
-    added_ms = 1e3 * (one.mean_s - fmean(both[0]))
-    mean_gain, p99_gain = _PAPER.get(name.partition(",")[0], ("", ""))
+    added_ms = 1e3 * (fmean(each.latency_s for each in found[_ONE]) - fmean(both[0]))
     return [
-        Finding(f"{name}: mean gain", one.mean_s / two.mean_s, paper=mean_gain),
+        mean_gain,
         Finding(f"{name}: mean gain offline", fmean(both[0]) / fmean(least)),
-        Finding(f"{name}: p99 gain", one.p99_s / two.p99_s, paper=p99_gain),
+        p99_gain,
         Finding(f"{name}: p99 gain offline", offline),
-        Finding(f"{name}: p99 gain / p99 gain offline", one.p99_s / two.p99_s / offline, 0.95),
+        Finding(f"{name}: p99 gain / p99 gain offline", p99_gain.measured / offline, 0.95),
         Finding(f"{name}: latency less wait, one server, mean, ms", added_ms),
     ]
 
@@ -217,16 +202,12 @@ def _notes(counts: Mapping[str, int], timeout_s: float) -> list[str]:
         " A tail is known no better than so many runs show it.",
         f"Gains of the least of any two recorded runs, by arithmetic: {'; '.join(gains)}. The p99 of two servers is the"
         " p90 of one. So a p99 gain of 5.53 needs a p99 that is 5.53 times the p90.",
-        "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is"
-        " not: it"
-        " weighs more here than in the paper (last figure of each).",
+        "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is not:"
+        " it weighs more here than in the paper (last figure of each).",
         f"Computed trials: {counted or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
-        " the p99 is"
-        " the slowest one. A problem without a solution counts with its timeout, as failed."
-        " The replicas share two cores"
-        " with each"
-        " other, the robot and the overlay, and the planner calls back into Python for each check: gains of computed"
-        " trials are less than those of two machines.",
+        " the p99 is the slowest one. A problem without a solution counts with its timeout, as failed. The replicas"
+        " share two cores with each other, the robot and the overlay, and the planner calls back into Python for each"
+        " check: gains of computed trials are less than those of two machines.",
         "The paper's planner is not named in what is at hand; the gains depend on how heavy a planner's tail is.",
     ]
 

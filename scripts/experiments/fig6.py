@@ -9,28 +9,18 @@ from __future__ import annotations
 
 import random
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
-from experiment import (
-    CASES,
-    Asking,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from asking import Asking
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
-from samples import Sample, Summary, least_of_two, p99
-from series import Contention, Series
+from samples import Sample, Series, least_of_two, p99
+from skeleton import Options
 from vision import require_networks
 
 REQUESTS: Final = 300
@@ -67,8 +57,7 @@ _SETTING: Final = (
     "A robot calls a service that finds the words in frames of 640 x 480 bytes. *Contended*: a second client of the"
     f" same service, next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for"
     f" {OFF_S:g} s. The node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and"
-    " no other client asks."
-    " Both cases take turns, request by request, with the same frames.",
+    " no other client asks. Both cases take turns, request by request, with the same frames.",
     "*Servers compute*: each runs DBNet, a neural network that gives every pixel its probability of being text, and"
     " answers the mask. *Servers wait*: they run no network, count the words by their brightness, and wait for the rest"
     " of the time, as if a processor of their own worked. The time is drawn, for each request and replica, from"
@@ -101,22 +90,18 @@ def measure(options: Options) -> Report:
     counts = {what: count for what in chosen if (count := wanted[_SETTINGS[what].role])}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]
     groups: dict[str, list[Sample]] = {}
-    findings = []
+    findings: list[Finding] = []
     for what, count in counts.items():
         setting = _SETTINGS[what]
         series = Series(setting.role, (_ONE, _TWO), 2 * count, _MACHINES, _PATIENCE_S, gap_s=_GAP_S)
         work = work_of(served, setting.role, {each: {"takes_s": times} for each, times in _times().items()})
         with field_of(served, work) as here:
-            contention = asdict(Contention(setting.role, _ONE, ON_S, OFF_S))
+            contention = {"task": setting.role, "service": _ONE, "on_s": ON_S, "off_s": OFF_S}
             conflict = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
             with conflict, Asking(here, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
         groups |= {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
-        one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
-        findings += [
-            Finding(f"mean gain, {what}", one.mean_s / two.mean_s, paper=setting.paper[0]),
-            Finding(f"p99 gain, {what}", one.p99_s / two.p99_s, paper=setting.paper[1]),
-        ]
+        findings += gains(f"{{}} gain, {what}", found[_ONE], found[_TWO], setting.paper)
     findings.append(Finding("p99 gain offline, least of any two recorded runs", _OFFLINE, paper="1.3"))
     panels = latencies_of(groups, "{name}, {case}", counts, 1e3)
     return Report(

@@ -9,23 +9,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from experiment import (
-    CASES,
-    Asking,
-    Finding,
-    Options,
-    Report,
-    command_line,
-    field_of,
-    latencies_of,
-    run_experiment,
-    work_of,
-)
+from asking import Asking
+from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
 from pictures import save_distributions
-from samples import Sample, Summary
-from series import Series
+from samples import Sample, Series
+from skeleton import Options
 from vision import require_networks
 
 DELAY_S: Final = 0.1
@@ -43,8 +33,7 @@ _SETTING: Final = (
     "A robot calls a service that looks for words in frames of 640 x 480 bytes. The link of one of its two servers is"
     " slowed down, the other one's is not. *One server*: requests go to the two servers in turn, as where a load"
     " balancer or an anycast address picks the server. So half of them meet the slow link. *Two replicas*: each"
-    " request goes to both, and the first answer wins. All cases take turns, request by request, with the same"
-    " frames.",
+    " request goes to both, and the first answer wins. All cases take turns, request by request, with the same frames.",
     "The gain depends on the server's time. A call of the near server takes a, one of the slow server a + d. One server"
     " then has a mean of a + d / 2 and a p99 of a + d; two replicas have a for both. The gains are 1 + d / 2a and"
     f" 1 + d / a. With d = {1e3 * DELAY_S:g} ms a mean gain of 2.1 needs a call of {1e3 * DELAY_S / 2.2:.0f} ms"
@@ -106,18 +95,14 @@ def measure(options: Options) -> Report:
 def _compared(found: dict[str, list[Sample]], *, has_target: bool) -> tuple[dict[str, list[Sample]], list[Finding]]:
     """Return the cases, and the gains. The near machine's requests are shared out between the links in turn."""
     groups: dict[str, list[Sample]] = {}
-    findings = []
+    findings: list[Finding] = []
     near = found[f"/detect/{_NEAR}"]
     for at, (machine, (link, _)) in enumerate(_LINKS.items()):
         one = near[at :: len(_LINKS)] + found[f"/detect/{machine}"]
         two = found[f"/detect/both/{machine}"]
         groups |= {f"{case}, {link}": samples for case, samples in zip(CASES, (one, two), strict=True)}
-        single, pair = Summary.of(one), Summary.of(two)
-        mean, tail = (2.1, 3.9) if has_target else (None, None)
-        findings += [
-            Finding(f"mean gain, {link}", single.mean_s / pair.mean_s, mean, paper="2.1"),
-            Finding(f"p99 gain, {link}", single.p99_s / pair.p99_s, tail, paper="3.9 (2.0 in the abstract)"),
-        ]
+        targets = (2.1, 3.9) if has_target else (None, None)
+        findings += gains(f"{{}} gain, {link}", one, two, ("2.1", "3.9 (2.0 in the abstract)"), targets)
     return groups, findings
 
 

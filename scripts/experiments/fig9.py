@@ -12,12 +12,13 @@ import time
 from dataclasses import replace
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, run_experiment
+from asking import Asking
+from experiment import Finding, Report, command_line, run_experiment
 from pictures import Span, save_timeline
 from recovery_stage import DEDICATED
 from report import progress
-from samples import Sample, Summary
-from series import Series
+from samples import Sample, Series, Summary
+from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
 
 MINUTES: Final = 2.0

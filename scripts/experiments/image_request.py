@@ -21,8 +21,6 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetPara
 from rcl_interfaces.srv import SetParameters
 from vision import SHAPE, Grey, Mask
 
-__all__ = ["TYPE", "answer_of", "frame_of", "mask_in", "request_of", "said_in", "text_of"]
-
 TYPE: Final = "rcl_interfaces/srv/SetParameters"
 
 

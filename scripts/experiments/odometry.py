@@ -16,8 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CAMERA", "DEPTH_SCALE", "Features", "Transform", "motion", "transform_of"]
-
 Transform: TypeAlias = "NDArray[np.float64]"  # 4 x 4, homogeneous
 
 CAMERA: Final = np.array([[518.0, 0, 325.5], [0, 519.0, 253.5], [0, 0, 1]])  # of the recorded frames, in pixels

@@ -2,7 +2,7 @@
 
     sudo .venv/bin/python scripts/experiments/offload.py               # all; writes docs/experiments/offload.*
     sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
-    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --part network     # a piece; the rest is kept
+    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM       # a piece; the rest is kept
 
 Robot and server are nodes of ROS 2 on the first and the last machine of the ring, with its three trust domains. The
 unsecured ROS 2 takes as many links over Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes
@@ -22,12 +22,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Final
 
 from bench_path import ROOT
-from experiment import OUTPUT, Computed, Options, command_line, run_experiment
+from experiment import OUTPUT, Computed, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from report import progress
-from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from skeleton import new_run
+from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
+from skeleton import Options, new_run
+from topologies import LEFT, RIGHT
 
 from gdp.host.cgroups import Cgroup
 from lab.process import LabProcess
@@ -81,12 +82,10 @@ def measure(options: Options) -> Computed:
         tasks = json.loads(held.read_text(encoding="utf-8"))["tasks"]
     for name in names:
         machine = {"machine": asdict(machine_state())}
-        figures = tasks.setdefault(name, {})
-        if options.part != "alone":
-            rounds = 1 if quick else options.rounds
-            figures["network"] = _network(name, rounds, quick=quick, is_limited=options.cores) | machine
-        if options.part != "network":
-            figures["alone"] = _alone(name, quick=quick) | machine
+        tasks[name] = {
+            "network": _network(name, 1 if quick else options.rounds, quick=quick, is_limited=options.cores) | machine,
+            "alone": _alone(name, quick=quick) | machine,
+        }
     document = {"slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     title = "FogROS G: Table I and Figure 5"
@@ -196,7 +195,6 @@ def _short(value: object) -> object:
 if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
-    parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
     parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)

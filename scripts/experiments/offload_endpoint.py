@@ -18,33 +18,17 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from select import select
-from typing import Final, Protocol, TypeAlias
+from typing import Final, TypeAlias
 
 import bench_path  # noqa: F401 - finds ``peers``
+from offload_messages import TYPES, Message, number_of, set_number
 from offload_tasks import TASKS
 from peers.jsonl import say
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_tasks import TYPES, Message, number_of, set_number
 
 _GREETING_S: Final = 0.2
 _LONG_S: Final = 3_600.0
 Settings: TypeAlias = "Mapping[str, object]"
-
-
-class _End(Protocol):
-    """Node of ROS 2."""
-
-    def publisher(self, topic: str, type_name: str) -> Callable[[Message], None]:
-        """Return a publisher of a topic."""
-        ...
-
-    def subscribe(self, topic: str, type_name: str, take: Callable[[Message], None]) -> None:
-        """Call ``take`` with each message."""
-        ...
-
-    def run(self, look: Callable[[], bool], every_s: float) -> None:
-        """Work until ``look``, called at least so often, returns that the series is over."""
-        ...
 
 
 class _FastEnd:
@@ -74,7 +58,7 @@ class _FastEnd:
         self._end.node.create_subscription(TYPES[type_name], topic, take, reliable())
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
-        """Work until ``look`` returns that the series is over."""
+        """Work until ``look``, called at least so often, returns that the series is over."""
         is_over = False
 
         def tick() -> None:
@@ -116,6 +100,8 @@ class _CycloneEnd:
                 if isinstance(event, MessageReceived):
                     self._heard[event.handle](event.raw)
 
+
+_End: TypeAlias = "_FastEnd | _CycloneEnd"
 
 _ENDS: Final[Mapping[str, Callable[[int], _End]]] = {"fast": _FastEnd, "cyclone": _CycloneEnd}
 

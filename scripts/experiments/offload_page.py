@@ -14,24 +14,10 @@ from typing import Any, Final
 from machine import MachineState
 from report import markdown_table, percentile
 
-__all__ = [
-    "CDR",
-    "CYCLONE",
-    "FAST",
-    "JSON",
-    "PAPER",
-    "PAPER_ADDED_S",
-    "added_s",
-    "page_of",
-    "save_picture",
-    "seconds_text",
-]
-
 CYCLONE: Final = "ROS 2, Cyclone DDS"
 FAST: Final = "ROS 2, Fast DDS"
 JSON: Final = "overlay, JSON"
 CDR: Final = "overlay, CDR"
-_MISSING: Final = "not measured"
 _CELLS: Final = ("network", "total")
 _SHOWN: Final = (CYCLONE, JSON, CDR)  # in Table I
 _COLOURS: Final = {CYCLONE: "#99a8b2", FAST: "#5d6b75", JSON: "#7fb3c4", CDR: "#1f6f8b"}
@@ -64,15 +50,13 @@ PAPER: Final = {
 Document = Mapping[str, Any]  # JSON
 
 
-def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, float] | None:
-    """Return the network time that the overlay adds to ROS 2: median, least and most of the rounds; None: not measured.
+def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, float]:
+    """Return the network time that the overlay adds to ROS 2: median, least and most of the rounds.
 
     Args:
         overlay: ``JSON`` or ``CDR``.
         other: ``CYCLONE`` or ``FAST``.
     """
-    if overlay not in network["contenders"]:
-        return None
     ours, theirs = (network["contenders"][who]["rounds_there_s"] for who in (overlay, other))
     gaps = [a - b for a, b in zip(ours, theirs, strict=True)]
     return statistics.median(gaps), min(gaps), max(gaps)
@@ -81,7 +65,7 @@ def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, 
 def page_of(document: Document) -> str:
     """Return the page, in Markdown, of the measured tasks."""
     tasks: Document = document["tasks"]
-    networks = {name: task["network"] for name, task in tasks.items() if "network" in task}
+    networks = {name: task["network"] for name, task in tasks.items()}
     parts = [
         "# FogROS G: Table I and Figure 5",
         "A robot computes three tasks by itself, or sends them to a server. Both ends are nodes of ROS 2. Five switches"
@@ -90,6 +74,7 @@ def page_of(document: Document) -> str:
         "*Network* is one way, as in the paper. *There* is from the robot's first `publish` to the server's callback"
         " with the last part of the request. *Back* is from the computed answer to its arrival at the robot. *Total* is"
         " from the first `publish` to the answer at the robot, computing included.",
+        "![FogROS G: Table I and Figure 5](offload.png)",
         "```bash\nsudo .venv/bin/python scripts/experiments/offload.py\n```",
         "## Table I",
         "Medians in seconds, with the p99 (of fewer than a hundred: the slowest) in brackets. *ROS 2* is unsecured, on"
@@ -98,13 +83,13 @@ def page_of(document: Document) -> str:
             ("scenario", "", "robot only", *(f"{who} {what}" for who in ("ROS 2", JSON, CDR) for what in _CELLS)),
             [row for name in PAPER if name in tasks for row in _rows(name, tasks[name])],
         ),
+        "## Figure 5: what the overlay adds",
+        *_figure5(networks),
+        "## The rest of the way",
+        *_details(networks),
+        "## What differs from the paper",
+        "\n".join(f"- {note}" for note in _notes(tasks, document["slower"])),
     ]
-    if networks:
-        parts += ["## Figure 5: what the overlay adds", *_figure5(networks)]
-        parts += ["## The rest of the way", *_details(networks)]
-    parts += ["## What differs from the paper", "\n".join(f"- {note}" for note in _notes(tasks, document["slower"]))]
-    if networks:
-        parts.insert(3, "![FogROS G: Table I and Figure 5](offload.png)")
     return "\n\n".join(parts) + "\n"
 
 
@@ -112,12 +97,9 @@ def save_picture(path: Path, document: Document) -> None:
     """Draw network time by baseline and task, and next to it the time that the overlay adds."""
     from pictures import plt, save, tidy
 
-    networks = {name: each["network"] for name, each in document["tasks"].items() if "network" in each}
-    if not networks:
-        return
+    networks = {name: each["network"] for name, each in document["tasks"].items()}
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-    shown = [who for who in _COLOURS if all(who in network["contenders"] for network in networks.values())]
-    for at, who in enumerate(shown):
+    for at, who in enumerate(_COLOURS):
         times = [1e3 * statistics.median(network["contenders"][who]["there_s"]) for network in networks.values()]
         places = [place + (at - 1.5) * 0.21 for place in range(len(networks))]
         left.bar(places, times, 0.19, color=_COLOURS[who], label=who)
@@ -126,8 +108,8 @@ def save_picture(path: Path, document: Document) -> None:
     left.plot(range(len(names)), paper, "_", ms=30, color="#c96f3b", label="FogROS G, the paper")
     left.set_xticks(range(len(names)), names, fontsize=8)
     left.set_title("network, one way, ms (median)", loc="left", fontsize=10)
-    for at, who in enumerate(each for each in (JSON, CDR) if each in shown):
-        added = [found for network in networks.values() if (found := added_s(network, who, CYCLONE))]
+    for at, who in enumerate((JSON, CDR)):
+        added = [added_s(network, who, CYCLONE) for network in networks.values()]
         spread = [[1e3 * (a - low) for a, low, _ in added], [1e3 * (high - a) for a, _, high in added]]
         places = [place + (at - 0.5) * 0.4 for place in range(len(names))]
         right.bar(places, [1e3 * a for a, _, _ in added], 0.38, yerr=spread, color=_COLOURS[who], label=who)
@@ -143,15 +125,10 @@ def _rows(name: str, task: Document) -> list[tuple[str, ...]]:
     paper = PAPER[name]
     theirs = (paper.alone_s, paper.ros_network_s, paper.ros_total_s, paper.network_s, paper.total_s)
     mark = "".join(dict.fromkeys(MachineState(**part["machine"]).mark for part in task.values()))
-    contenders = task["network"]["contenders"] if "network" in task else {}
-    found = [contenders.get(who) for who in _SHOWN]
-    alone = _MISSING
-    if "alone" in task:
-        cores = task["alone"]["cores"]
-        share = "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core"
-        alone = f"{_text(task['alone']['took_s'])}, {share}"
-    there = [_text(each[key]) if each else _MISSING for each in found for key in ("there_s", "total_s")]
-    back = [cell for each in found for cell in (_text(each["back_s"]) if each else _MISSING, "")]
+    found = [task["network"]["contenders"][who] for who in _SHOWN]
+    alone = f"{_text(task['alone']['took_s'])}, {share_text(task['alone']['cores'])}"
+    there = [_text(each[key]) for each in found for key in ("there_s", "total_s")]
+    back = [cell for each in found for cell in (_text(each["back_s"]), "")]
     return [
         (name, "paper", *(f"{each:g}" for each in theirs), "", ""),
         ("", f"here, there{mark}", alone, *there),
@@ -164,13 +141,10 @@ def _figure5(networks: Document) -> list[str]:
     added = {name: [added_s(network, *pair) for pair in pairs] for name, network in networks.items()}
     rows = []
     for name, network in networks.items():
-        cells = [f"{each[0]:.4f} ({each[1]:.4f} to {each[2]:.4f})" if each else _MISSING for each in added[name]]
+        cells = [f"{middle:.4f} ({least:.4f} to {most:.4f})" for middle, least, most in added[name]]
         paper_s = PAPER[name].network_s - PAPER[name].ros_network_s
         rows.append((name, f"{network['request_bytes']:,}", *cells, f"{paper_s:.3f}"))
-    means = []
-    for column in zip(*added.values(), strict=True):
-        middles = [each[0] for each in column if each]
-        means.append(f"{statistics.fmean(middles):+.4f}" if len(middles) == len(PAPER) else _MISSING)
+    means = [f"{statistics.fmean(each[0] for each in column):+.4f}" for column in zip(*added.values(), strict=True)]
     rows.append(("mean of the tasks", "", *means, f"{PAPER_ADDED_S:+g}"))
     head = ("scenario", "request, bytes", *(f"{overlay} less {other}" for overlay, other in pairs), "paper")
     text = (
@@ -205,10 +179,9 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         " Answers are checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a"
         " grasp on the object.",
         "*Robot only* is the same computation in a control group with the stated share of a core, as the paper's robot"
-        f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's,"
-        " not a"
-        " result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core, as"
-        " the server has.",
+        f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's, not"
+        " a result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core,"
+        " as the server has.",
         "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
         " robot, switches, proxies and server; `--cores` bounds each. Links are veth pairs, without the time of a"
         " cable, and the switches forward in the kernel.",
@@ -226,9 +199,12 @@ def _cores_text(network: Document) -> str:
     return "cores by control groups: " + ", ".join(f"{node} {count}" for node, count in network["cores"].items())
 
 
+def share_text(cores: float) -> str:
+    """Return the share of a core that a robot has."""
+    return "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core"
+
+
 def _text(values: Sequence[float]) -> str:
-    if not values:
-        return "-"
     return f"{seconds_text(statistics.median(values))} ({seconds_text(percentile(values, 0.99))})"
 
 

@@ -1,8 +1,7 @@
 """Tasks of FogROS G's Table I: the robot's request, the server's computation, and the check of the answer.
 
 Reads recorded frames and meshes when a task is made; otherwise sans-I/O. The sizes of images and the types are those of
-the clients that the authors publish (``scripts/bench/fogros_tasks.py`` names the files). Types of packages without a
-wheel are replaced by standard ones that carry the same numbers.
+the clients that the authors publish (``offload_messages.py`` names the files).
 
     vSLAM             colour (rgb8) and depth (16UC1) of 640 x 480 -> pose          stand-in: odometry.py
     motion planning   meshes of OMPL's Home and a request -> path                   OMPL's RRTConnect, FCL
@@ -14,58 +13,25 @@ from __future__ import annotations
 import array
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import cv2
 import numpy as np
-from fogros_tasks import CAMERA, IMAGE, NUMBERS, OCTETS, POSE
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
+from offload_messages import CAMERA, IMAGE, NUMBERS, OCTETS, POSE, Message
 from preconditions import data_folder
-from ros_tasks import Message
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 if TYPE_CHECKING:
     from planning import Problem
 
-__all__ = ["TASKS", "OffloadTask"]
-
 _FRAMES: Final = (2, 3, 4, 5)  # the first of the five recorded frames is too far from the second to be matched well
 _NEAR_M: Final = 0.1
 _TURNED_RAD: Final = 0.1
 _PLANNER: Final = "RRTConnect"
 _PLANNING_LIMIT_S: Final = 1_000.0
-
-
-class OffloadTask(Protocol):
-    """Task of the experiment."""
-
-    @property
-    def parts(self) -> Sequence[tuple[str, str]]:
-        """Return topic and type of each message that the robot sends."""
-        ...
-
-    @property
-    def answer(self) -> tuple[str, str]:
-        """Return topic and type of the server's message."""
-        ...
-
-    def warm_up(self) -> None:
-        """Load what the first computation would load."""
-        ...
-
-    def request(self, number: int) -> list[Message]:
-        """Return the messages of a request, in the order of ``parts``."""
-        ...
-
-    def compute(self, messages: Sequence[Message]) -> Message:
-        """Return the server's answer."""
-        ...
-
-    def is_right(self, number: int, answer: Message) -> bool:
-        """Return whether an answer to the request of that number is right."""
-        ...
 
 
 class Vslam:
@@ -220,6 +186,8 @@ class GraspPlanning:
             Grasp(place.y, place.x, turn.x, place.z, turn.y, turn.z), self._frames[number % len(self._frames)]
         )
 
+
+OffloadTask: TypeAlias = "Vslam | MotionPlanning | GraspPlanning"
 
 TASKS: Final[Mapping[str, Callable[[], OffloadTask]]] = {
     "vSLAM": Vslam,

@@ -16,15 +16,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from experiment import Asking, Finding, Options, Report, command_line, field_of, run_experiment, work_of
+from asking import Asking
+from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
 from pictures import Span, save_timeline
-from samples import Sample
-from series import Series
+from samples import Sample, Series
+from skeleton import Options
 
 from fog.plan.failure import chance_down, joint
-
-__all__ = ["Outage", "draw_outages", "share_unanswered"]
 
 SECONDS: Final = 180.0
 QUICK_S: Final = 6.0
@@ -42,21 +41,18 @@ _SEED: Final = 15
 _STEP_S: Final = 0.01
 _SETTING: Final = (
     "A robot asks two services ten times a second each. One is on machine m1 alone, the other one on m1 and m2. Each"
-    " machine stops (SIGSTOP to its node and its proxy at once: its input waits) and goes on, independently."
-    f" The times up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers"
-    " answer"
-    f" at once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
+    " machine stops (SIGSTOP to its node and its proxy at once: its input waits) and goes on, independently. The times"
+    f" up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers answer at"
+    f" once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
     "*By the list*: the share of requests during whose whole patience all their machines are down, computed from the"
     " times drawn, without any overlay. *By arithmetic*: the machines' shares of time down, multiplied.",
 )
 _NOTES: Final = (
     "The paper's times (15 h up, 20 min down) would need months, so the shares here are larger ones. What is tested is"
-    " that shares multiply as the arithmetic says, and that the overlay adds little to it. A service is back as"
-    " soon as a"
-    " machine of it is.",
+    " that shares multiply as the arithmetic says, and that the overlay adds little to it. A service is back as soon"
+    " as a machine of it is.",
     "The machines stop and do not die: a new machine needs time to start, which figure 9 shows. Outages of spot"
-    " machines"
-    " that come together are in availability.md.",
+    " machines that come together are in availability.md.",
 )
 
 

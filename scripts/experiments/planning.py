@@ -21,8 +21,6 @@ import trimesh
 from numpy.typing import NDArray
 from ompl import base, geometric, util
 
-__all__ = ["PROBLEMS", "Problem", "Solved", "Way", "be_quiet", "limits", "planners"]
-
 # The last one is this project's own: a bar and a wall with a slit.
 PROBLEMS: Final = {"Home": "Home", "Cubicles": "cubicles", "Twistycool": "Twistycool", "Easy": "Easy", "Slit": "Slit"}
 _AXES: Final = "xyz"

@@ -18,18 +18,6 @@ from typing import Final
 
 from samples import least_of_two, p99
 
-__all__ = [
-    "FASTER",
-    "LIMIT_S",
-    "MOST_CHECKS",
-    "RECORDING",
-    "SEGMENTATION",
-    "Recorded",
-    "draw",
-    "load",
-    "segmentation_runs",
-]
-
 RECORDING: Final = Path(__file__).with_name("planning_runs.json")
 SEGMENTATION: Final = Path(__file__).with_name("segmentation_runs.json")
 LIMIT_S: Final = 100.0  # the paper's timeout

@@ -14,11 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 from machine import MachineState
-from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seconds_text
+from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seconds_text, share_text
 from report import markdown_table
 from samples import p99
-
-__all__ = ["THIS_RUN", "Row", "machines_of", "page_of", "rows_of"]
 
 THIS_RUN: Final = "this run"
 
@@ -151,9 +149,8 @@ def page_of(rows: Sequence[Row], machines: Sequence[str], missing: Sequence[str]
 
 
 _NOTES: Final = (
-    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs"
-    " (G), and"
-    " AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
+    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs (G),"
+    " and AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
     " are.",
     "Stand-ins: visual odometry for ORB-SLAM2, geometric ranking for Dex-Net's GQ-CNN, and DBNet on a CPU for SAM and"
     " YOLOv8, run or as recorded. Their answers are checked against known truth. Motion planning is OMPL with FCL on"
@@ -166,45 +163,37 @@ _NOTES: Final = (
 
 
 def _offload(document: Any) -> Iterator[Row]:
-    networks = {}
-    for name, paper in PAPER.items():
-        task = document["tasks"].get(name, {})
-        if "alone" in task:
-            times, cores = task["alone"]["took_s"], task["alone"]["cores"]
-            where = "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core, the paper's ratio"
-            yield _seconds("G Table I", f"{name}: robot only", paper.alone_s, times, where)
-        if "network" not in task:
-            continue
-        networks[name] = task["network"]
+    tasks = {name: document["tasks"][name] for name in PAPER if name in document["tasks"]}
+    for name, task in tasks.items():
+        paper, network = PAPER[name], task["network"]
+        where = share_text(task["alone"]["cores"])
+        where += "" if task["alone"]["cores"] == 1 else ", the paper's ratio"
+        yield _seconds("G Table I", f"{name}: robot only", paper.alone_s, task["alone"]["took_s"], where)
         for who, network_s, total_s in (
             (CYCLONE, paper.ros_network_s, paper.ros_total_s),
             (JSON, paper.network_s, paper.total_s),
             (CDR, paper.network_s, paper.total_s),
         ):
-            if (found := task["network"]["contenders"].get(who)) is None:
-                continue
-            hops = "three bridges" if who == CYCLONE else task["network"]["over"]
+            found, hops = network["contenders"][who], "three bridges" if who == CYCLONE else network["over"]
             yield _seconds("G Table I", f"{name}: {who}, network one way", network_s, found["there_s"], hops)
             yield _seconds("G Table I", f"{name}: {who}, total", total_s, found["total_s"], f"{hops}; computed")
     for who in (JSON, CDR):
         middles = []
-        for name, network in networks.items():
-            if (added := added_s(network, who, CYCLONE)) is None:
-                continue
-            middles.append(added[0])
-            paper_s = PAPER[name].network_s - PAPER[name].ros_network_s
+        for name, task in tasks.items():
+            network = task["network"]
+            middle, least, most = added_s(network, who, CYCLONE)
+            middles.append(middle)
             yield Row(
                 "G Figure 5",
                 f"{name}: {who}, added to Cyclone DDS",
-                f"{paper_s:.3f} s",
-                f"{added[0]:.4f} s",
-                f"{added[1]:.4f} to {added[2]:.4f} s, rounds",
+                f"{PAPER[name].network_s - PAPER[name].ros_network_s:.3f} s",
+                f"{middle:.4f} s",
+                f"{least:.4f} to {most:.4f} s, rounds",
                 f"{network['rounds']} x {network['answered_at_once'] // network['rounds']}",
                 "one way",
             )
-        if len(middles) == len(PAPER):
-            middle = f"{fmean(middles):.4f} s"
-            yield Row("G Figure 5", f"{who}, added on average", f"{PAPER_ADDED_S} s", middle, "", "", "one way")
+        average = f"{fmean(middles):.4f} s"
+        yield Row("G Figure 5", f"{who}, added on average", f"{PAPER_ADDED_S} s", average, "", "", "one way")
 
 
 def _prices(document: Any) -> Iterator[Row]:

@@ -2,36 +2,31 @@
 
 Process of its own, started by ``field.py`` at the robot or at a server: ``robot.py ROLE SETTINGS``.
 
-``ask`` makes a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
+``ask`` makes a series of calls (``samples.py``), ``busy`` is the second client of figure 6.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from functools import partial
 from typing import Final
 
 import bench_path  # noqa: F401 - finds ``peers``
-import rclpy
 from peers.jsonl import say
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service_introspection import ServiceIntrospectionState
 from rclpy.task import Future
-from samples import Sample
-from series import Contention, Series
+from ros_endpoint import End, Settings, reliable, run_role
+from samples import Sample, Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
 
 _PATIENCE_S: Final = 30.0
 _TICK_S: Final = 0.002
-_EVENTS: Final = 1_000
+_DEPTH: Final = 1_000  # every client receives the answers to all clients
+_EVENTS: Final = 10_000
 _LATE_S: Final = 0.02
 _LINGER_S: Final = 0.5  # in which a surplus answer would arrive
 
@@ -46,7 +41,9 @@ class _Client:
         self._node = node
         self._task = task
         self._services = list(services)
-        self._clients = {name: node.create_client(task.kind, name) for name in dict.fromkeys(services)}
+        self._clients = {
+            name: node.create_client(task.kind, name, qos_profile=reliable(_DEPTH)) for name in dict.fromkeys(services)
+        }
         self.under_way: dict[int, tuple[str, float]] = {}
         self.sent = self.ended = 0
         self.is_warm = False
@@ -61,7 +58,7 @@ class _Client:
     def count_answers(self) -> Counter[tuple[bytes, int]]:
         """Return a counter of the answers that reach each call of this node, by ROS 2's service introspection."""
         answers: Counter[tuple[bytes, int]] = Counter()
-        deep = QoSProfile(depth=_EVENTS, reliability=ReliabilityPolicy.RELIABLE)
+        deep = reliable(_EVENTS)
 
         def take(event: object) -> None:
             info: ServiceEventInfo = event.info  # type: ignore[attr-defined]
@@ -102,11 +99,13 @@ class _Client:
                 del self.under_way[number]
                 self._note(Sample(name, begun_s, now_s - begun_s, "", 0.0, is_right=False))
 
-    def start_over(self) -> None:
-        """Reset the count: the calls until now were the warm-up."""
+    def start_over(self) -> dict[str, int]:
+        """Reset the count; return how often each service was called until now, in the warm-up."""
         self.give_up(0.0)
+        called = Counter(self._services[number % len(self._services)] for number in range(self.sent))
         self.sent = self.ended = 0
         self.is_warm = True
+        return dict(called)
 
     def _note(self, sample: Sample) -> None:
         self.ended += 1
@@ -114,26 +113,24 @@ class _Client:
             say(sample=asdict(sample))
 
 
-def ask(node: Node, executor: SingleThreadedExecutor, settings: Mapping[str, object]) -> None:
+def ask(end: End, settings: Settings) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
     series = Series(**settings)  # type: ignore[arg-type]
-    client = _Client(node, TASKS[series.task](series.problem), series.services)
+    client = _Client(end.node, TASKS[series.task](series.problem), series.services)
     answers = client.count_answers() if series.counts_answers else None
-    done: Future[None] = Future()
     client.wait_for_servers()
     deadline_s = time.monotonic() + _PATIENCE_S
     while client.sent < series.warm_up or not client.winners.issuperset(series.machines):
         if time.monotonic() > deadline_s:
             raise TimeoutError(f"no answer of {', '.join({*series.machines} - client.winners)}")
-        first: Future[None] = Future()
-        client.ask(partial(first.set_result, None))
-        executor.spin_until_future_complete(first, timeout_sec=series.patience_s)
-    client.start_over()
+        client.ask(end.finish)
+        end.run(series.patience_s)
+    warm_up = client.start_over()
     if answers is not None:
-        executor.spin_until_future_complete(Future(), timeout_sec=_LINGER_S)
+        end.run(_LINGER_S)
         answers.clear()
     due_s = time.monotonic()
-    say(event="begins", at_s=due_s)
+    say(event="begins", at_s=due_s, warm_up=warm_up)
 
     def tick() -> None:
         nonlocal due_s
@@ -142,47 +139,33 @@ def ask(node: Node, executor: SingleThreadedExecutor, settings: Mapping[str, obj
             due_s = max(due_s, now_s - _LATE_S) + series.gap_s  # a client that was delayed for long skips calls
             client.ask(tick)
         client.give_up(series.patience_s)
-        if not done.done() and client.ended == series.count:
-            done.set_result(None)
+        if client.ended == series.count:
+            end.finish()
 
-    node.create_timer(_TICK_S, tick)
-    executor.spin_until_future_complete(done)
+    timer = end.every(_TICK_S, tick)
+    end.run()
+    timer.cancel()
     if answers is not None:
-        executor.spin_until_future_complete(Future(), timeout_sec=_LINGER_S)
+        end.run(_LINGER_S)
     heard = None if answers is None else sum(answers.values())
     say(event="over", heard=heard, twice=None if answers is None or heard is None else heard - len(answers))
 
 
-def busy(node: Node, executor: SingleThreadedExecutor, settings: Mapping[str, object]) -> None:
-    """Run as the second client, until killed."""
-    contention = Contention(**settings)  # type: ignore[arg-type]
-    client = _Client(node, TASKS[contention.task](""), [contention.service])
+def busy(end: End, settings: Settings) -> None:
+    """Call one service, one call after the other for ``on_s``, none for ``off_s``, and so on, until killed."""
+    on_s, off_s = float(str(settings["on_s"])), float(str(settings["off_s"]))
+    client = _Client(end.node, TASKS[str(settings["task"])](""), [str(settings["service"])])
     client.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)
 
     def tick() -> None:
-        period_s = contention.on_s + contention.off_s
-        if (time.monotonic() - begun_s) % period_s < contention.on_s and not client.under_way:
+        if (time.monotonic() - begun_s) % (on_s + off_s) < on_s and not client.under_way:
             client.ask(tick)
 
-    node.create_timer(_TICK_S, tick)
-    executor.spin()
-
-
-_ROLES: Final[Mapping[str, Callable[[Node, SingleThreadedExecutor, Mapping[str, object]], None]]] = {
-    "ask": ask,
-    "busy": busy,
-}
-
-
-def main() -> None:
-    """Run the role of the first argument."""
-    rclpy.init()
-    node, executor = Node(f"robot_{sys.argv[1]}"), SingleThreadedExecutor()
-    executor.add_node(node)
-    _ROLES[sys.argv[1]](node, executor, json.loads(sys.argv[2]))
+    end.every(_TICK_S, tick)
+    end.run()
 
 
 if __name__ == "__main__":
-    main()
+    run_role({"ask": ask, "busy": busy})

@@ -1,4 +1,4 @@
-"""Samples of requests, and their statistics: mean, p99, gains, and the least of two that arithmetic predicts.
+"""Series of requests, their samples, and statistics: mean, p99, and the least of two that arithmetic predicts.
 
 Sans-I/O.
 Source: FogROS2-FT (IROS 2024), whose figures compare mean and 99th percentile of one server and of two.
@@ -13,7 +13,33 @@ from statistics import fmean
 import bench_path  # noqa: F401 - finds ``report``
 from report import percentile
 
-__all__ = ["Sample", "Summary", "least_of_two", "p99"]
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Calls of several services in turn; each round of them carries the same request.
+
+    Args:
+        task: a kind of request in ``tasks.TASKS``.
+        count: of calls in all.
+        machines: each has answered a call before the series begins.
+        patience_s: after which a call has failed.
+        lanes: most calls at a time.
+        gap_s: least time between the beginnings of two calls.
+        warm_up: least number of calls before the series.
+        problem: for the task ``plan``.
+        counts_answers: whether to count the answers that reach each call.
+    """
+
+    task: str
+    services: tuple[str, ...]
+    count: int
+    machines: tuple[str, ...]
+    patience_s: float
+    lanes: int = 1
+    gap_s: float = 0.0
+    warm_up: int = 4
+    problem: str = ""
+    counts_answers: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from pupil_apriltags import Detector
 from vision import SHAPE, Grey
 
-__all__ = ["Pose", "TagCamera"]
-
 _FAMILY: Final = "tag36h11"
 _SIZE_M: Final = 0.16  # metres from black edge to black edge
 _FOCAL: Final = 600.0  # pixels

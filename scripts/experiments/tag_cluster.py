@@ -25,8 +25,6 @@ from fog.providers.local.netlinks import MACHINE_DEVICE, UP
 from gdp.host import netns_files
 from lab.process import LabProcess
 
-__all__ = ["SERVICE", "TagCluster"]
-
 SERVICE: Final = "/tag"
 _HERE: Final = Path(__file__).resolve().parent
 _LAUNCH_FILE: Final = """\

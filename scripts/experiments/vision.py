@@ -18,8 +18,6 @@ from PIL import Image, ImageDraw, ImageFont
 from preconditions import RefusedError
 from scipy import ndimage
 
-__all__ = ["SHAPE", "Box", "Grey", "Mask", "Networks", "Scene", "count_words", "require_networks"]
-
 Grey: TypeAlias = "NDArray[np.uint8]"
 Mask: TypeAlias = "NDArray[np.bool_]"
 Box: TypeAlias = "tuple[int, int, int, int]"  # top, left, bottom, right, in pixels; the last two are excluded

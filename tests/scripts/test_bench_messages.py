@@ -21,13 +21,13 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 from background_load import BackgroundLoad
 from peers.certificates import make_certificates
-from peers.chain import LEFT, NODES, RIGHT, address, routes
-from peers.cyclone_net import cyclone_xml
+from peers.chain import NODES, address, routes
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
 from peers.figures import CPU, MEDIAN, case_of, targets_of
 from peers.jsonl import EndSettings
+from peers.systems import cyclone_xml
 from report import Rounds
-from topologies import row
+from topologies import LEFT, RIGHT, row
 
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer

@@ -12,8 +12,10 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 import ros
 import services
 from report import Rounds
-from ros_row import LEFT, RIGHT, Carried
-from ros_stage import DIRECT, Bench, Options, parse
+from ros_row import Carried
+from ros_stage import DIRECT, Bench, parse
+from skeleton import Options
+from topologies import LEFT, RIGHT
 
 from gdp.metadata import Metadata
 from gdp.stores.issue import make_owner

@@ -20,8 +20,6 @@ from faults.plan import Plan
 from faults.records import Kind, Record
 from gdp.message.loss import LossReason
 
-__all__ = ["Account", "Books", "Silence", "Timeline"]
-
 UNCONFIRMED_S: Final = 2.0  # the publisher may count a message as lost that came so shortly before a reader's death
 _SECOND_NS: Final = 1_000_000_000
 

@@ -18,8 +18,6 @@ import time
 from pathlib import Path
 from typing import Final
 
-__all__ = ["Clock", "follow"]
-
 _OFFSET: Final = struct.Struct("=q")  # offset in nanoseconds
 
 

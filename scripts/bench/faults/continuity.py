@@ -9,8 +9,6 @@ from faults.accounts import Books, Silence, Timeline
 from faults.oracle import Broken, Oracle
 from faults.plan import Plan
 
-__all__ = ["Continuity"]
-
 
 class Continuity:
     """Pairs of publisher and reader, with the times in which graph and policy connect them.

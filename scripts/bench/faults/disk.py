@@ -14,8 +14,6 @@ from typing import Final
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 
-__all__ = ["BROKEN", "NOT_WRITTEN", "Disk", "snapshot_faults"]
-
 SIZE_BYTES: Final = 64 << 20  # six snapshots with their logs take 30 MB at most
 NOT_WRITTEN: Final = "snapshot not written"
 _WRITTEN: Final = "snapshot written again"

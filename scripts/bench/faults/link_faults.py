@@ -35,8 +35,6 @@ from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.syscall import Command, bpf, load_program
 from gdp.ports.sockets import large_buffers
 
-__all__ = ["FrameFaults", "LinkFaults"]
-
 _TCX_INGRESS: Final = 46
 _BEFORE: Final = 1 << 3  # BPF_F_BEFORE, with no program named: before all
 _INGRESS: Final = 1  # BPF_F_INGRESS

@@ -15,8 +15,6 @@ from topologies import make_topology
 from faults.plan import Flow, Plan, Service
 from lab.topology import Link
 
-__all__ = ["VICTIM", "random_network"]
-
 VICTIM: Final = "victim"  # the member whose membership is revoked
 REVOKED_TOPIC: Final = "/of-the-victim"
 _UPPERS: Final = {"middle": "top", "left": "middle", "right": "middle"}

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 
 from faults.plan import Plan
 
-__all__ = ["Broken", "Oracle"]
-
 
 @dataclass(slots=True)
 class Broken:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import yaml
-from devices import hand_over, received, set_up
+from devices import received, set_link
 from pyroute2 import IPRoute
 from testbed import Lab
 
@@ -35,10 +35,8 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from lab.process import LabProcess
+from lab.process import FailedError, LabProcess
 from ring.credentials import OverlayCredentials
-
-__all__ = ["Overlay"]
 
 READY_S: Final = 60.0
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
@@ -134,7 +132,7 @@ class Overlay:
                 self._processes[who].read(READY_S)
 
     def start(self, who: str) -> None:
-        """Start a process, with a new incarnation."""
+        """Start a process, also one that was killed, with a new incarnation; does not wait for it."""
         role, _, node = who.partition(" ")
         incarnation_id = self._incarnation_ids[who] = self._incarnation_ids.get(who, 0) + 1
         if role == "switch":
@@ -165,10 +163,6 @@ class Overlay:
         process = self._processes.pop(who)
         os.kill(process.pid, signal.SIGKILL)
         process.__exit__(None, None, None)
-
-    def restart(self, who: str) -> None:
-        """Start a killed process again, without waiting for it."""
-        self.start(who)
 
     def is_running(self, who: str) -> bool:
         """Return whether a process was started and not killed; it may have ended by itself."""
@@ -208,6 +202,17 @@ class Overlay:
             if (member, incarnation_id) not in self._records:
                 self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
             yield incarnation_id, self._records[member, incarnation_id].read()
+
+    def new_records(self, member: str) -> Iterator[Record]:
+        """Yield what all incarnations of a member recorded since the last call.
+
+        Raises:
+            FailedError: a process ended by itself.
+        """
+        for who in self.died():
+            raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
+        for _, records in self.read(member):
+            yield from records
 
     def signal(self, who: str, number: signal.Signals) -> None:
         """Send a signal.
@@ -281,10 +286,10 @@ class Overlay:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
         there = os.open(self.spaces[to].path, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            self._lab.inside(self._at[mover], partial(hand_over, mover, there))
+            self._lab.inside(self._at[mover], partial(set_link, mover, net_ns_fd=there))
         finally:
             os.close(there)
-        self._lab.inside(to, partial(set_up, mover))
+        self._lab.inside(to, partial(set_link, mover, state="up"))
         self._at[mover] = to
 
     # files

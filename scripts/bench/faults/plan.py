@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 
 from lab.topology import Topology
 
-__all__ = ["Flow", "Plan", "Service"]
-
 
 @dataclass(frozen=True, slots=True)
 class Flow:

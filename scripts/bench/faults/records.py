@@ -12,8 +12,6 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-__all__ = ["Kind", "Record", "RecordReader", "RecordWriter"]
-
 _FORM: Final = struct.Struct("=BBHIQQ")
 
 

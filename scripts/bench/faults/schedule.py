@@ -17,8 +17,6 @@ from faults.network import VICTIM
 from faults.oracle import Broken, Oracle
 from faults.plan import Plan
 
-__all__ = ["DISK", "STORE", "STRUCTURAL", "Fault", "FaultKind", "broken_by", "make_schedule"]
-
 
 class FaultKind(Enum):
     """Kind of a fault."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 import yaml
-from devices import add_address, add_bridge, set_up
+from devices import add_address, add_bridge, set_link
 from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
@@ -28,8 +28,6 @@ from gdp.host.run_registry import Run
 from lab.namespace import Namespace
 from lab.namespaces import Namespaces
 from lab.process import FailedError, until
-
-__all__ = ["StoreCluster", "critical_lines", "has_server"]
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
 _KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
@@ -65,7 +63,7 @@ class StoreCluster:
         self._folder = run.directory / "store"
         self._namespace = Namespace(run, "store")
         self._namespace.inside(netns_files.disable_ipv6)
-        self._namespace.inside(partial(set_up, "lo"))
+        self._namespace.inside(partial(set_link, "lo", state="up"))
         self._namespace.inside(partial(add_bridge, _BRIDGE))
         self._namespace.inside(partial(add_address, _BRIDGE, _ADDRESS))
         for at, node in enumerate(ribs, 2):
@@ -156,7 +154,7 @@ class StoreCluster:
         finally:
             os.close(there)
         rib.inside(partial(add_address, _IFNAME, address))
-        rib.inside(partial(set_up, _IFNAME))
+        rib.inside(partial(set_link, _IFNAME, state="up"))
 
 
 def critical_lines(folder: Path) -> list[str]:

@@ -15,8 +15,6 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-__all__ = ["make_certificates"]
-
 _LIFE = datetime.timedelta(days=1)
 _BACK = datetime.timedelta(minutes=5)
 

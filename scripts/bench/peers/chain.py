@@ -17,11 +17,9 @@ from devices import add_address
 from machine import offload_text, offloads, set_offloads
 from pyroute2 import IPRoute
 from testbed import Lab
-from topologies import LEFT, MIDDLE, RIGHT, ROW, row
+from topologies import MIDDLE, ROW, row
 
 from gdp.host.run_registry import Run
-
-__all__ = ["LEFT", "MIDDLE", "NODES", "RIGHT", "Chain", "address", "routes"]
 
 NODES: Final = ROW
 _LINKS: Final = len(NODES) - 1

@@ -1,6 +1,6 @@
 """Endpoint process of Cyclone DDS.
 
-Process of its own, started by ``cyclone_net.py``.
+Process of its own, started by ``systems.py``.
 
 Messages go in and out as serialised bytes, which is what a ROS 2 node passes to the middleware. The binding's own
 serialiser, in Python, would cost 26 ms for an image. For that the type is one octet: Cyclone carries the rest of a
@@ -28,8 +28,6 @@ from cyclonedds.topic import Topic
 
 from peers.exchange import ANSWER, answer_to, exchange
 from peers.jsonl import EndSettings, say
-
-__all__ = ["main"]
 
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE: Final = 16

@@ -22,8 +22,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-__all__ = ["ANSWER", "IMAGE", "PATIENCE_S", "SIZE_MIN", "Load", "Way", "answer_to", "exchange", "image"]
-
 IMAGE: Final = "sensor_msgs/msg/Image"
 PATIENCE_S: Final = 20.0
 ANSWER: Final = struct.Struct("!QII")  # number, bytes, CRC-32 or 0

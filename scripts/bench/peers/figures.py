@@ -11,8 +11,6 @@ from typing import Final
 
 from report import Rounds, Target
 
-__all__ = ["CPU", "MEDIAN", "P99", "case_of", "targets_of"]
-
 MEDIAN: Final = "RTT median, ms"
 P99: Final = "RTT p99, ms"
 CPU: Final = {"sender": "sender CPU, ms", "receiver": "receiver CPU, ms", "between": "CPU between, ms"}

@@ -1,6 +1,6 @@
 """Endpoint process of GDP at A and B: a session of the library, or a member of the overlay without it.
 
-Process of its own, started by ``gdp_net.py``; or a client and a server without the library, for requests and
+Process of its own, started by ``systems.py``; or a client and a server without the library, for requests and
 responses. Each message is encoded, encrypted, signed, verified, ordered,
 acknowledged and decoded. That is all that a proxy does except for ROS.
 
@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol, get_args
+from typing import Final, TypeAlias, get_args
 
 from member_endpoint import End
 
@@ -29,8 +29,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.standard_types import standard_definition
 
-__all__ = ["PONG", "main", "ping_topic"]
-
 PONG: Final = "/pong"
 _FOREVER_S: Final = 3_600.0
 
@@ -38,25 +36,6 @@ _FOREVER_S: Final = 3_600.0
 def ping_topic(encoding: str) -> str:
     """Return the topic that carries messages in an encoding."""
     return f"/ping/{encoding}"
-
-
-class Endpoint(Protocol):
-    """One side: publishes some topics and reads others."""
-
-    def advertise(self, topic: str) -> Callable[[bytes], None]:
-        """Publish a topic, reliably; return what sends a message."""
-
-    def subscribe(self, topic: str) -> None:
-        """Read a topic."""
-
-    def wait_for_readers(self, deadline_s: float) -> None:
-        """Wait until each published topic is read; raises ``TimeoutError``."""
-
-    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
-        """Return the next message with its topic; None when the monotonic second passed."""
-
-    def resent(self, topic: str) -> int:
-        """Return how many parts of a published topic were sent again."""
 
 
 class LibraryEndpoint:
@@ -151,7 +130,8 @@ class UnicastEndpoint:
 
     def resent(self, topic: str) -> int:
         """Return how many parts of the streams to all servers were sent again: nothing is sent on them."""
-        return sum(each.repairs for each in self._end.member.publishers() if each.topic == self._end.name_of(topic))
+        del topic
+        return 0
 
     def _respond(self, message: bytes) -> None:
         if self._asked is not None:
@@ -161,6 +141,9 @@ class UnicastEndpoint:
     def _flush(self) -> None:
         self._end.member.flush(time.monotonic())
         self._end.runtime.send()
+
+
+Endpoint: TypeAlias = "LibraryEndpoint | UnicastEndpoint"
 
 
 class GdpWay:

@@ -13,8 +13,6 @@ from typing import Any
 
 from peers.exchange import Load
 
-__all__ = ["EndSettings", "order_waits", "read_order", "say"]
-
 
 @dataclass(frozen=True, slots=True)
 class EndSettings:

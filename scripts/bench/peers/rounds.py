@@ -18,12 +18,10 @@ from report import Rounds, percentile, progress
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
-from peers.baseline import Baseline, Measured
 from peers.chain import Chain
 from peers.exchange import Load
 from peers.figures import CPU, MEDIAN, P99, case_of
-
-__all__ = ["Plan", "Turns"]
+from peers.systems import Baseline, Measured
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,10 @@
 """Endpoint and router processes of Zenoh; the endpoints are as a user would write them (a callback and an Event).
 
-Process of its own, started by ``zenoh_net.py``. Shared memory is off everywhere: it would cross namespaces of
-one host, and its figures are not those of a network.
+Process of its own, started by ``systems.py``.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -18,8 +16,7 @@ import zenoh
 
 from peers.exchange import answer_to, exchange
 from peers.jsonl import EndSettings, say
-
-__all__ = ["main"]
+from peers.zenoh_config import zenoh_config
 
 _PING: Final = "bench/ping"
 _PONG: Final = "bench/pong"
@@ -54,7 +51,10 @@ class ZenohWay:
 def main() -> None:
     """Run ``ping``, ``pong`` or ``router``."""
     settings = EndSettings.from_argument()
-    with zenoh.open(_config(settings)) as session:
+    own, mode = settings.own, "router" if settings.role == "router" else "client"
+    listen, connect = ([own[key]] if key in own else [] for key in ("listen", "connect"))
+    config = zenoh_config(mode, listen=listen, connect=connect, certificate=own.get("certificate"))
+    with zenoh.open(config) as session:
         if settings.role == "ping":
             pids = {"sender": [os.getpid()], **settings.pids}
             say(series="zenoh", sizes=exchange(ZenohWay(session), settings.load, pids))
@@ -75,35 +75,6 @@ def _serve() -> None:
 
 def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
     return session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
-
-
-def _config(settings: EndSettings) -> zenoh.Config:
-    own = settings.own
-    config: zenoh.Config = zenoh.Config()
-
-    def put(key: str, value: object) -> None:
-        config.insert_json5(key, json.dumps(value))
-
-    put("mode", "router" if settings.role == "router" else "client")
-    put("transport/shared_memory/enabled", False)
-    put("scouting/multicast/enabled", False)
-    if "listen" in own:
-        put("listen/endpoints", [own["listen"]])
-    if "connect" in own:
-        put("connect/endpoints", [own["connect"]])
-    if "certificates" in own:
-        path = f"{own['certificates']}/{own['host']}"
-        put(
-            "transport/link/tls",
-            {
-                "root_ca_certificate": f"{own['certificates']}/ca.crt",
-                "enable_mtls": True,
-                "verify_name_on_connect": True,
-                **{f"{side}_private_key": f"{path}.key" for side in ("listen", "connect")},
-                **{f"{side}_certificate": f"{path}.crt" for side in ("listen", "connect")},
-            },
-        )
-    return config
 
 
 if __name__ == "__main__":

@@ -16,26 +16,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from random import Random
-from typing import Final, Protocol
-
-__all__ = ["OPPORTUNITY_BYTES", "Channel", "ConstantRate", "Counters", "Loss", "Rate", "TraceRate"]
+from typing import Final, TypeAlias
 
 OPPORTUNITY_BYTES: Final = 1_500  # of one line of a trace; mahimahi, NSDI/ATC 2015, section 3.2
 _MS_NS: Final = 1_000_000
 _SLOT_NS: Final = 100 * _MS_NS
-
-
-class Rate(Protocol):
-    """Server of a channel."""
-
-    def depart_ns(self, ready_ns: int, size: int) -> int:
-        """Return when the last bit of a frame leaves; calls come in the order of the frames."""
-
-    def capacity_bytes(self, begin_ns: int, end_ns: int) -> float:
-        """Return how many bytes could leave between two moments, both after the last ``rewind``."""
-
-    def rewind(self, now_ns: int) -> None:
-        """Begin a recording again."""
 
 
 class ConstantRate:
@@ -46,12 +31,12 @@ class ConstantRate:
         self._free_ns = 0.0
 
     def depart_ns(self, ready_ns: int, size: int) -> int:
-        """Return when the last bit leaves, as ``Rate``."""
+        """Return when the last bit of a frame leaves; calls come in the order of the frames."""
         self._free_ns = max(self._free_ns, ready_ns) + size * self._byte_ns
         return round(self._free_ns)
 
     def capacity_bytes(self, begin_ns: int, end_ns: int) -> float:
-        """Return the bytes of a span, as ``Rate``."""
+        """Return how many bytes could leave between two moments, both after the last ``rewind``."""
         return (end_ns - begin_ns) / self._byte_ns
 
     def rewind(self, now_ns: int) -> None:
@@ -82,7 +67,7 @@ class TraceRate:
         self._begun_ns = 0
 
     def depart_ns(self, ready_ns: int, size: int) -> int:
-        """Return when the last byte leaves, as ``Rate``."""
+        """Return when the last byte of a frame leaves."""
         if self._moment_ns(self._next) < ready_ns:
             self._next, self._left = self._index_from(ready_ns), OPPORTUNITY_BYTES
         while size > self._left:
@@ -92,11 +77,11 @@ class TraceRate:
         return self._moment_ns(self._next)
 
     def capacity_bytes(self, begin_ns: int, end_ns: int) -> float:
-        """Return the bytes of a span, as ``Rate``."""
+        """Return how many bytes could leave between two moments."""
         return float(OPPORTUNITY_BYTES * (self._index_from(end_ns) - self._index_from(begin_ns)))
 
     def rewind(self, now_ns: int) -> None:
-        """Begin the recording again, as ``Rate``."""
+        """Begin the recording again."""
         self._next, self._left, self._begun_ns = 0, OPPORTUNITY_BYTES, now_ns
 
     def _moment_ns(self, index: int) -> int:
@@ -111,6 +96,9 @@ class TraceRate:
         cycle, rest_ns = divmod(moment_ns - 1, self._period_ms * _MS_NS)  # the end of a repetition belongs to it
         at = bisect_left(self._moments, rest_ns // _MS_NS + 1)
         return cycle * len(self._moments) + at
+
+
+Rate: TypeAlias = "ConstantRate | TraceRate"
 
 
 class Loss:

@@ -13,8 +13,6 @@ from typing import Any, Final
 from gdp.errors import LocalError
 from thin_link.channel import OPPORTUNITY_BYTES, Channel, ConstantRate, Loss, Rate, TraceRate
 
-__all__ = ["FIFOS", "FRAME_BYTES", "LOSSES", "Conditions", "Direction", "fifo_bytes", "load_trace", "mean_bits_s"]
-
 FRAME_BYTES: Final = 1_500  # of a full frame after its Ethernet header
 LOSSES: Final[Mapping[str, tuple[float, float]]] = {  # share, mean burst in frames
     "0": (0.0, 1.0),

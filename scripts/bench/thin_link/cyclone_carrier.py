@@ -20,10 +20,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from peers.cyclone_endpoint import Opaque
 
-from thin_link.carrier import Arrival
+from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
-
-__all__ = ["CycloneCarrier"]
 
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian

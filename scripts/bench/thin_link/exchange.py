@@ -11,14 +11,26 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
-from thin_link.carrier import Carrier
 from thin_link.traffic import Direction, Stream, make_message, open_message
 
-__all__ = ["Exchange", "Window"]
-
 _QUEUE: Final = 1_024
+
+Arrival = Callable[[Stream, bytes, int], None]  # stream, message, monotonic ns; any thread
+
+
+class Carrier(Protocol):
+    """One end of a system."""
+
+    def publish(self, stream: Stream) -> Callable[[bytes], None]:
+        """Publish a stream; return what sends a message, which may wait."""
+
+    def subscribe(self, stream: Stream) -> None:
+        """Read a stream from now on."""
+
+    def is_matched(self) -> bool:
+        """Return whether every published stream is read."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,10 +14,8 @@ from typing import Any, Final
 import gdp
 from gdp.runtime.busy_poll import SPIN_US
 from gdp.runtime.memory_tuning import tune_memory
-from thin_link.carrier import Arrival
+from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
-
-__all__ = ["GdpCarrier"]
 
 _PATIENCE_S: Final = 30.0
 _QUEUE: Final = 4_096

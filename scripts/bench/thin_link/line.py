@@ -22,8 +22,6 @@ from gdp.host.run_registry import Run
 from lab.process import FailedError, LabProcess
 from thin_link.conditions import FRAME_BYTES, Conditions
 
-__all__ = ["ADDRESSES", "CLOUD", "LINE", "ROBOT", "Flow", "Line", "Used", "open_line", "thin_link_lab"]
-
 ROBOT: Final = "s1"
 CLOUD: Final = "s2"
 LINE: Final = "line"

@@ -35,8 +35,6 @@ from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
 from thin_link.channel import Channel
 from thin_link.conditions import Direction
 
-__all__ = ["MARKED_PORT", "main"]
-
 log = logging.getLogger(__name__)
 
 MARKED_PORT: Final = 5_201  # of the TCP flow that is counted apart

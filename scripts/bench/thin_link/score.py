@@ -7,7 +7,7 @@ were due; ``fraction`` says how many of all that were due those are.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from report import percentile
@@ -15,10 +15,6 @@ from report import percentile
 from thin_link.conditions import Conditions
 from thin_link.line import Used
 from thin_link.traffic import Stream, wire_bytes
-
-__all__ = ["AGE_P50", "AGE_P99", "ARRIVED", "DROPS", "DUE", "FRACTION", "LINK_COLUMNS", "OF_LINK", "OVER_IDLE",
-           "QUEUE_P50", "RELAY_LATE", "SENT", "SHARE", "SHARE_BOTH", "STREAM_COLUMNS", "TCP_ALONE", "TCP_BOTH",
-           "WHOLE",            "Report", "link_figures", "merged", "stream_figures", "whole_share"]  # fmt: skip
 
 DUE: Final = "due"
 SENT: Final = "sent"
@@ -47,9 +43,6 @@ class Report:
     due: int
     sent: int
     ages_s: Sequence[float]
-    broken: int = 0
-    doubled: int = 0
-    refusals: Mapping[str, int] = field(default_factory=dict)
     whole: int = 0  # that arrived in the window, whenever they were due
 
 
@@ -60,9 +53,7 @@ def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, 
         source, sink = (robot, cloud) if each.direction == "up" else (cloud, robot)
         sent, arrived = source[each.name], sink[each.name]
         due = robot[each.answers]["due"] if each.answers else sent["due"]
-        found[each.name] = Report(
-            due, sent["sent"], arrived["ages_s"], arrived["broken"], arrived["doubled"], whole=arrived["whole"]
-        )
+        found[each.name] = Report(due, sent["sent"], arrived["ages_s"], arrived["whole"])
     return found
 
 

@@ -9,18 +9,17 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from peers.certificates import make_certificates
+from peers.systems import cyclone_xml
 from testbed import Lab, OverlayNodes
 
 from gdp.trust.right import Right
 from lab.process import FailedError, LabProcess
 from thin_link.line import ADDRESSES, CLOUD, ROBOT
 from thin_link.traffic import streams
-
-__all__ = ["SYSTEMS", "System", "start_role"]
 
 _READY_S: Final = 45.0
 _MODULE: Final = "uplink_endpoint"
@@ -29,21 +28,6 @@ _WIREGUARD_MTU: Final = 1_420
 _INNER: Final = {ROBOT: "fd00::1", CLOUD: "fd00::2"}
 
 Ends = tuple[LabProcess, LabProcess]
-
-
-class System(Protocol):
-    """One way to carry the traffic. ``name`` is its row, and its word in ``--only``."""
-
-    @property
-    def name(self) -> str:
-        """The row that it fills."""
-
-    def run(self, lab: Lab, camera: str) -> Any:
-        """Return a context with both ends, robot first, matched and waiting for a window.
-
-        Raises:
-            FailedError: it is not installed, or did not come up.
-        """
 
 
 def start_role(lab: Lab, node: str, role: str, settings: Mapping[str, Any], *, has_orders: bool = False) -> LabProcess:
@@ -69,17 +53,14 @@ class Gdp:
 
     name = "gdp"
 
-    def __init__(self, plane: str = "kernel") -> None:
-        self._plane = plane
-
     @contextmanager
     def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, as ``System``."""
+        """Run both ends, robot first, matched and waiting for a window; raises FailedError if one did not come up."""
         mix = streams(camera)
         up = [each.name for each in mix if each.direction == "up"]
         down = [each.name for each in mix if each.direction == "down"]
         with ExitStack() as stack:
-            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane=self._plane)
+            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane="kernel")
             stack.callback(nodes.close)
             robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
             cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
@@ -97,15 +78,14 @@ class Zenoh:
 
     @contextmanager
     def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, as ``System``."""
+        """Run both ends, as ``Gdp.run``."""
         directory = lab.directory / "tls"
         if not directory.exists():
             make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
         at = f"{self._scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
         own = [
             {
-                "certificates": str(directory),
-                "host": node,
+                "certificate": str(directory / node),
                 "congestion": self._congestion,
                 "listen": [at] if node == CLOUD else [],
                 "connect": [at] if node == ROBOT else [],
@@ -123,10 +103,10 @@ class Cyclone:
 
     @contextmanager
     def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, as ``System``."""
+        """Run both ends, as ``Gdp.run``."""
         with _tunnel(lab):
-            own = ({"xml": _cyclone_xml(ROBOT, CLOUD)}, {"xml": _cyclone_xml(CLOUD, ROBOT)})
-            with _both(lab, "cyclone", camera, (ROBOT, CLOUD), own) as ends:
+            own = [{"xml": cyclone_xml(_INNER[a], _INNER[b])} for a, b in ((ROBOT, CLOUD), (CLOUD, ROBOT))]
+            with _both(lab, "cyclone", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
                 yield ends
 
 
@@ -151,16 +131,7 @@ def _tunnel(lab: Lab) -> Iterator[None]:
         yield
 
 
-def _cyclone_xml(own: str, other: str) -> str:
-    """Return the configuration of an end whose only peer is in the tunnel; else the defaults of Cyclone."""
-    return (
-        '<CycloneDDS><Domain id="any"><General><Transport>udp6</Transport>'
-        f'<Interfaces><NetworkInterface address="{_INNER[own]}"/></Interfaces>'
-        "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
-        f'<MaxAutoParticipantIndex>1</MaxAutoParticipantIndex><Peers><Peer address="{_INNER[other]}"/></Peers>'
-        "</Discovery></Domain></CycloneDDS>"
-    )
-
+System: TypeAlias = "Gdp | Zenoh | Cyclone"
 
 SYSTEMS: Final[Mapping[str, System]] = {
     each.name: each

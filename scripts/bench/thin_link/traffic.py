@@ -14,9 +14,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-__all__ = ["CAMERA_BYTES", "RELIABLE", "SERVICE_ANSWER", "Direction", "Stream", "carried_s", "make_message",
-           "open_message", "streams", "wire_bytes"]  # fmt: skip
-
 Direction = Literal["up", "down"]
 CAMERA_BYTES: Final = {"raw": 921_600, "jpeg": 40_000}  # 640x480 rgb8; the same as JPEG
 SERVICE_ANSWER: Final = "service answer"

@@ -6,24 +6,25 @@ I/O. Urgent streams are express, at the priority REAL_TIME; bulk streams are at 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from typing import Any
 
 import zenoh
+from peers.zenoh_config import zenoh_config
 
-from thin_link.carrier import Arrival
+from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
-
-__all__ = ["ZenohCarrier"]
 
 
 class ZenohCarrier:
     """Session of a peer."""
 
     def __init__(self, settings: dict[str, Any], arrived: Arrival) -> None:
-        self._session = zenoh.open(_config(settings))
+        config = zenoh_config(
+            "peer", listen=settings["listen"], connect=settings["connect"], certificate=settings["certificate"]
+        )
+        self._session = zenoh.open(config)
         self._arrived = arrived
         self._blocks_all = settings["congestion"] == "block"
         self._publishers: list[zenoh.Publisher] = []
@@ -59,26 +60,3 @@ class ZenohCarrier:
 
 def _key(stream: Stream) -> str:
     return "robot/" + stream.name.replace(" ", "_")
-
-
-def _config(settings: dict[str, Any]) -> zenoh.Config:
-    config: zenoh.Config = zenoh.Config()
-    path = f"{settings['certificates']}/{settings['host']}"
-    tls = {
-        "root_ca_certificate": f"{settings['certificates']}/ca.crt",
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        **{f"{side}_private_key": f"{path}.key" for side in ("listen", "connect")},
-        **{f"{side}_certificate": f"{path}.crt" for side in ("listen", "connect")},
-    }
-    values = {
-        "mode": "peer",
-        "transport/shared_memory/enabled": False,
-        "scouting/multicast/enabled": False,
-        "transport/link/tls": tls,
-        "listen/endpoints": settings["listen"],
-        "connect/endpoints": settings["connect"],
-    }
-    for key, value in values.items():
-        config.insert_json5(key, json.dumps(value))
-    return config

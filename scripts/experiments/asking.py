@@ -1,0 +1,70 @@
+"""Series of calls in progress at the robot, read a sample at a time.
+
+I/O. Starts ``robot.py`` at a place, and reads what it prints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Final, Protocol
+
+import bench_path  # noqa: F401 - finds ``peers``
+from report import progress
+from samples import Sample, Series
+
+from lab.process import LabProcess
+
+_ROBOT: Final = "robot"
+_BEGIN_S: Final = 90.0
+_SILENT_S: Final = 20.0  # silence of a client between two samples
+
+
+class Place(Protocol):
+    """Machines with a robot: a ``Field``, or a ``TagCluster``."""
+
+    def client(self, place: str, role: str, **settings: object) -> LabProcess:
+        """Start a role of ``robot.py`` at a machine."""
+
+
+class Asking:
+    """Series in progress, read a sample at a time; a context manager that ends its client.
+
+    Attributes:
+        twice: surplus answers that reached a call; None until the end, or where they were not counted.
+        heard: answers in all; the same.
+        warm_up: calls of each service before the series.
+    """
+
+    def __init__(self, place: Place, series: Series) -> None:
+        self._series = series
+        self._client = place.client(_ROBOT, "ask", **asdict(series))
+        self.twice: int | None = None
+        self.heard: int | None = None
+        self.warm_up: dict[str, int] = {}
+
+    def __enter__(self) -> Asking:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.__exit__(None, None, None)
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield each sample as it comes; raises FailedError if none comes in time."""
+        begun = self._client.read(_BEGIN_S)
+        self.warm_up = begun["warm_up"] if isinstance(begun["warm_up"], dict) else {}
+        while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
+            fields = said["sample"]
+            if isinstance(fields, dict):
+                yield Sample(**fields)
+        twice, heard = said["twice"], said["heard"]
+        self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
+
+    def by_service(self, what: str) -> dict[str, list[Sample]]:
+        """Return all samples of each service, and report progress at intervals."""
+        found: dict[str, list[Sample]] = {}
+        for number, sample in enumerate(self, 1):
+            found.setdefault(sample.service, []).append(sample)
+            if number % max(self._series.count // 5, 1) == 0:
+                progress(f"{what}: {number} of {self._series.count}")
+        return found
