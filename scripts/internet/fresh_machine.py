@@ -6,19 +6,19 @@ nothing stays. Each command runs in a shell of its own, as in several terminals.
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
 from internet.host import Host
+from lab.process import LabProcess
 
 __all__ = ["HIDDEN", "FreshMachine", "Shell", "TypedCommand", "typed_commands"]
 
@@ -51,37 +51,24 @@ def typed_commands(page: str) -> list[TypedCommand]:
     ]
 
 
-class Shell:
+class Shell(LabProcess):
     """A command that runs in a shell on a machine."""
 
-    def __init__(self, argv: Sequence[str], environment: Mapping[str, str], log: Path) -> None:
-        self._log = log
-        with log.open("wb") as output:
-            self._process = subprocess.Popen(
-                [*_INTERRUPTIBLE, *argv],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                env=environment,
-                start_new_session=True,
-            )
-
-    @property
-    def pid(self) -> int:
-        """Return the id of its process."""
-        return self._process.pid
+    def __init__(self, argv: Sequence[str], log: Path) -> None:
+        super().__init__(None, log.stem, [*_INTERRUPTIBLE, *argv], log=log, heard=False)
 
     @property
     def text(self) -> str:
         """Return what it has printed."""
-        return self._log.read_text(encoding="utf-8", errors="replace")
+        return self.log.read_text(encoding="utf-8", errors="replace")
 
     def exit_code(self, timeout_s: float) -> int:
         """Return the exit code of the command. Raises ``LocalError``: it goes on after this time."""
         try:
-            return self._process.wait(timeout_s)
+            self.reap(timeout_s)
         except subprocess.TimeoutExpired as error:
             raise LocalError(f"goes on after {timeout_s:g} s: {self.text[-_SHOWN:]}") from error
+        return self.code or 0
 
     def wait(self, timeout_s: float) -> None:
         """Return when the command has ended well. Raises ``LocalError``: it failed, or goes on."""
@@ -92,19 +79,17 @@ class Shell:
         """Return when the command has printed some words. Raises ``LocalError``: it has ended, or does not."""
         end_s = time.monotonic() + timeout_s
         while words not in self.text:
-            if self._process.poll() is not None or time.monotonic() > end_s:
+            if self.code is not None or time.monotonic() > end_s:
                 raise LocalError(f"did not print {words!r}: {self.text[-_SHOWN:]}")
             time.sleep(_LOOK_S)
 
     def end(self) -> None:
         """End the command as Ctrl-C does."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
+        self.send(signal.SIGINT)
         try:
-            self._process.wait(_END_S)
+            self.reap(_END_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.kill_group()
 
 
 class FreshMachine:
@@ -124,7 +109,7 @@ class FreshMachine:
         mounts = " && ".join(f"mount -t tmpfs -o mode=755 tmpfs {each}" for each in HIDDEN)
         script = f"{mounts} && mkdir {_HOME} && echo mounted && exec sleep infinity"
         argv = host.command(["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", script])
-        self._holder = Shell(argv, os.environ, folder / f"{host.label}-mounts.log")
+        self._holder = Shell(argv, folder / f"{host.label}-mounts.log")
         self._holder.wait_for("mounted", _END_S)
 
     def __enter__(self) -> FreshMachine:
@@ -141,13 +126,9 @@ class FreshMachine:
 
     def type(self, command: str) -> Shell:
         """Start a command as a person types it in a root shell, in which the environment of Python is active."""
-        binaries = Path(sys.executable).parent
-        environment = {
-            "LANG": "C.UTF-8",
-            "PATH": f"{binaries}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-            "PYTHONPATH": str(_ROOT),
-        }
+        path = f"{Path(sys.executable).parent}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+        environment = ["LANG=C.UTF-8", f"PATH={path}", f"PYTHONPATH={_ROOT}", f"HOME={_HOME}"]
         log = self._folder / f"{self.host.label}-{len(self._shells)}.log"
-        shell = Shell(self.command(["bash", "-c", f"exec {command}"]), environment, log)
+        shell = Shell(self.command(["env", "-i", *environment, "bash", "-c", f"exec {command}"]), log)
         self._shells.append(shell)
         return shell
