@@ -322,9 +322,7 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     begun_s = time.monotonic()
     with (
         new_run(runs) as run,
-        Overlay(
-            run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store, more=more
-        ) as overlay,
+        Overlay(run, plan, has_clocks=True, has_disk=True, in_store=in_store, more=more) as overlay,
     ):
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
@@ -438,7 +436,6 @@ def main() -> None:
         "--fifo-ms", type=float, default=200.0, help="depth of the FIFO of such a link (default: %(default)s)"
     )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
-    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     parser.add_argument(
         "--keepalive-ms",
         type=int,

@@ -38,6 +38,7 @@ TIMES, TYPED = "seconds, without a person's", "typed"
 WHOLE, ALL, FOREIGN = "first command to first image", "on all machines", "other than gdp"
 _SITES: Final = {"border": Access.PUBLIC, "robot": Access.PORT_RESTRICTED, "server": Access.PORT_RESTRICTED}
 _PATIENCE_S: Final = 120.0
+_DELAY_MS: Final = 10.0  # of each uplink, each way
 _JOIN: Final = re.compile(r"^gdp join (gdp1\S+)$", re.MULTILINE)
 _ENDPOINT: Final = str(Path(__file__).with_name("first_topic_endpoint.py"))
 _DONE: Final = {"gdp domain create": "listening on TCP port", "gdp join": "tunnels are up"}  # they go on running
@@ -46,13 +47,12 @@ _DONE: Final = {"gdp domain create": "listening on TCP port", "gdp join": "tunne
 class Tutorial:
     """The machines of the tutorial, on which its commands are typed in order."""
 
-    def __init__(self, laboratory: Laboratory, stack: ExitStack, delay_ms: float) -> None:
+    def __init__(self, laboratory: Laboratory, stack: ExitStack) -> None:
         self.machines: dict[str, FreshMachine] = {}
         self._tokens: list[str] = []
         for label, access in _SITES.items():
-            site = laboratory.add_site(f"at-{label}", access, has_line=bool(delay_ms))
-            if delay_ms:
-                site.set_delay(delay_ms)
+            site = laboratory.add_site(f"at-{label}", access, has_line=True)
+            site.set_delay(_DELAY_MS)
             machine = FreshMachine(laboratory.add_host(label, site), laboratory.run.directory)
             self.machines[label] = stack.enter_context(machine)
         self._border = self.machines["border"].host.lease().address.partition("/")[0]
@@ -81,7 +81,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Follow the tutorial from its beginning in each round."""
     over, commands = Rounds(), typed_commands(PAGE.read_text(encoding="utf-8"))
     for number in range(1, options.rounds + 1):
-        for what, seconds in _follow(commands, runs, options.delay_ms).items():
+        for what, seconds in _follow(commands, runs).items():
             over.add(BASELINE, TIMES, what, seconds)
             progress(f"round {number}, {what}: {seconds:.1f} s")
     for label in _SITES:
@@ -97,18 +97,18 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     ]
     settings = {
         "rounds": options.rounds,
-        "delay of each uplink, ms": options.delay_ms,
+        "delay of each uplink, ms": _DELAY_MS,
         "commands": [f"{each.machine}: {each.text}" for each in commands],
         "tutorial, SHA-256": hashlib.sha256(PAGE.read_bytes()).hexdigest(),
     }
     return Outcome("first_topic", "First topic between fresh machines behind two NATs", over, targets, settings)
 
 
-def _follow(commands: Sequence[TypedCommand], runs: RunRegistry, delay_ms: float) -> Mapping[str, float]:
+def _follow(commands: Sequence[TypedCommand], runs: RunRegistry) -> Mapping[str, float]:
     """Return the seconds of each command, from the last one to the first image, and of all."""
     found = dict[str, float]()
     with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
-        tutorial = Tutorial(laboratory, stack, delay_ms)
+        tutorial = Tutorial(laboratory, stack)
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
             settings = [_ENDPOINT, role, json.dumps({"topic": TOPIC})]
@@ -128,5 +128,4 @@ def _follow(commands: Sequence[TypedCommand], runs: RunRegistry, delay_ms: float
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=5, quick={"rounds": 1}, has_record=True)
-    parser.add_argument("--delay-ms", type=float, default=10.0, help="of each uplink, each way (default: %(default)s)")
     run_bench(parser, measure)

@@ -27,8 +27,7 @@ from typing import Final
 
 from background_load import LOADS, SHARE
 from peers.exchange import ANSWER, SIZE_MIN, Load
-from peers.figures import MEDIAN, P99, case_of, targets_of
-from peers.rounds import Plan, Turns
+from peers.rounds import MEDIAN, P99, Plan, Turns, case_of, targets_of
 from peers.systems import ENCODINGS, Baseline, CycloneNet, GdpNet, ZenohNet
 from plot import Panel, panel_of
 from report import Rounds
@@ -42,13 +41,13 @@ MTUS: Final = (1_500, 9_000)
 QUICK_COUNT: Final = 10
 
 
-def baselines_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float) -> tuple[Baseline, ...]:
+def baselines_of(only: Sequence[str]) -> tuple[Baseline, ...]:
     """Return the baselines with these names; all, if none is named."""
     every: tuple[Baseline, ...] = (
-        GdpNet("kernel", encodings, spin_s),
-        GdpNet("raw", encodings, spin_s),
-        GdpNet("kernel", ("cdr",), spin_s, "unicast"),
-        GdpNet("kernel", ("cdr",), spin_s, "session"),
+        GdpNet("kernel", ENCODINGS),
+        GdpNet("raw", ENCODINGS),
+        GdpNet("kernel", ("cdr",), "unicast"),
+        GdpNet("kernel", ("cdr",), "session"),
         ZenohNet(secured=True),
         ZenohNet(secured=False),
         CycloneNet(),
@@ -84,10 +83,6 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
         default="both",
         help="none, or processes that take half of each core, or each in turn (default: %(default)s)",
     )
-    parser.add_argument("--encoding", action="append", choices=ENCODINGS, help="of ours; may be repeated")
-    parser.add_argument(
-        "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
-    )
     return parser
 
 
@@ -120,7 +115,7 @@ def plan_of(options: argparse.Namespace) -> Plan:
     return Plan(
         tuple(options.mtu or MTUS),
         {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
-        baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.busy_poll_us / 1e6),
+        baselines_of(options.only or ()),
         Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
         1 if options.quick else options.rounds,
         LOADS[options.load],
@@ -141,7 +136,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
             "rounds": plan.rounds,
             "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
             "answer, B": ANSWER.size,
-            "ends of gdp spin, us": options.busy_poll_us,
+            "ends of gdp spin, us": SPIN_US,
             "shared memory": "off everywhere",
             "load": f"{SHARE:.0%} of each core" if True in plan.loads else "none",
             **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
@@ -160,7 +155,7 @@ def is_whole(options: Options) -> bool:
 
 def main() -> None:
     """Run the bench, or a part of it."""
-    options = parse(arguments([each.name for each in baselines_of((), (), 0.0)]))
+    options = parse(arguments([each.name for each in baselines_of(())]))
     options.no_plot |= options.plot is None and not is_whole(options)
     options.is_whole = is_whole
     perform(options, measure)

@@ -120,9 +120,9 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     cases = options.only or [case for case in CASES if is_replica or case != FROZEN]
     if FROZEN in cases and not is_replica:
         raise FailedError("--only frozen is measured with --gateway replica")
-    over, machines = Rounds(), options.machines or (3 if is_replica else 2)
+    over, machines = Rounds(), 3 if is_replica else 2
     with Cluster([ECHO.read_text(encoding="utf-8")], machines, options.gateway) as cluster:
-        cluster.call(options.rate)
+        cluster.call(RATE)
         for at in range(1, options.rounds + 1):
             for case in cases:
                 progress(f"round {at}/{options.rounds}: {CASES[case]}")
@@ -141,7 +141,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
             "rounds": options.rounds,
             "machines": machines,
             "gateway": options.gateway,
-            "requests a second": options.rate,
+            "requests a second": RATE,
             "notice, s": NOTICE_S,
         },
         lambda: panels_of(over),
@@ -152,6 +152,4 @@ if __name__ == "__main__":
     parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True, has_plot=True)
     parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
     parser.add_argument("--gateway", choices=[DEDICATED, REPLICA], default=DEDICATED, help="(default: %(default)s)")
-    parser.add_argument("--machines", type=int, help="(default: 2, with --gateway replica 3)")
-    parser.add_argument("--rate", type=float, default=RATE, help="requests a second (default: %(default)s)")
     run_bench(parser, measure)

@@ -46,13 +46,11 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         robot = laboratory.add_host("robot", homes[0])
         server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
         overlay = stack.enter_context(Overlay(laboratory))
-        flow = _start(overlay, stack, (border, robot, server), has_direct=not options.no_direct)
+        flow = _start(overlay, stack, (border, robot, server))
         for what, act in _events(robot, homes).items():
-            if options.only and not any(words in what for words in options.only):
-                continue
             silences = []
             for number in range(options.rounds):
-                time.sleep(options.settle_s)
+                time.sleep(SETTLE_S)
                 since_s = time.monotonic()
                 act()
                 over.add("through tunnels", what, COMMANDS, (time.monotonic() - since_s) * 1e3)
@@ -69,18 +67,17 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     ]
     for column in (LOST, DOUBLED):
         targets.append(over.target(f"messages {column}", "through tunnels", "whole run", column, 0.0, at_most=True))
-    settings = {"rounds": options.rounds, "messages": len(flow.sent_s), "direct": "no" if options.no_direct else "yes"}
+    settings = {"rounds": options.rounds, "messages": len(flow.sent_s)}
     return Outcome("roaming", "Silence when a robot's address changes", over, targets, settings)
 
 
-def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host], *, has_direct: bool) -> NumberedFlow:
+def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host]) -> NumberedFlow:
     _, robot, _ = hosts
-    sender, reader = open_sessions(overlay, stack, hosts, [TOPIC], has_direct=has_direct)
+    sender, reader = open_sessions(overlay, stack, hosts, [TOPIC], has_direct=True)
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)
-    if has_direct:
-        until(lambda: overlay.tunnels(robot).get("server", {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
+    until(lambda: overlay.tunnels(robot).get("server", {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
     return NumberedFlow(publisher, subscription)
 
 
@@ -101,7 +98,4 @@ def _events(robot: Host, homes: list[Site]) -> dict[str, Callable[[], object]]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=30, quick={"rounds": 1}, has_record=True)
-    parser.add_argument("--no-direct", action="store_true", help="all messages go through the border")
-    parser.add_argument("--only", action="append", metavar="WORDS", help="rows whose title has these words")
-    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="between two events (default: %(default)s)")
     run_bench(parser, measure)

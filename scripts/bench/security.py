@@ -42,7 +42,7 @@ STEADY_S: Final = 60.0  # limit until every flow is read
 AFTER_S: Final = 3.0  # time in which a closed flow must stay silent
 
 
-def _plan(hz: float) -> Plan:
+def _plan() -> Plan:
     """Return three tiers: t over m and n, m over l, n over r; every domain has a RIB."""
     victims = [f"V{number}" for number in range(VICTIMS)]
     topology, members = make_topology(
@@ -52,8 +52,8 @@ def _plan(hz: float) -> Plan:
         ("t1", "m1", "n1", "l1", "r1"),
         {"P": "l1", "R": "r1", **dict.fromkeys(victims, "l1")},
     )
-    flows = [Flow(f"/of/P/{number}", "P", ("R",), hz=hz) for number in range(TOPICS)]
-    flows += [Flow(f"/of/{victim}", victim, ("R",), hz=hz) for victim in victims]
+    flows = [Flow(f"/of/P/{number}", "P", ("R",), hz=HZ) for number in range(TOPICS)]
+    flows += [Flow(f"/of/{victim}", victim, ("R",), hz=HZ) for victim in victims]
     return Plan(topology, members, flows=tuple(flows))
 
 
@@ -62,7 +62,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     over = Rounds()
     for number in range(options.rounds):
         progress(f"network {number + 1} of {options.rounds}")
-        with new_run(runs) as run, Overlay(run, _plan(options.hz), plane=options.plane) as overlay:
+        with new_run(runs) as run, Overlay(run, _plan()) as overlay:
             overlay.start_all()
             _Closing(overlay).measure(over)
     targets = []
@@ -73,7 +73,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
             over.target(f"{what}: {P99}", what, CASE, P99, TARGET_MS, at_most=True),
             over.target(f"{what}: {OPEN}", what, CASE, OPEN, 0.0, at_most=True),
         ]
-    settings = {"rounds": options.rounds, "messages a second and flow": options.hz, "data plane": options.plane}
+    settings = {"rounds": options.rounds, "messages a second and flow": HZ}
     return Outcome("security", "From a revocation to the last message, three tiers", over, targets, settings)
 
 
@@ -144,6 +144,4 @@ class _Closing:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, quick={"rounds": 1}, has_record=True)
-    parser.add_argument("--hz", type=float, default=HZ, help="messages a second and flow (default: %(default)s)")
-    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     run_bench(parser, measure)

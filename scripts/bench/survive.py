@@ -39,6 +39,7 @@ STEADY_S: Final = 0.5  # a flow that had no gap above ``STEADY_GAP_S`` for so lo
 STEADY_GAP_S: Final = 0.1
 PATIENCE_S: Final = 40.0  # longer than a lease
 LOOK_S: Final = 0.05
+PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
 
@@ -137,7 +138,7 @@ def measure_row(runs: RunRegistry, row: Row, rounds: int, options: Options) -> M
         GdpError: the kernel refuses.
     """
     found = Measured()
-    with new_run(runs) as run, Overlay(run, row.plan(options.hz), plane=options.plane) as overlay:
+    with new_run(runs) as run, Overlay(run, row.plan(HZ)) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -154,7 +155,7 @@ def measure_row(runs: RunRegistry, row: Row, rounds: int, options: Options) -> M
 
 
 def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
-    time.sleep(random.random() * options.phase_s)  # events hit any phase of every timer
+    time.sleep(random.random() * PHASE_S)  # events hit any phase of every timer
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
@@ -221,7 +222,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     if options.quick:
         options.dead_s, options.settle_s = 3.0, 0.0
     over, targets, notes = Rounds(), list[Target](), list[str]()
-    case = f"a flow of {options.hz:g} messages/s"
+    case = f"a flow of {HZ:g} messages/s"
     for name in options.only or ROWS:
         row = ROWS[name]
         rounds = min(options.rounds, NEW_TOPICS) if row.new_name_s is not None else options.rounds
@@ -232,7 +233,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")
-    settings = {"events a row": options.rounds, "data plane": options.plane, "trouble": notes or "none"}
+    settings = {"events a row": options.rounds, "trouble": notes or "none"}
     title = "Silence when something fails or moves"
     return Outcome("survive", title, over, targets, settings, keeps_rows=True, has_failed=bool(notes))
 
@@ -240,9 +241,6 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
-    parser.add_argument("--hz", type=float, default=HZ, help="messages a second (default: %(default)s)")
-    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
-    parser.add_argument("--phase-s", type=float, default=0.5, help="random wait before an event (default: %(default)s)")
     parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
     run_bench(parser, measure)

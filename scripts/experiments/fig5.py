@@ -74,8 +74,7 @@ def measure(options: Options) -> Report:
         "folder": str(options.meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout
     }  # fmt: skip
     if counts:
-        stop = _STOP if options.stop else {}
-        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, plan), stop, timeout + _SLACK_S)) as here:
+        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, plan), _STOP, timeout + _SLACK_S)) as here:
             for name, count in counts.items():
                 found = _ask(here, name, count, patience_s=timeout + _SLACK_S)
                 groups |= _named(f"{name}, computed", found)
@@ -101,7 +100,6 @@ def measure(options: Options) -> Report:
             "timeout, s": timeout,
             "planner": planner,
             "trials of each wait": waits,
-            "the slower one is stopped": "yes" if options.stop else "no",
         },
         lambda path, title: save_distributions(path, title, panels, "latency, s"),
     )
@@ -221,5 +219,4 @@ if __name__ == "__main__":
     parser.add_argument("--waits", type=int, default=_WAITS, help="trials of each wait; 0: none (default: %(default)s)")
     parser.add_argument("--meshes", type=Path, default=DATA / "planning", help="folder of the problems")
     parser.add_argument("--planning", action=argparse.BooleanOptionalAction, default=True, help="plan, or only wait")
-    parser.add_argument("--stop", action=argparse.BooleanOptionalAction, default=True, help="stop the slower replica")
     run_experiment(parser, measure)

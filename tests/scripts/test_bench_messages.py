@@ -23,8 +23,8 @@ from background_load import BackgroundLoad
 from peers.certificates import make_certificates
 from peers.chain import NODES, address, routes
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
-from peers.figures import CPU, MEDIAN, case_of, targets_of
 from peers.jsonl import EndSettings
+from peers.rounds import CPU, MEDIAN, case_of, targets_of
 from peers.systems import cyclone_xml
 from report import Rounds
 from topologies import LEFT, RIGHT, row

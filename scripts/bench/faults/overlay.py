@@ -49,7 +49,6 @@ class Overlay:
     Args:
         run: run that owns the namespaces and processes.
         plan: the nodes.
-        plane: as ``gdp-switch --data-plane``.
         has_clocks: processes may have their wall clock stepped.
         more: further keys of the file of every switch and RIB, by role.
         has_disk: RIBs keep snapshots on a small disk.
@@ -65,7 +64,6 @@ class Overlay:
         run: Run,
         plan: Plan,
         *,
-        plane: str = "auto",
         has_clocks: bool = False,
         more: Mapping[str, Mapping[str, object]] | None = None,
         has_disk: bool = False,
@@ -75,7 +73,6 @@ class Overlay:
         self.directory = run.directory
         self._lab = Lab(run, plan.topology)
         self._run = run
-        self._plane = plane
         self._more = more or {}
         self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self._incarnation_ids: dict[str, int] = {}
@@ -136,7 +133,7 @@ class Overlay:
         role, _, node = who.partition(" ")
         incarnation_id = self._incarnation_ids[who] = self._incarnation_ids.get(who, 0) + 1
         if role == "switch":
-            argv = ["gdp.cli.switch", "--json", "--data-plane", self._plane, "--config", str(self._switch_file(node))]
+            argv = ["gdp.cli.switch", "--json", "--config", str(self._switch_file(node))]
         elif role == "rib":
             argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
         else:

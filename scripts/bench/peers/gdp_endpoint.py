@@ -22,6 +22,7 @@ from member_endpoint import End
 import gdp
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.runtime.busy_poll import SPIN_US
 from gdp.runtime.memory_tuning import tune_memory
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
@@ -41,8 +42,8 @@ def ping_topic(encoding: str) -> str:
 class LibraryEndpoint:
     """Session of the library."""
 
-    def __init__(self, config: Path, spin_s: float) -> None:
-        self.session = gdp.open(config, busy_poll_us=round(spin_s * 1e6), timeout_s=PATIENCE_S)
+    def __init__(self, config: Path) -> None:
+        self.session = gdp.open(config, busy_poll_us=SPIN_US, timeout_s=PATIENCE_S)
         self._publishers: dict[str, gdp.Publisher] = {}
         self._subscriptions: dict[str, gdp.Subscription] = {}
 
@@ -83,8 +84,8 @@ class UnicastEndpoint:
         is_session: a session secret authenticates both, instead of signatures.
     """
 
-    def __init__(self, config: Path, spin_s: float, *, is_session: bool) -> None:
-        self._end = End(config, spin_s)
+    def __init__(self, config: Path, *, is_session: bool) -> None:
+        self._end = End(config, SPIN_US / 1e6)
         self._is_session = is_session
         self._labels: dict[bytes, str] = {}
         self._called: list[Name] = []
@@ -197,11 +198,11 @@ def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
             send(answer_to(serializers[topic].decode(body)))
 
 
-def endpoint_of(path: str, config: Path, spin_s: float) -> Endpoint:
+def endpoint_of(path: str, config: Path) -> Endpoint:
     """Return an endpoint of a kind, as ``GdpNet`` names it."""
     if path == "library":
-        return LibraryEndpoint(config, spin_s)
-    return UnicastEndpoint(config, spin_s, is_session=path == "session")
+        return LibraryEndpoint(config)
+    return UnicastEndpoint(config, is_session=path == "session")
 
 
 def main() -> None:
@@ -209,8 +210,7 @@ def main() -> None:
     settings = EndSettings.from_argument()
     wanted = settings.own["encodings"].split()
     encodings: list[Encoding] = [each for each in get_args(Encoding) if each in wanted]
-    config, spin_s = Path(settings.own["config"]), float(settings.own["spin_s"])
-    end = endpoint_of(settings.own["path"], config, spin_s)
+    end = endpoint_of(settings.own["path"], Path(settings.own["config"]))
     if settings.role == "ping":
         _ping(end, encodings, settings)
     else:

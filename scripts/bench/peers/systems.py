@@ -56,18 +56,16 @@ class GdpNet:
     Args:
         plane: as ``gdp-switch --data-plane``.
         encodings: measured one after the other, by the same processes.
-        spin_s: seconds for which endpoints poll for frames before they sleep.
         path: kind of endpoint: ``library``; ``unicast`` or ``session``: a request and its response, signed or under a
             session secret.
     """
 
-    def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float, path: str = "library") -> None:
+    def __init__(self, plane: str, encodings: tuple[str, ...], path: str = "library") -> None:
         self.name = f"gdp-{plane}" if path == "library" else f"gdp-{plane}-{path}"
         self._path = path
         self.labels = tuple(f"{self.name} {encoding}" for encoding in encodings)
         self._plane = plane
         self._encodings = encodings
-        self._spin_s = spin_s
 
     def measure(self, chain: Chain, load: Load) -> list[Measured]:
         """Start switches, RIB, B, A.
@@ -94,7 +92,6 @@ class GdpNet:
         own = {
             "config": str(nodes.admit_member(node, rights)),
             "encodings": " ".join(self._encodings),
-            "spin_s": str(self._spin_s),
             "path": self._path,
         }
         return start_end(nodes.lab, _GDP, node, load, own, pids)
