@@ -373,9 +373,8 @@ def limit_versions(root: Path) -> list[dict[str, float]]:
 
     settings, raised = (each.relative_to(ROOT).as_posix() for each in (SETTINGS, RAISED))
     begun = git("log", "--diff-filter=A", "--format=%H", "--", raised).split()[-1:]
-    commits = (
-        [*begun, *git("log", "--reverse", "--format=%H", f"{begun[0]}..HEAD", "--", settings).split()] if begun else []
-    )
+    order = ("--first-parent", "--reverse", "--format=%H")  # not those of a branch that was merged
+    commits = [*begun, *git("log", *order, f"{begun[0]}..HEAD", "--", settings).split()] if begun else []
     texts = [*(git("show", f"{commit}:{settings}") for commit in commits), (root / settings).read_text()]
     return [json.loads(text)["limits"] for text in texts]
 
