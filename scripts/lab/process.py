@@ -189,9 +189,12 @@ class LabProcess:
 
 def end_processes(processes: Collection[LabProcess], patience_s: float = 3.0) -> None:
     """End processes and their groups at once, by SIGKILL after this time; return when all have ended."""
+    living = list[Process]()
     for each in processes:
         each.close_orders()
-    end_all([Process.from_pid(each.pid) for each in processes if each.code is None], patience_s)
+        with suppress(ProcessLookupError):  # it has just ended by itself
+            living += [Process.from_pid(each.pid)] if each.code is None else []  # a former id may be another's now
+    end_all(living, patience_s)
     for each in processes:
         each.reap()
 

@@ -12,7 +12,7 @@ import signal
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -28,14 +28,13 @@ from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import StoreCluster
-from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from lab.process import FailedError, LabProcess
+from lab.process import FailedError, LabProcess, end_processes
 from ring.credentials import OverlayCredentials
 
 READY_S: Final = 60.0
@@ -101,13 +100,7 @@ class Overlay:
             self.store.close()
         for who in list(self._frozen):
             self.thaw(who)
-        with ExitStack() as undo:
-            living = list[Process]()
-            for process in self._processes.values():
-                undo.enter_context(process)
-                with suppress(ProcessLookupError):  # it ended by itself
-                    living.append(Process.from_pid(process.pid))
-            end_all(living)  # all at once, not one after the other
+        end_processes(list(self._processes.values()))  # all at once
 
     def everybody(self) -> list[str]:
         """Return every process by name."""
