@@ -8,7 +8,7 @@ in ``unread``.
 
 from __future__ import annotations
 
-import shutil
+import contextlib
 import struct
 import sys
 import tempfile
@@ -25,7 +25,6 @@ from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
 from rosbags.rosbag2 import metadata as rosbag2_metadata
-from rosbags.rosbag2 import reader as rosbag2_reader
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import ConfigError, LocalError
@@ -33,7 +32,7 @@ from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
 from proxy.recordings.source import ZSTD, JoinedSource, Message, Source, UnpackedSource
-from proxy.recordings.unpacking import bound_rosbags, check_file
+from proxy.recordings.unpacking import bound_rosbags, unpack_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
 
@@ -87,7 +86,6 @@ class BagDecoder:
         checked = [_checked(channel) for channel in self._source.channels]
         self._channels = [channel for channel, _ in checked]
         self._opaque = [reason for _, reason in checked if reason]
-        self._missing: list[str] = []
 
     @property
     def channels(self) -> list[Channel]:
@@ -110,7 +108,7 @@ class BagDecoder:
 
         The text is final after ``messages``.
         """
-        return "; ".join(filter(None, (self._source.unread, *self._missing, *self._opaque)))
+        return "; ".join(filter(None, (self._source.unread, *self._opaque)))
 
     def messages(self) -> Iterator[Message]:
         """Yield (channel index, stamp in ns, bytes) in time order; a file that ends early is no error.
@@ -118,15 +116,10 @@ class BagDecoder:
         Raises:
             ConfigError: there is not enough memory; ``MemoryError`` is its cause.
         """
-        given = 0
         try:
-            for message in self._source.messages():
-                yield message
-                given += 1
+            yield from self._source.messages()
         except MemoryError as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
-
-        self._missing = [] if given >= self.count else [f"{given} of {self.count} announced messages are given"]
 
     def close(self) -> None:
         """Close the files."""
@@ -209,40 +202,20 @@ def _lacking(metadata: Path, there: set[str]) -> list[str]:
     return [f"{metadata.name} states no files; all storage files are read"]
 
 
-class _UnpackedFile:
+class _UnpackedFile(UnpackedSource):
     """A storage file that is compressed as a whole, unpacked into a folder of its own."""
 
     def __init__(self, path: Path) -> None:
-        check_file(path)
-        self._folder = tempfile.TemporaryDirectory(prefix="unpacked-")
-        try:
-            unpacked = Path(self._folder.name) / path.stem
-            with zstd.open(path, "rb") as packed, unpacked.open("wb") as file:
-                shutil.copyfileobj(packed, file, 1 << 20)
-            self._source = _open(unpacked)
-        except BaseException:
-            self._folder.cleanup()
-            raise
-        self.channels = self._source.channels
-
-    @property
-    def count(self) -> int:
-        return self._source.count
-
-    @property
-    def counts(self) -> list[int] | None:
-        return self._source.counts
-
-    @property
-    def unread(self) -> str:
-        return self._source.unread
-
-    def messages(self) -> Iterator[Message]:
-        return self._source.messages()
+        with contextlib.ExitStack() as stack:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="unpacked-"))
+            unpacked = Path(folder) / path.stem
+            unpack_file(path, unpacked)
+            super().__init__(_open(unpacked))
+            self._folder = stack.pop_all()
 
     def close(self) -> None:
-        self._source.close()
-        self._folder.cleanup()
+        super().close()
+        self._folder.close()
 
 
 def _open_mcap(path: Path) -> Source:
@@ -316,7 +289,6 @@ class _McapSource(_IndexedSource):
 
 
 bound_rosbags()
-rosbag2_reader.YAML = BoundedYaml  # type: ignore[attr-defined]
 rosbag2_metadata.YAML = BoundedYaml  # type: ignore[attr-defined]
 
 

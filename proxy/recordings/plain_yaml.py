@@ -6,7 +6,6 @@ Sans-I/O. rosbags reads QoS profiles and ``metadata.yaml`` with a reader that ta
 
 from __future__ import annotations
 
-import functools
 from typing import Any, Final
 
 import yaml
@@ -21,7 +20,6 @@ _BYTES_MAX: Final = 1 << 20
 _DEPTH_MAX: Final = 16
 
 
-@functools.lru_cache(maxsize=1)  # metadata is read for its compression, then by rosbags
 def load_plain(text: str) -> object:
     """Return the value of a YAML text.
 

@@ -94,8 +94,10 @@ class BagReader:
             with self._checked():
                 self._frames.skip(take)
                 self._process.request_messages()
-                self.unread = printable((yield from self._frames.messages(take)))
-                self.missing = max(0, self.count - self._frames.given)
+                unread, given = (yield from self._frames.messages(take)), self._frames.given
+                self.missing = max(0, self.count - given)
+                lacking = f"{given} of {self.count} announced messages are given" if self.missing else ""
+                self.unread = printable("; ".join(filter(None, (unread, lacking))))
         except StoppedError:
             self._is_stopped = True
 

@@ -25,7 +25,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "file_max_bytes", "unpack"]
+__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "file_max_bytes", "unpack", "unpack_file"]
 
 CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can be sent
 _FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, in addition to the first 64 MiB
@@ -75,21 +75,20 @@ def file_max_bytes(size: int) -> int:
     return CHUNK_MAX_BYTES + _FILE_RATIO_MAX * size
 
 
-def check_file(path: Path) -> None:
-    """Refuse a zstd file that would fill the disk: one that unpacks to more than any recording does.
+def unpack_file(path: Path, to: Path) -> None:
+    """Unpack a zstd file, unless it would fill the disk: unpacks to more than any recording does.
 
     Raises:
         SalvageError: it does, or is no zstd.
-        OSError: it cannot be read.
+        OSError: it cannot be read or written.
     """
     limit = file_max_bytes(path.stat().st_size)
-    count = 0
     try:
-        with zstd.open(path, "rb") as file:
-            while piece := file.read(1 << 20):
-                count += len(piece)
-                if count > limit:
+        with zstd.open(path, "rb") as packed, to.open("wb") as file:
+            while piece := packed.read(1 << 20):
+                if file.tell() + len(piece) > limit:
                     raise SalvageError(f"{path.name} unpacks to more than {limit} bytes")
+                file.write(piece)
     except (EOFError, zstd.ZstdError) as error:
         raise SalvageError(f"{path.name} cannot be unpacked: {error}") from error
 

@@ -12,6 +12,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import tempfile
 import textwrap
 import time
 from collections.abc import Callable, Iterator
@@ -380,18 +381,21 @@ def test_b06_no_decoder_outlives_the_process_that_started_it(
         assert ends(decoder)
 
 
-def test_b06_a_recording_that_is_closed_leaves_no_decoder_and_no_folder(tmp_path: Path) -> None:
+def test_b06_a_recording_that_is_closed_leaves_no_decoder_and_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # other tests make such folders meanwhile
     path = tmp_path / "a.db3"
     with sqlite3.connect(path) as connection:
         connection.execute(TOPICS)
         connection.execute(MESSAGES)
     connection.close()
-    before = set(Path(os.environ.get("TMPDIR", "/tmp")).glob("gdp-recording-*"))
     with BagReader(path) as bag:
+        assert list(tmp_path.glob("gdp-recording-*"))
         decoder = child_of(os.getpid())
         assert bag.count == 0
     assert has_ended(decoder)
-    assert set(Path(os.environ.get("TMPDIR", "/tmp")).glob("gdp-recording-*")) <= before
+    assert not list(tmp_path.glob("gdp-recording-*"))
 
 
 def test_b07_a_decoder_works_no_further_ahead_than_its_pipe_holds(tmp_path: Path) -> None:
