@@ -192,8 +192,9 @@ def end_processes(processes: Collection[LabProcess], patience_s: float = 3.0) ->
     living = list[Process]()
     for each in processes:
         each.close_orders()
-        with suppress(ProcessLookupError):  # it has just ended by itself
-            living += [Process.from_pid(each.pid)] if each.code is None else []  # a former id may be another's now
+        if each.code is None:  # a former id may be another's now
+            with suppress(ProcessLookupError):  # it has just ended by itself
+                living.append(Process.from_pid(each.pid))
     end_all(living, patience_s)
     for each in processes:
         each.reap()

@@ -7,7 +7,7 @@ supervised, so that one which dies ends the run at once.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -59,6 +59,7 @@ class Overlay:
         )
         self._cores = self._make_cores(run) if options.cores else None
         self.children = Children(run, kept=options.keep, started=None if self._cores is None else self._cores.add)
+        self.start = partial(self.children.start_in, self.namespaces)
         self.switches: dict[str, Child] = {}
         self._ribs: dict[str, Child] = {}
         self._restarts = 0
@@ -89,18 +90,6 @@ class Overlay:
         self._ribs = {node: self._start_rib(node, config) for node, config in configs.items()}
         await self.children.ready(list(self._ribs.values()))
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
-
-    def start(
-        self,
-        node: str,
-        role: str,
-        arguments: Sequence[str],
-        *,
-        heard: bool = True,
-        environment: Mapping[str, str] | None = None,
-    ) -> Child:
-        """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
-        return self.children.start_in(self.namespaces, node, role, arguments, heard=heard, environment=environment)
 
     async def cut(self, cut: Cut) -> None:
         """Take a link down."""
