@@ -2,7 +2,7 @@
 
 Sans-I/O. In a pattern ``*`` matches any characters of one segment. ``**``, which is a segment of its own, matches one
 or more segments. As in a Unix shell, neither matches the start of a hidden segment (``/fold/_action/status``): a
-pattern spells it out.
+pattern spells it out. What every node has (``/rosout``, services for parameters) stays out alike (``leaves_out``).
 Source: https://design.ros2.org/articles/topic_and_service_names.html; http://wiki.ros.org/Names, by which a segment may
 also begin with a digit.
 """
@@ -23,7 +23,9 @@ __all__ = [
     "covers",
     "fits_kind",
     "is_name",
+    "is_of_every_node",
     "is_pattern",
+    "leaves_out",
     "matches",
     "resolved",
 ]
@@ -43,6 +45,16 @@ TYPE_FORMS: Final[dict[Kind, tuple[str, str]]] = {  # pattern in ECMAScript's sy
     "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
     "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
 }
+_OF_EVERY_NODE: Final[dict[Kind, frozenset[str]]] = {  # of ROS 2's nodes and ROS 1's
+    "topic": frozenset({"/rosout", "/rosout_agg", "/parameter_events"}),
+    "service": frozenset(  # the last segment; the others are the node's name
+        {
+            "describe_parameters", "get_parameter_types", "get_parameters", "list_parameters", "set_parameters",
+            "set_parameters_atomically", "get_type_description", "get_loggers", "set_logger_level",
+        }
+    ),
+    "action": frozenset(),
+}  # fmt: skip
 _ANY: Final = "[A-Za-z0-9_]+"
 _VISIBLE: Final = f"(?!_){_ANY}"
 
@@ -65,6 +77,19 @@ def is_pattern(text: str) -> bool:
 def matches(pattern: str, name: str) -> bool:
     """Return whether a full name matches the pattern."""
     return _compiled(pattern).fullmatch(name) is not None
+
+
+def is_of_every_node(kind: Kind, name: str) -> bool:
+    """Return whether every node has this topic or a service of this last segment, without its author's doing."""
+    return (name if kind == "topic" else name.rpartition("/")[2]) in _OF_EVERY_NODE[kind]
+
+
+def leaves_out(pattern: str, kind: Kind, name: str) -> bool:
+    """Return whether a pattern that matches leaves a live name out: every node has it, and the pattern ends with ``*``.
+
+    ``/base/*_parameters`` spells it out.
+    """
+    return pattern.rpartition("/")[2] in ("*", "**") and is_of_every_node(kind, name)
 
 
 def covers(pattern: str, name: str) -> bool:

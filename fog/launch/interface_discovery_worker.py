@@ -21,6 +21,7 @@ from typing import Final, TypedDict
 from fog.child_environment import child_environment
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
+from gdp.ros_names import is_of_every_node
 from proxy.bridge.core.action_interface import action_of, is_part
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.endpoints.ros2 import Ros2Endpoint
@@ -56,7 +57,7 @@ def offers(graph: Graph) -> list[tuple[str, str, str]]:
         if end.role is Role.SERVES and end.type_name:
             if action := action_of(end):
                 found.add(("action", *action))
-            elif not is_part(end.name):
+            elif not is_part(end.name) and not is_of_every_node("service", end.name):
                 found.add(("service", end.name, end.type_name))
     return sorted(found)
 

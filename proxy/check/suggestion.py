@@ -10,18 +10,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.ros_names import Kind, is_of_every_node
+from proxy.bridge.core.action_interface import action_of
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.printable import printable
 
 __all__ = ["Offered", "Traffic", "offered_names", "suggested_file"]
 
-_GOAL: Final = "/_action/send_goal"  # https://design.ros2.org/articles/actions.html
-_GOAL_TYPE: Final = "_SendGoal"
-_OF_NODES: Final = (
-    "/describe_parameters", "/get_parameter_types", "/get_parameters", "/get_type_description", "/list_parameters",
-    "/set_parameters", "/set_parameters_atomically",
-)  # fmt: skip
-_EVERY_GRAPH: Final = ("/rosout", "/parameter_events")
+
+_OFFERS: Final[dict[Role, Kind]] = {Role.PUBLISHES: "topic", Role.SERVES: "service"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +46,7 @@ class Offered:
         traffic: of a topic that could be read.
     """
 
-    kind: str
+    kind: Kind
     name: str
     type_name: str
     nodes: tuple[str, ...]
@@ -63,19 +60,15 @@ class Offered:
 
 def offered_names(graph: Graph) -> list[Offered]:
     """Return what nodes of a graph publish and serve, except the services and topics that every node has."""
-    found: dict[tuple[str, str, str], list[str]] = {}
+    found: dict[tuple[Kind, str, str], list[str]] = {}
     for each in graph:
-        if each.is_proxy or not each.type_name or each.name in _EVERY_GRAPH:
+        kind = _OFFERS.get(each.role)
+        if each.is_proxy or not each.type_name or kind is None:
             continue
-        if each.role is Role.SERVES and each.name.endswith(_GOAL):
-            key = ("action", each.name.removesuffix(_GOAL), each.type_name.removesuffix(_GOAL_TYPE))
-        elif "/_" in each.name or each.name.endswith(_OF_NODES):
-            continue
-        elif each.role in (Role.PUBLISHES, Role.SERVES):
-            key = ("topic" if each.role is Role.PUBLISHES else "service", each.name, each.type_name)
-        else:
-            continue
-        found.setdefault(key, []).append(each.node)
+        if kind == "service" and (action := action_of(each)):
+            found.setdefault(("action", *action), []).append(each.node)
+        elif "/_" not in each.name and not is_of_every_node(kind, each.name):
+            found.setdefault((kind, each.name, each.type_name), []).append(each.node)
     return [
         Offered(kind=kind, name=name, type_name=type_name, nodes=tuple(sorted(set(nodes))))
         for (kind, name, type_name), nodes in sorted(found.items())

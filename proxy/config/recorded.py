@@ -39,7 +39,7 @@ class RecordedRules:
         """Return the rules about topics, without the limits that a recording does not have."""
         return cls(
             tuple(_exact(rule) for rule in expose if rule.kind == "topic"),
-            tuple(rule.model_copy(update=_UNLIMITED) for rule in imports if rule.kind == "topic"),
+            tuple(rule.of_recording(_UNLIMITED) for rule in imports if rule.kind == "topic"),
         )
 
     @property
@@ -56,4 +56,4 @@ class RecordedRules:
 def _exact(rule: Rule) -> Rule:
     """Return the rule without what would change or omit messages."""
     image = None if rule.image == "jpeg" else rule.image
-    return rule.model_copy(update={**_EXACT, "image": image})
+    return rule.of_recording({**_EXACT, "image": image})

@@ -6,6 +6,7 @@ Section of a configuration file. Validation reads the owner's public key and cha
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -40,6 +41,7 @@ from gdp.ros_names import (
     fits_kind,
     is_name,
     is_pattern,
+    leaves_out,
     matches,
 )
 from gdp.service.replication import Mode, Replication
@@ -306,6 +308,7 @@ class Rule(Section):
     is_global: bool = Field(default=True, alias="global", description="The tier above learns the name.")
 
     _denied: tuple[str, ...] = PrivateAttr(default=())
+    _is_of_recording: bool = PrivateAttr(default=False)
 
     def within(self, prefix: str | None, denied: tuple[str, ...]) -> Rule:
         """Return the rule as it applies in a file.
@@ -316,6 +319,12 @@ class Rule(Section):
         """
         rule = self.model_copy(update={"prefix": prefix or ""} if self.prefix is None else {})
         rule._denied = denied
+        return rule
+
+    def of_recording(self, changes: Mapping[str, object]) -> Rule:
+        """Return the rule for a recording: with these changes, and patterns that take whatever was recorded."""
+        rule = self.model_copy(update=changes)
+        rule._is_of_recording = True
         return rule
 
     @property
@@ -389,7 +398,14 @@ class Rule(Section):
 
     def means(self, local_name: str) -> bool:
         """Return whether the rule is about a local name, denied or not."""
-        return matches(self.name, local_name) if self.is_pattern else local_name == self.local
+        if not self.is_pattern:
+            return local_name == self.local
+        return matches(self.name, local_name) and not self.leaves_out(local_name)
+
+    def leaves_out(self, local_name: str) -> bool:
+        """Return whether the rule is a pattern that does not mean this name only because every node has it."""
+        is_match = self.is_pattern and not self._is_of_recording and matches(self.name, local_name)
+        return is_match and leaves_out(self.name, self.kind, local_name)
 
     def denied_by(self, local_name: str) -> str | None:
         """Return the pattern under ``deny`` that covers a local name or its name on the overlay; None: none does."""

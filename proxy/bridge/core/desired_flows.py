@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import Kind
-from proxy.bridge.core.action_interface import action_of, is_part
+from proxy.bridge.core.action_interface import action_of
 from proxy.bridge.faults import Fault
 from proxy.config import matching
 from proxy.config.matching import choose
@@ -140,7 +140,6 @@ def _things(end: GraphEntity, roles: Mapping[Kind, Role]) -> Iterator[tuple[Kind
     action = action_of(end)
     if action is not None and end.role is roles["action"]:
         yield "action", *action
-    elif not is_part(end.name):
-        for kind in _PLAIN:
-            if end.role is roles[kind]:
-                yield kind, end.name, end.type_name
+    for kind in _PLAIN:  # the parts of an action are hidden names: no pattern means them
+        if end.role is roles[kind]:
+            yield kind, end.name, end.type_name

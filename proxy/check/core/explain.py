@@ -14,6 +14,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import Kind
 from gdp.trust.right import Right
+from proxy.bridge.core.action_interface import action_of
 from proxy.check.core.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
 from proxy.config.rule import SALT, Rule
@@ -22,9 +23,7 @@ from proxy.serial.channel import Qos
 
 __all__ = ["Delegated", "explain"]
 
-_GOAL: Final = "/_action/send_goal"  # https://design.ros2.org/articles/actions.html
-_GOAL_TYPE: Final = "_SendGoal"
-_DENIED_SHOWN: Final = 10
+_NAMES_SHOWN: Final = 10
 _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which ``gdp delegate`` has an option
 
 
@@ -88,8 +87,10 @@ class _Look:
         self._held = held
         self._is_live = graph is not None
         self._side = _SIDES[direction, rule.kind == "topic"]
-        kin = _of_kind(graph or (), rule.kind)
-        meant = [end for end in kin if end.role is self._side.role and rule.means(end.name)]
+        kin = list(_of_kind(graph or (), rule.kind))
+        kin = [end for end in kin if end.role is self._side.role]
+        meant = [end for end in kin if rule.means(end.name)]
+        self._left_out = sorted({end.name for end in kin if rule.leaves_out(end.name) and not end.is_proxy})
         ends = [end for end in meant if rule.denied_by(end.name) is None]
         self._denied = dict(self._find_denied([end.name for end in meant]))
         self._ends = [end for end in ends if not end.is_proxy]
@@ -193,8 +194,8 @@ class _Look:
 
     def _notes(self, matches: Sequence[Match]) -> Iterator[str]:
         if self._denied:
-            shown = ", ".join(f"{local} ({pattern})" for local, pattern in sorted(self._denied.items())[:_DENIED_SHOWN])
-            yield f"denied, hence left alone: {len(self._denied)}: {shown}"
+            names = [f"{name} ({pattern})" for name, pattern in sorted(self._denied.items())]
+            yield f"denied, hence left alone: {_listed(names)}"
         elif not matches:
             foreign = sorted({end.type_name for end in self._ends if not self._rule.fits_type(end.type_name)})
             if foreign:
@@ -203,6 +204,8 @@ class _Look:
                 yield "no delegation held fits it, and nothing here asks for it"
             elif self._is_live:
                 yield "nothing here matches it yet"
+        if self._left_out:
+            yield f"every node has it, so name it in full if it is to cross: {_listed(self._left_out)}"
         if self._proxied:
             yield f"of another proxy, hence left alone: {', '.join(self._proxied)}"
         silent = sum(each.metadata is None and self._has_right(each) for each in self._held.values())
@@ -223,10 +226,12 @@ def _of_kind(graph: Iterable[GraphEntity], kind: Kind) -> Iterator[GraphEntity]:
         if kind != "action":
             if is_topic == (kind == "topic"):
                 yield end
-        elif not is_topic and end.name.endswith(_GOAL):
-            yield GraphEntity(
-                end.role, end.name.removesuffix(_GOAL), end.type_name.removesuffix(_GOAL_TYPE), end.node, end.key
-            )
+        elif not is_topic and (action := action_of(end)):
+            yield GraphEntity(end.role, *action, end.node, end.key)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{len(names)}: {', '.join(names[:_NAMES_SHOWN])}{', ...' * (len(names) > _NAMES_SHOWN)}"
 
 
 def _qos_in_words(qos: Qos) -> str:

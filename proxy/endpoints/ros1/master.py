@@ -28,8 +28,6 @@ PERIOD_S: Final = 0.4
 _PATIENCE_S: Final = 2.0
 _CONNECT_S: Final = 0.5
 _LIVENESS_PERIOD_S: Final = 2.0
-_HIDDEN_TOPICS: Final = frozenset({"/rosout", "/rosout_agg"})
-_HIDDEN_SERVICES: Final = ("/get_loggers", "/set_logger_level")
 _LENGTH: Final = struct.Struct("<I")
 _HEADER_MAX: Final = 1 << 20
 _ANSWER_MAX_BYTES: Final = 16 << 20
@@ -163,15 +161,9 @@ class MasterWatch:
         for role, topics in (("publishes", publishers), ("subscribes", subscribers)):
             for topic, nodes in topics:
                 type_name = types.get(topic, "*")
-                if topic not in _HIDDEN_TOPICS and type_name != "*":
+                if type_name != "*":
                     ends += [LocalEnd(role, topic, type_name, node, "") for node in nodes if self._is_seen(node)]
-        offered = {
-            (service, node)
-            for service, nodes in servers
-            if not service.endswith(_HIDDEN_SERVICES)
-            for node in nodes
-            if self._is_seen(node)
-        }
+        offered = {(service, node) for service, nodes in servers for node in nodes if self._is_seen(node)}
         self._probe(offered)
         for service, node in offered:
             server = self._services.get((service, node))

@@ -19,22 +19,10 @@ __all__ = ["LOOK_EVERY_S", "GraphCache"]
 LOOK_EVERY_S: Final = 0.2
 _TURNS: Final = 4
 _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"  # its discovery is incomplete
-_TOPICS_OF_NODES: Final = frozenset({"/rosout", "/parameter_events"})
-_SERVICES_OF_NODES: Final = frozenset(
-    {
-        "describe_parameters",
-        "get_parameter_types",
-        "get_parameters",
-        "list_parameters",
-        "set_parameters",
-        "set_parameters_atomically",
-        "get_type_description",
-    }
-)
 
 
 class GraphCache:
-    """The last known graph, without the endpoint's own node and without the entities that every node has."""
+    """The last known graph, without the endpoint's own node."""
 
     def __init__(self, session: ContextNode) -> None:
         self._node = session.node
@@ -74,7 +62,6 @@ class GraphCache:
         found = {
             name: (types, handle.get_count_publishers(name), handle.get_count_subscribers(name))
             for name, types in self._node.get_topic_names_and_types(no_demangle=False)
-            if name not in _TOPICS_OF_NODES
         }
         before = self._by_topic
         self._by_topic = {name: before[name] for name in found if name in before}
@@ -133,7 +120,6 @@ class GraphCache:
             GraphEntity(role, service, type_name, node, node)
             for role, found in ((Role.SERVES, served), (Role.CALLS, called))
             for service, types in found
-            if service.rpartition("/")[2] not in _SERVICES_OF_NODES
             for type_name in types
         )
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
+from gdp.ros_names import is_of_every_node
 from proxy.endpoints.core.endpoint import EndpointError, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros1 import Ros1Endpoint, install
 from proxy.serial.channel import Channel, Qos
@@ -179,7 +180,9 @@ def test_the_graph_shows_others_with_their_types_and_not_ourselves(net: Net, ear
     net.peer(TALKER.format(node="talker", topic="/chatter", latch=False))
     listener = net.peer(LISTENER.format(node="listener", topic="/chatter", type="AnyMsg"))
     ear.wait_end("/chatter", "/listener")
-    shown = {(end.role, end.name, end.type_name, end.node, end.key) for end in ear.endpoint.graph()}
+    graph = {(end.role, end.name, end.type_name, end.node, end.key) for end in ear.endpoint.graph()}
+    assert (Role.PUBLISHES, "/rosout", "rosgraph_msgs/msg/Log", "/talker", "/talker") in graph
+    shown = {each for each in graph if not is_of_every_node("service", each[1]) and "/rosout" not in each[1]}
     assert shown == {
         (Role.PUBLISHES, "/chatter", STRING, "/talker", "/talker"),
         (Role.SUBSCRIBES, "/chatter", STRING, "/listener", "/listener"),

@@ -241,6 +241,17 @@ def test_an_action_is_known_by_its_goals(place: Path) -> None:
     assert service.matches == topic.matches == ()
 
 
+def test_what_a_pattern_leaves_out_because_every_node_has_it_is_named(place: Path) -> None:
+    ends = [end(Role.SERVES, f"/node/{each}_parameters", "std_srvs/srv/SetBool") for each in ("get", "set")]
+    ends.append(end(Role.SERVES, "/node/do", "std_srvs/srv/SetBool"))
+    (finding,) = findings(place, "expose", ["kind: service, name: /**"], ends)
+    assert [match.local for match in finding.matches] == ["/node/do"]
+    said = "every node has it, so name it in full if it is to cross: 2: /node/get_parameters, /node/set_parameters"
+    assert finding.notes == (said,)
+    (full,) = findings(place, "expose", ["kind: service, name: /node/get_parameters"], ends)
+    assert [match.local for match in full.matches] == ["/node/get_parameters"]
+
+
 def test_a_type_that_is_not_known_yet_is_said_to_be_so(place: Path) -> None:
     match = only(place, "expose", "name: /image", [end(Role.PUBLISHES, type_name="")])
     assert (match.overlay, match.notes) == (None, ("its type is not known yet",))
