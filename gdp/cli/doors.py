@@ -1,6 +1,6 @@
 """Commands of other packages under ``gdp``, loaded through their entry points when they run.
 
-I/O. The first four are shown and run where ``proxy`` or an extra is not installed: the error says which.
+I/O. The first five are shown and run where ``proxy`` or an extra is not installed: the error says which.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import typer
 
 from gdp.cli.extension import load_command
 
-__all__ = ["foxglove", "rosbridge", "rule", "rules_of_proxies", "suggest_rules", "watch"]
+__all__ = ["foxglove", "recording", "rosbridge", "rule", "rules_of_proxies", "suggest_rules", "watch"]
 
 
 def foxglove() -> None:
@@ -22,6 +22,11 @@ def foxglove() -> None:
 def rosbridge() -> None:
     """Let rosbridge clients use what a node's delegations allow, through a WebSocket server on this machine."""
     load_command("rosbridge", extras="proxy,doors")
+
+
+def recording() -> None:
+    """Complete a recording whose writer was killed."""
+    load_command("recording")
 
 
 def rule() -> None:

@@ -20,7 +20,7 @@ from gdp.errors import GdpError
 
 __all__ = ["app", "main"]
 
-_DOORS: Final = ("foxglove", "rosbridge", "rule", "watch")  # of the package proxy
+_DOORS: Final = ("foxglove", "rosbridge", "recording", "rule", "watch")  # of the package proxy
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),

@@ -74,7 +74,8 @@ def proxy(
 ) -> None:
     """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
 
-    With a ros section it takes part in that graph; without one it records what it imports.
+    With a ros section it takes part in that graph; without one it records what it imports. Exit 1: not all that came
+    could be written.
     """
     del columns, schema, version  # their callbacks have done all
     set_up_logging(verbose=verbose, level=log_level, form=log_format)
@@ -99,7 +100,7 @@ def proxy(
             from proxy.node.recorder import record
 
             wait_for_device(settings.iface, await_iface)
-            record(settings, json=json)
+            raise typer.Exit(0 if record(settings, json=json) else 1)
 
 
 def main() -> None:

@@ -70,6 +70,15 @@ class Record(Section):
 
     path: NewFile = Field(description="File for what arrives; its directory must exist.")
     format: Literal["mcap", "ros1"] = Field(default="mcap", description="`ros1`: a bag.")
+    split_bytes: int | None = Field(
+        default=None, ge=1 << 20, description="Messages' bytes in one file; then `NAME_0`, `NAME_1` and so on."
+    )
+    split_s: float | None = Field(default=None, ge=1.0, description="Seconds of one file, likewise.")
+
+    @property
+    def is_split(self) -> bool:
+        """Return whether there may be several files."""
+        return self.split_bytes is not None or self.split_s is not None
 
 
 class ProxyMetrics(Metrics):

@@ -16,21 +16,23 @@ from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.topic_stats import TopicStats
-from proxy.config.config import ProxyConfig
+from proxy.config.config import ProxyConfig, Record
 from proxy.config.recorded import RecordedRules
 from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
 from proxy.node.recording_bridge import open_recording_bridge
 from proxy.recordings.endpoint import RecordingEndpoint
-from proxy.recordings.writer import BagWriter
+from proxy.recordings.split import SplitWriter, first_part
+from proxy.recordings.writer import refuse_existing
+from proxy.serial.channel import RosVersion
 
 __all__ = ["record", "refuse_existing_file"]
 
 TICK_S: Final = 0.5
 
 
-def record(settings: ProxyConfig, *, json: bool) -> None:
-    """Receive the configured imports until stopped.
+def record(settings: ProxyConfig, *, json: bool) -> bool:
+    """Receive the configured imports until stopped, or until they cannot be written; return whether all are.
 
     Raises:
         LocalError: keys, delegations, the device or the file are not as configured.
@@ -38,17 +40,33 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
     refuse_existing_file(settings)
     rules = RecordedRules.of(imports=settings.imports)
     with run_node(settings, emit_wait if json else None) as node, contextlib.ExitStack() as stack:
-        writer = None
-        if settings.record is not None:
-            writer = BagWriter(settings.record.path, 1 if settings.record.format == "ros1" else 2)
-            stack.callback(writer.close)
+        writer = _writer(settings.record)
+        if writer is not None:
+            stack.callback(writer.close)  # what was written stays whatever happens
         endpoint = RecordingEndpoint(writer, rules.recorded_topics)
         with open_recording_bridge(node, settings, rules, endpoint) as bridge:
-            _work(node, bridge, json=json)
+            _work(node, bridge, writer, json=json)
             stats = bridge.stats
             say_goodbye(node, bridge)
-        stack.close()
-    _report(stats, json=json)
+        unfinished = _finish(writer)
+    _report(stats, writer, json=json)
+    if unfinished:
+        typer.echo(f"error: the recording ended early: {unfinished}", err=True)
+    return not unfinished
+
+
+def _finish(writer: SplitWriter | None) -> str:
+    """Complete the recording; return what it lacks, empty where it lacks nothing."""
+    if writer is None:
+        return ""
+    try:
+        writer.close()
+    except LocalError as error:
+        return str(error)
+    if writer.written == writer.received:
+        return ""
+    held = f"{writer.written} of {writer.received} messages are in {', '.join(map(str, writer.paths))}"
+    return f"{writer.failure or 'a stamp or a channel was refused'}; {held}"
 
 
 def refuse_existing_file(settings: ProxyConfig) -> None:
@@ -57,18 +75,27 @@ def refuse_existing_file(settings: ProxyConfig) -> None:
     Raises:
         LocalError: the file exists.
     """
-    if settings.record is not None and settings.record.path.exists():
-        raise LocalError(f"{settings.record.path} exists already; move or delete it, or change record.path")
+    if settings.record is not None:
+        refuse_existing(first_part(settings.record.path, is_split=settings.record.is_split))
 
 
-def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
-    """Receive until stopped; report progress."""
+def _writer(record: Record | None) -> SplitWriter | None:
+    if record is None:
+        return None
+    ros: RosVersion = 1 if record.format == "ros1" else 2
+    return SplitWriter(record.path, ros, max_bytes=record.split_bytes, max_s=record.split_s)
+
+
+def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: bool) -> None:
+    """Receive until stopped, or until nothing can be written any more; report progress."""
     is_ready = False
     tick_at_s = 0.0
     while not node.runtime.is_stopped:
         due_s = bridge.get_timer()
         node.runtime.step(max(tick_at_s if due_s is None else min(due_s, tick_at_s), time.monotonic()))
         bridge.work(time.monotonic())
+        if writer is not None and writer.failure:
+            return
         if not is_ready and node.member.attachment.is_attached:
             is_ready = True
             node.tell_refusals()
@@ -78,6 +105,8 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
                 typer.echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
         if time.monotonic() >= tick_at_s:
             tick_at_s = time.monotonic() + TICK_S
+            if writer is not None:
+                writer.flush()
             if json and is_ready:
                 _report_progress(bridge.stats)
 
@@ -92,9 +121,10 @@ def _report_progress(stats: Sequence[TopicStats]) -> None:
     )
 
 
-def _report(topics: Sequence[TopicStats], *, json: bool) -> None:
+def _report(topics: Sequence[TopicStats], writer: SplitWriter | None, *, json: bool) -> None:
     if json:
-        emit("done", topics=[stats.to_fields() for stats in topics])
+        about = {} if writer is None else {"written": writer.written, "files": [str(path) for path in writer.paths]}
+        emit("done", topics=[stats.to_fields() for stats in topics], **about)
         return
     received, lost = sum(stats.received for stats in topics), sum(stats.lost for stats in topics)
     typer.echo(f"{received} messages received, {lost} lost")

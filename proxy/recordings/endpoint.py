@@ -16,6 +16,7 @@ from typing import Final, NamedTuple, NoReturn
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, GraphEntity, MessageReceived, Role, TypeResolved
 from proxy.recordings.reader import BagReader
+from proxy.recordings.split import SplitWriter
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
@@ -191,7 +192,7 @@ class RecordingEndpoint(_TopicsEndpoint):
         topics: local name and type of each topic that is recorded.
     """
 
-    def __init__(self, writer: BagWriter | None, topics: Sequence[tuple[str, str]]) -> None:
+    def __init__(self, writer: BagWriter | SplitWriter | None, topics: Sequence[tuple[str, str]]) -> None:
         super().__init__("messages that are counted" if writer is None else f"recording {writer.path}")
         self._writer = writer
         self._graph: Graph = frozenset(

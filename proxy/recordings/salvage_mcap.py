@@ -76,6 +76,8 @@ class _Found(Scan):
                 elif there == length and code in (_SCHEMA, _CHANNEL):
                     self._describe(code, file.read(there))
             except (struct.error, UnicodeDecodeError, SalvageError) as error:
+                if there < length:
+                    return f"the file ends in the middle, at byte {size}"
                 return f"a record at byte {at} cannot be read ({error})"
             if there < length:
                 return f"the file ends in the middle, at byte {size}"

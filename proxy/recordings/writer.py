@@ -1,45 +1,78 @@
 """Writer of a recording: ROS 2 messages as one MCAP file, ROS 1 messages as a bag.
 
-I/O. A recording gets its name when it is closed; until then it is a hidden file in the same folder. So a killed process
-leaves nothing that looks complete.
+I/O. Until it is complete, the file has the suffix ``.partial``. What was flushed can be read whatever happens:
+``gdp recording finish`` completes the file of a killed process. A disk that fills is watched: the recording ends while
+there is space for its index.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import contextlib
+import fcntl
+import os
+import sys
+from concurrent.futures import Future, ThreadPoolExecutor
+from io import RawIOBase
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import BinaryIO, Final, Protocol
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag1 import WriterError as WriterError1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.rosbag2 import WriterError as WriterError2
 
 from gdp.errors import LocalError
-from proxy.recordings.channels import to_qos
+from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
 
-__all__ = ["BagWriter"]
+__all__ = ["PARTIAL", "BagWriter", "refuse_existing"]
 
-_UNKNOWN_HASH: Final = "RIHS01_" + "0" * 64
+PARTIAL: Final = ".partial"
 _STAMPS_NS: Final = {1: (1 << 32) * 1_000_000_000, 2: 1 << 63}
-_CONNECTIONS_MAX: Final = 4_096  # rosbags keeps each, and its definition, until the file is finished
+_CONNECTIONS_MAX: Final = 4_096  # each is kept, with its definition, until the file is finished
 _DEFINITIONS_MAX_BYTES: Final = 64 << 20
+_SPARE_BYTES: Final = 256 << 10  # of the disk, for what others write meanwhile and for the file system's own blocks
 _ANY_MD5: Final = "*"  # ROS 1's own value for an unknown one
 
 
+class _Format(Protocol):
+    """A file format that is written in chunks."""
+
+    written: int  # messages in complete chunks
+
+    @property
+    def file(self) -> RawIOBase | BinaryIO:
+        """Return the open file."""
+
+    @property
+    def unwritten_bytes(self) -> int:
+        """Return about the most bytes that the file still takes until it is complete."""
+
+    def connect(self, channel: Channel) -> None:
+        """Add a channel; the first has number 0."""
+
+    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
+        """Add a message to the chunk."""
+
+    def flush(self) -> None:
+        """Write the chunk."""
+
+    def finish(self) -> None:
+        """Write what is left, and the index."""
+
+
 class BagWriter:
-    """A recording in progress. Close it, or use it as a context: an exception inside discards it.
+    """A recording in progress. Close it, or use it as a context; what was written stays in any case.
 
     Args:
         path: the file to create, ``.mcap`` for ROS 2 or ``.bag`` for ROS 1.
         ros: version of the messages; one recording holds one kind.
+
+    Attributes:
+        failure: why nothing is written any more; empty while it is.
+        is_closed: nothing more can be written.
 
     Raises:
         LocalError: the file exists, or cannot be created.
@@ -47,24 +80,25 @@ class BagWriter:
 
     def __init__(self, path: Path | str, ros: RosVersion) -> None:
         self.path = Path(path)
+        self.partial = self.path.with_name(self.path.name + PARTIAL)
         self.ros = ros
-        if self.path.exists():
-            raise LocalError(f"{self.path} exists already")
+        self.failure = ""
+        refuse_existing(self.path)
         try:
-            self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
+            self._format: _Format = _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial)
+            fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error
         self._handles: dict[tuple[object, ...], int] = {}  # by the properties that the format can distinguish
         self._definitions_bytes = 0
-        self._connections: list[Connection] = []
-        self._writer1: Writer1 | None = None
-        self._writer2: Writer2 | None = None
-        if ros == 1:
-            self._writer1 = Writer1(self._folder / "bag")
-            self._writer1.open()
-        else:
-            self._writer2 = Writer2(self._folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
-            self._writer2.open()
+        self._syncs = ThreadPoolExecutor(1, "sync")
+        self._synced: Future[None] | None = None
+        self.is_closed = False
+
+    @property
+    def written(self) -> int:
+        """Return the messages that can be read from the file, whatever happens now."""
+        return self._format.written
 
     def add(self, channel: Channel) -> int:
         """Return the handle of a channel, the same for an equal one.
@@ -77,14 +111,15 @@ class BagWriter:
         reporter = _reporter(channel)
         if reporter not in self._handles:
             size = self._definitions_bytes + definition_bytes(channel.definition)
-            if len(self._connections) >= _CONNECTIONS_MAX or size > _DEFINITIONS_MAX_BYTES:
+            if len(self._handles) >= _CONNECTIONS_MAX or size > _DEFINITIONS_MAX_BYTES:
                 raise LocalError(f"{channel.topic} cannot be recorded: the recording has too many channels")
+            self._check_open()
             try:
-                self._connections.append(self._connect(channel))
-            except (WriterError1, WriterError2, AssertionError) as error:
+                self._format.connect(channel)
+            except (WriterError1, AssertionError) as error:
                 raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
             self._definitions_bytes = size
-            self._handles[reporter] = len(self._connections) - 1
+            self._handles[reporter] = len(self._handles)
         return self._handles[reporter]
 
     def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
@@ -95,45 +130,55 @@ class BagWriter:
             raw: the message in its own wire form.
 
         Raises:
-            LocalError: closed, a stamp out of range, or the disk is full.
+            LocalError: closed, a stamp out of range, or the disk is full; ``failure`` has the reason.
         """
-        connection = self._connections[handle]
         if not 0 <= stamp_ns < _STAMPS_NS[self.ros]:
             raise LocalError(f"{self.path}: a stamp of {stamp_ns} ns cannot be recorded")
+        self._check_open()
         try:
-            if self._writer1 is not None:
-                self._writer1.write(connection, stamp_ns, raw)
-            elif self._writer2 is not None:
-                self._writer2.write(connection, stamp_ns, raw)
-            else:
-                raise LocalError(f"{self.path} is closed")
+            free = os.fstatvfs(self._format.file.fileno())
+            if free.f_bavail * free.f_frsize < self._format.unwritten_bytes + 2 * len(raw) + _SPARE_BYTES:
+                self._fail(f"no space is left on the disk of {self.path.parent.absolute()}")
+            self._format.write(handle, stamp_ns, raw)
         except OSError as error:
-            raise LocalError(f"{self.path} cannot be written: {error.strerror}") from error
+            self._fail(f"{self.path} cannot be written: {error.strerror}")
 
-    def close(self) -> None:
-        """Finish the file and rename it; further calls have no effect.
-
-        Raises:
-            LocalError: it cannot be written.
-        """
-        if self._writer1 is None and self._writer2 is None:
+    def flush(self) -> None:
+        """Write what is kept in memory, and have it put on the disk meanwhile; a failure becomes ``failure``."""
+        if self.failure or self.is_closed:
             return
         try:
-            self._finish().rename(self.path)
+            self._format.flush()
+            if self._synced is None or self._synced.done():
+                if self._synced is not None:
+                    self._synced.result()
+                self._synced = self._syncs.submit(os.fdatasync, self._format.file.fileno())
         except OSError as error:
-            raise LocalError(f"{self.path} cannot be written: {error.strerror}") from error
-        finally:
-            self.discard()
+            self.failure = f"{self.path} cannot be written: {error.strerror}"
 
-    def discard(self) -> None:
-        """Delete the unfinished file."""
-        writer1, self._writer1 = self._writer1, None
-        writer2, self._writer2 = self._writer2, None
-        if writer1 is not None:
-            writer1.abort()
-        if writer2 is not None:
-            writer2.abort()
-        shutil.rmtree(self._folder, ignore_errors=True)
+    def close(self) -> None:
+        """Complete the file and give it its name; further calls have no effect.
+
+        Raises:
+            LocalError: it cannot be completed; what was written stays under ``partial``.
+        """
+        if self.is_closed:
+            return
+        self.is_closed = True
+        try:
+            self._format.finish()
+            _sync(self.partial)
+            refuse_existing(self.path, partial=False)
+            self.partial.rename(self.path)
+        except OSError as error:
+            why = f"{self.path} cannot be written: {error.strerror}"
+            raise LocalError(
+                f"{why}; {self.written} messages are in {self.partial}: gdp recording finish {self.partial}"
+            ) from error
+        finally:
+            self._syncs.shutdown()
+            with contextlib.suppress(OSError):  # of a write that has failed, and is reported
+                self._format.file.close()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -141,24 +186,44 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
+        self.close()
 
-    def _finish(self) -> Path:
-        if self._writer1 is not None:
-            self._writer1.close()
-            self._writer1 = None
-        if self._writer2 is not None:
-            self._writer2.close()
-            self._writer2 = None
-            return self._folder / "bag" / "bag.mcap"
-        return self._folder / "bag"
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise LocalError(f"{self.path} is closed")
+        if self.failure:
+            raise LocalError(self.failure)
 
-    def _connect(self, channel: Channel) -> Connection:
-        if self._writer1 is not None:
-            return self._writer1.add_connection(
+    def _fail(self, failure: str) -> None:
+        self.failure = failure
+        raise LocalError(failure)
+
+
+class _Ros1Format:
+    """A ROS 1 bag in progress, written by rosbags."""
+
+    def __init__(self, path: Path) -> None:
+        self._writer = Writer1(path)
+        self._writer.chunk_threshold = sys.maxsize  # chunks are written here
+        self._writer.open()
+        if self._writer.bio is None:
+            raise LocalError(f"{path}: rosbags did not open it")
+        self.file: BinaryIO = self._writer.bio
+        self._connections: list[Connection] = []
+        self._torn: OSError | None = None  # a chunk was written in part
+        self._pending = 0
+        self.written = 0
+
+    @property
+    def unwritten_bytes(self) -> int:
+        indexed = 12 * self._pending + 8 * len(self._connections)
+        chunks = len(self._writer.chunks) * (128 + 8 * len(self._connections))
+        definitions = sum(len(each.msgdef.data) + 1_024 for each in self._connections)
+        return self._writer.chunks[-1].data.tell() + indexed + chunks + definitions + 8_192
+
+    def connect(self, channel: Channel) -> None:
+        self._connections.append(
+            self._writer.add_connection(
                 channel.topic,
                 channel.type_name,
                 msgdef=channel.definition,
@@ -166,19 +231,54 @@ class BagWriter:
                 callerid=channel.callerid,
                 latching=1 if channel.latched else None,
             )
-        if self._writer2 is not None:
-            return self._writer2.add_connection(
-                channel.topic,
-                channel.type_name,
-                msgdef=channel.definition,
-                rihs01=channel.hash or _UNKNOWN_HASH,
-                offered_qos_profiles=[to_qos(profile) for profile in channel.qos],
-            )
-        raise LocalError(f"{self.path} is closed")
+        )
+
+    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
+        self._writer.write(self._connections[number], stamp_ns, raw)
+        self._pending += 1
+        if self._writer.chunks[-1].data.tell() > CHUNK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        try:
+            self._writer.write_chunk(self._writer.chunks[-1])
+            self.file.flush()
+        except OSError as error:
+            self._torn = error
+            raise
+        self.written += self._pending
+        self._pending = 0
+
+    def finish(self) -> None:
+        if self._torn is not None:
+            raise self._torn
+        self.flush()
+        self._writer.close()
+
+
+def refuse_existing(path: Path, *, partial: bool = True) -> None:
+    """Refuse to record into an existing file.
+
+    Raises:
+        LocalError: the file exists, or an incomplete one from a run that was killed.
+    """
+    if path.exists():
+        raise LocalError(f"{path} exists already")
+    unfinished = path.with_name(path.name + PARTIAL)
+    if partial and unfinished.exists():
+        raise LocalError(f"{unfinished} is of a run that did not end: gdp recording finish {unfinished}")
+
+
+def _sync(path: Path) -> None:
+    """Put a file on the disk; raises ``OSError`` where that fails."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _reporter(channel: Channel) -> tuple[object, ...]:
-    if channel.ros == 2:  # the hash and the definition belong to the type, not to the channel
-        return channel.topic, channel.type_name, channel.qos
     definition = digest_of(channel.definition)
-    return channel.topic, channel.type_name, definition, channel.hash, channel.latched, channel.callerid
+    about = (channel.hash, channel.qos) if channel.ros == 2 else (channel.hash, channel.latched, channel.callerid)
+    return channel.topic, channel.type_name, definition, channel.definition_format, *about

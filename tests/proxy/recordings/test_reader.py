@@ -369,7 +369,7 @@ def test_a_recording_appears_when_it_is_closed_and_leaves_nothing_else(tmp_path:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.bag", "a.mcap"]
 
 
-def test_a_failed_recording_leaves_nothing(tmp_path: Path) -> None:
+def test_a_recording_that_fails_keeps_what_was_written(tmp_path: Path) -> None:
     def fail() -> None:
         with BagWriter(tmp_path / "a.mcap", 2) as bag:
             bag.write(bag.add(string(2)), START_NS, raw(2, b"x"))
@@ -377,13 +377,15 @@ def test_a_failed_recording_leaves_nothing(tmp_path: Path) -> None:
 
     with pytest.raises(KeyError):
         fail()
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+    assert [message.raw for message in read(tmp_path / "a.mcap")[0]] == [raw(2, b"x")]
 
 
 def test_equal_channels_share_a_handle(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.mcap", 2) as bag:
-        assert bag.add(string(2)) == bag.add(string(2)) == bag.add(string(2, hash="RIHS01_other"))
-        assert bag.add(string(2, "/other")) != bag.add(string(2))
+        assert bag.add(string(2)) == bag.add(string(2))
+        others = [string(2, "/other"), string(2, hash="RIHS01_other"), string(2, definition="string data\n# other\n")]
+        assert sorted(bag.add(each) for each in [string(2), *others]) == [0, 1, 2, 3]
 
 
 def test_a_channel_of_the_other_ros_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,193 @@
+"""Writer of an MCAP file in chunks, each of which is complete in the file once it is flushed.
+
+I/O. Source: MCAP format specification, https://mcap.dev/spec; the metadata of channels are those of
+rosbag2_storage_mcap.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Final
+
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
+
+from proxy.recordings.channels import to_qos
+from proxy.recordings.salvage_mcap import MAGIC
+from proxy.serial.channel import Channel, DefinitionFormat
+
+__all__ = ["CHUNK_BYTES", "McapWriter"]
+
+CHUNK_BYTES: Final = 1 << 20  # a chunk is written when it has more
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_STATISTICS, _SUMMARY_OFFSET, _DATA_END = 0x0B, 0x0E, 0x0F
+_RECORD: Final = struct.Struct("<BQ")
+_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
+_ENCODINGS: Final[dict[DefinitionFormat, str]] = {"msg": "ros2msg", "idl": "ros2idl", "": ""}
+
+
+class McapWriter:
+    """An MCAP file in progress.
+
+    Args:
+        path: where no file is yet.
+
+    Attributes:
+        file: open for writing.
+        written: messages in complete chunks.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.file = path.open("xb", buffering=0)
+        self._end = 0  # of what is complete in the file
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels = 0
+        self._described = {_SCHEMA: BytesIO(), _CHANNEL: BytesIO()}  # their records, for the summary
+        self._chunk = BytesIO()
+        self._index: dict[int, list[tuple[int, int]]] = {}  # of the chunk: by channel, stamp and offset
+        self._chunks: list[bytes] = []  # their index records
+        self._counts: dict[int, int] = {}
+        self._span = (1 << 63, 0)
+        self.written = 0
+        self._append(MAGIC + _record(_HEADER, _text("ros2") + _text("gdp")))
+
+    def connect(self, channel: Channel) -> None:
+        """Add a channel; the first has number 0.
+
+        Raises:
+            struct.error: one too many.
+        """
+        key = channel.type_name, channel.definition
+        if key not in self._schemas:
+            self._schemas[key] = len(self._schemas) + 1  # 0: no schema
+            definition = channel.definition.encode("utf-8", "replace")
+            words = _text(channel.type_name) + _text(_ENCODINGS[channel.definition_format])
+            self._describe(_SCHEMA, struct.pack("<H", self._schemas[key]) + words + _sized(definition))
+        about = {"offered_qos_profiles": _offered(channel), "topic_type_hash": channel.hash}
+        head = struct.pack("<HH", self._channels, self._schemas[key])
+        self._describe(_CHANNEL, head + _text(channel.topic) + _text("cdr") + _map(about))
+        self._counts[self._channels] = 0
+        self._channels += 1
+
+    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
+        """Add a message to the chunk.
+
+        Raises:
+            OSError: the chunk is full, and cannot be written.
+        """
+        self._index.setdefault(number, []).append((stamp_ns, self._chunk.tell()))
+        self._chunk.write(_RECORD.pack(_MESSAGE, _MESSAGE_HEAD.size + len(raw)))
+        self._chunk.write(_MESSAGE_HEAD.pack(number, 0, stamp_ns, stamp_ns))
+        self._chunk.write(raw)
+        if self._chunk.tell() > CHUNK_BYTES:
+            self.flush()
+
+    @property
+    def unwritten_bytes(self) -> int:
+        """Return about the most bytes that the file still takes until it is complete."""
+        indexed = sum(16 * len(each) + 64 for each in self._index.values())
+        summary = sum(each.tell() for each in self._described.values()) + sum(map(len, self._chunks))
+        summary += 10 * len(self._counts)
+        return self._chunk.tell() + 2 * indexed + summary + 1_024
+
+    def flush(self) -> None:
+        """Write the chunk and its index.
+
+        Raises:
+            OSError: it cannot be written; the file ends before it, and its messages are lost.
+        """
+        records = self._chunk.getvalue()
+        if not records:
+            return
+        index, self._index, self._chunk = self._index, {}, BytesIO()
+        stamps = [stamp_ns for each in index.values() for stamp_ns, _ in each] or [0]
+        span = min(stamps), max(stamps)
+        head = struct.pack("<QQQI", *span, len(records), zlib.crc32(records)) + _text("")
+        chunk = _record(_CHUNK, head + struct.pack("<Q", len(records)) + records)
+        places, offsets = b"", b""
+        for number, pairs in index.items():
+            offsets += struct.pack("<HQ", number, self._end + len(chunk) + len(places))
+            packed = b"".join(struct.pack("<QQ", *each) for each in pairs)
+            places += _record(_MESSAGE_INDEX, struct.pack("<H", number) + _sized(packed))
+        about = struct.pack("<QQQQ", *span, self._end, len(chunk)) + _sized(offsets)
+        about += struct.pack("<Q", len(places)) + _text("") + struct.pack("<QQ", len(records), len(records))
+        self._append(chunk + places)
+        self._chunks.append(_record(_CHUNK_INDEX, about))
+        for number, pairs in index.items():
+            self._counts[number] += len(pairs)
+        if index:
+            self._span = min(self._span[0], span[0]), max(self._span[1], span[1])
+        self.written = sum(self._counts.values())
+
+    def finish(self) -> None:
+        """Write what is left, then the summary; the file is complete and stays open.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.flush()
+        data_end = _record(_DATA_END, bytes(4))
+        start = self._end + len(data_end)
+        first, last = self._span if self.written else (0, 0)
+        counts = (len(self._schemas), len(self._counts), 0, 0, len(self._chunks))
+        statistics = struct.pack("<QHIIIIQQ", self.written, *counts, first, last)
+        statistics += _sized(b"".join(struct.pack("<HQ", *each) for each in self._counts.items()))
+        groups = (
+            *((code, records.getvalue()) for code, records in self._described.items()),
+            (_CHUNK_INDEX, b"".join(self._chunks)),
+            (_STATISTICS, _record(_STATISTICS, statistics)),
+        )
+        summary, offsets = b"", b""
+        for code, records in groups:
+            if records:
+                offsets += _record(_SUMMARY_OFFSET, struct.pack("<BQQ", code, start + len(summary), len(records)))
+            summary += records
+        footer = _RECORD.pack(_FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
+        crc = zlib.crc32(summary + offsets + footer)
+        self._append(data_end + summary + offsets + footer + struct.pack("<I", crc) + MAGIC)
+
+    def _append(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self.file.write(rest) :]
+        except OSError:
+            self.file.truncate(self._end)  # what is complete stays readable, and there is space for the summary
+            self.file.seek(self._end)
+            raise
+        self._end += len(data)
+
+    def _describe(self, code: int, content: bytes) -> None:
+        record = _record(code, content)
+        self._described[code].write(record)
+        self._chunk.write(record)
+
+
+def _record(code: int, content: bytes) -> bytes:
+    return _RECORD.pack(code, len(content)) + content
+
+
+def _sized(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
+def _text(text: str) -> bytes:
+    return _sized(text.encode("utf-8", "replace"))
+
+
+def _map(items: Mapping[str, str]) -> bytes:
+    return _sized(b"".join(_text(key) + _text(value) for key, value in items.items()))
+
+
+def _offered(channel: Channel) -> str:
+    if not channel.qos:
+        return ""
+    stream = StringIO()
+    yaml = YAML(typ="safe")
+    yaml.default_flow_style = False
+    yaml.dump(dump_qos_v9([to_qos(profile) for profile in channel.qos]), stream)
+    return stream.getvalue().strip()
