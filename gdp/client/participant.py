@@ -288,7 +288,7 @@ class Participant:
     def subscribe(self, topic: Topic, *, paths: int = 1) -> None:
         """Read a topic from now on, from every publisher of it; ``paths`` 2: by two paths from those that want two."""
         self._check(topic, Right.READ, is_free=self._subscriptions.get(topic.name) is None)
-        self._subscriptions.add(topic, Right.READ, paths)
+        self._subscriptions.add(topic, Right.READ, self._now_s, paths)
         self._advertisement(topic, Right.READ, is_global=False, paths=paths)
 
     def unsubscribe(self, name: Name) -> None:
@@ -510,7 +510,7 @@ class Participant:
             options=options,
         )  # fmt: skip
         self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent, paths=paths, options=options)
-        self._subscriptions.add(topic, right, paths, is_session=is_session)
+        self._subscriptions.add(topic, right, self._now_s, paths, is_session=is_session)
         self._advertisement(topic, right, is_global=is_global, paths=paths, is_session=is_session)
         return publisher
 

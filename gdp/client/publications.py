@@ -73,9 +73,11 @@ class Publications:
     def is_acknowledged(self, name: Name) -> bool:
         """Return whether every reader of a name has confirmed everything, what was sent to it alone included.
 
-        Readers that may return count. Best-effort messages have left instead. Without readers nothing waits.
+        Readers that may return count. Best-effort messages have left instead. Without readers nothing waits but
+        what is kept for those that may come.
         """
-        return all(each.is_acknowledged() or not each.is_wanted for each in self._all_of(name))
+        each_of = self._all_of(name)
+        return all((each.is_acknowledged() or not each.is_wanted) and not each.is_awaiting for each in each_of)
 
     def unacknowledged(self, name: Name) -> int:
         """Return how many messages on a name some reader has not confirmed, or have not left if none does."""

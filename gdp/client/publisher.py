@@ -47,6 +47,7 @@ __all__ = ["Publisher"]
 
 _ALL: Final = 1 << 30
 _NEVER: Final = float("inf")
+_AWAITED_MAX: Final = 64  # messages kept for readers that waited; as many as a latched topic of ROS keeps here
 _ALONE_FROM_S: Final = 1.0  # after a second path: round trips enough to measure the one that remains
 _LIMIT_BURST_S: Final = 0.05  # of ``max_bits_s``: a burst of this time leaves at once
 
@@ -107,6 +108,7 @@ class Publisher:
         self.path_share = 1.0
         self._blocking = BlockingReaders(patience.lag_s)
         self._seen_s = 0.0
+        self._awaits_until_s = _NEVER
         self._under_way = SentFrames(self._reader_paths, counts_losses=paths != SPREAD)
         self._uncounted: tuple[list[bytes], list[bytes], float, int] | None = None
         self._limit = _limit_of(options)
@@ -300,6 +302,26 @@ class Publisher:
         self._measure_loss(self._seen_s)
         self._late.set_options(options)
 
+    def await_readers(self, until_s: float) -> None:
+        """Keep messages until a second for readers that waited before they were published.
+
+        A reader waits as long as its subscription exists; the path to it comes later than the first messages.
+        """
+        if self.confirms:
+            self._awaits_until_s = until_s
+            self._queue.await_readers(_AWAITED_MAX)
+            self.published(self)
+
+    @property
+    def is_awaiting(self) -> bool:
+        """Return whether messages are kept for readers that waited, and may still come."""
+        return self._queue.awaited > 0
+
+    @property
+    def keeps_unread(self) -> bool:
+        """Return whether a message without a reader is kept."""
+        return self._queue.kept > 0
+
     def set_depth(self, depth: int) -> None:
         """Change how many messages are kept for late joiners; 0: none."""
         if depth == self._queue.depth:
@@ -417,7 +439,7 @@ class Publisher:
             LocalError: above the limits.
         """
         if not self.is_wanted:
-            if self._queue.depth:
+            if self._queue.kept:
                 self._queue.defer(message, now_s)
             else:
                 self.drops[DropReason.NO_READER] += 1
@@ -495,6 +517,9 @@ class Publisher:
         for name in self._blocking.slow(now_s):
             self._acknowledgements.exclude(name, now_s)
         self._late.drop_expired(now_s)
+        if now_s >= self._awaits_until_s:
+            self._awaits_until_s = _NEVER
+            self._queue.await_readers(0)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
         self._heartbeats.handle_timer(now_s)
 
@@ -502,6 +527,7 @@ class Publisher:
         """Return the monotonic second of the next timer, or None."""
         times = [self._window.next_probe(), self._window.next_slow_reader(), self._readers.next_silent()]
         times += [self._late.get_timer(), self._blocking.get_timer()]
+        times += [self._awaits_until_s] if self._awaits_until_s < _NEVER else []
         if self._readers and self.mtu is not None:
             times += [self._heartbeats.get_timer(), self.redundancy.get_timer()]
         return min((time for time in times if time is not None), default=None)

@@ -4,7 +4,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A message passes up to three stages::
 
-    deferred (latched, before the first reader) -> gathered (small, waits for its bundle) -> sealed (window or queue)
+    deferred (kept, before the first reader) -> gathered (small, waits for its bundle) -> sealed (window or queue)
 
 A message is sealed once. If the path becomes too narrow for a cached message, it is refragmented, and everything cached
 gets new numbers. Heartbeats announce the new numbers (``gdp/message/renumbering.py``). Each message has a sequence
@@ -49,6 +49,7 @@ class SendQueue:
     Attributes:
         is_acknowledged: readers acknowledge what they get (reliable or latched topics).
         depth: latched messages for late joiners.
+        awaited: messages kept for readers that waited before they were published.
         flags: header flags of every frame.
         mtu: smallest on the path, in bytes after the Ethernet header; None: unknown.
         bundle_bytes: largest bundle; 0: each message has a seal of its own.
@@ -73,6 +74,7 @@ class SendQueue:
         self.ledger = Ledger(last_sequence)
         self.is_acknowledged = True
         self.depth = 0
+        self.awaited = 0
         self.flags = 0
         self.mtu: int | None = None
         self.bundle_bytes = BUNDLE_BYTES
@@ -132,6 +134,31 @@ class SendQueue:
             sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
         return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
 
+    @property
+    def kept(self) -> int:
+        """Return how many messages stay for readers that come later."""
+        return max(self.depth, self.awaited)
+
+    def first_since(self, since_s: float) -> int:
+        """Return the number of the first message that is kept and was published since a second, or the next one."""
+        cached = self._window.first_since(since_s)
+        if cached is not None:
+            return cached
+        times = [added_s for _, _, added_s in self._deferred if added_s is None or added_s < since_s]
+        return self.next_number + len(times)
+
+    def begin_of(self, number: int) -> int:
+        """Return the sequence number with which a message begins, or will."""
+        waiting = number - self.next_number
+        if 0 < waiting < len(self._deferred):
+            return self._deferred[waiting][0]
+        return self.ledger.begin_of(number, self.first_waiting)
+
+    def await_readers(self, awaited: int) -> None:
+        """Change how many messages are kept for readers that waited before they were published."""
+        self.awaited = awaited
+        self.set_depth(self.depth)
+
     def defer(self, message: bytes, added_s: float | None = None) -> None:
         """Queue a latched message for the first reader; the oldest beyond the history are dropped.
 
@@ -140,13 +167,13 @@ class SendQueue:
         """
         self._deferred.append((self.ledger.next(), message, added_s))
         self._deferred_bytes += len(message)
-        self._drop_deferred(self.depth, added_s)
+        self._drop_deferred(self.kept, added_s)
 
     def drop_aged(self, now_s: float) -> None:
         """Drop what is too old for late joiners."""
         if self.options.history_age_s is not None:
             self._window.release_aged(now_s)
-            self._drop_deferred(self.depth, now_s)
+            self._drop_deferred(self.kept, now_s)
 
     def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None) -> None:
         """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
@@ -183,8 +210,8 @@ class SendQueue:
         """Change how many messages are latched; what is beyond that is dropped."""
         self.seal_gathered()
         self.depth = depth
-        self._window.set_history_depth(depth, self.next_number)
-        self.drops[DropReason.NO_READER] += self._drop_deferred(depth)
+        self._window.set_history_depth(self.kept, self.next_number)
+        self.drops[DropReason.NO_READER] += self._drop_deferred(self.kept)
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
@@ -324,6 +351,8 @@ class SendQueue:
     def _is_beyond_history(self, now_s: float | None) -> bool:
         """Return whether the oldest deferred message is one too many by bytes, or too old."""
         options, added_s = self.options, self._deferred[0][2]
+        if not self.depth and self._deferred_bytes > WINDOW_BYTES and len(self._deferred) > 1:
+            return True
         if options.history_bytes is not None and self._deferred_bytes > options.history_bytes:
             return True
         if options.history_age_s is None or added_s is None or now_s is None:

@@ -77,10 +77,12 @@ class Subscription:
         private: by writer.
         absent: publishers whose route has ended, with their incarnation, and where their writer proxies ended.
         past_losses: of closed writer proxies.
+        since_s: when it began, monotonic.
     """
 
     topic: Topic
     right: Right
+    since_s: float
     paths: int = 1
     is_session: bool = False
     writer_proxies: dict[Name, WriterProxy] = field(default_factory=dict)
@@ -177,14 +179,16 @@ class Subscriptions:
         """Return the subscription of a name, or None."""
         return self._by_name.get(name)
 
-    def add(self, topic: Topic, right: Right, paths: int = 1, *, is_session: bool = False) -> None:
+    def add(self, topic: Topic, right: Right, now_s: float, paths: int = 1, *, is_session: bool = False) -> None:
         """Read a name from now on.
 
         Args:
             paths: over how many paths its frames are to come.
             is_session: a session secret may authenticate its unicast streams.
         """
-        self._by_name[topic.name] = Subscription(topic=topic, right=right, paths=paths, is_session=is_session)
+        self._by_name[topic.name] = Subscription(
+            topic=topic, right=right, since_s=now_s, paths=paths, is_session=is_session
+        )
 
     def remove(self, name: Name) -> list[WriterProxy]:
         """Stop reading a name; return the writer proxies to close."""
@@ -293,6 +297,7 @@ class Subscriptions:
             now_s=now_s,
             ended=ended,
             restarted=incarnation_id != advertisement.incarnation,
+            waits_since_s=subscription.since_s,
         )
         subscription.writer_proxies[party] = writer_proxy
         subscription.set_advertisement(writer_proxy, advertisement)

@@ -105,6 +105,7 @@ class WriterProxy:
         ended: where an earlier writer proxy of the same ended. A latched topic's last messages come again, as its
             publisher announces in a new Heartbeat, unless this writer proxy resumes that one.
         restarted: this reader read another incarnation of the publisher before: what was published in this one is lost.
+        waits_since_s: when the topic was subscribed.
         introduces: the publisher gets the reader's key by an introduction, and announces where to begin. Else it knows
             the key already, and the stream is reliable and begins at the first message.
 
@@ -131,6 +132,7 @@ class WriterProxy:
         now_s: float,
         ended: Ended = _NOT_BEGUN,
         restarted: bool = False,
+        waits_since_s: float | None = None,
         introduces: bool = True,
     ) -> None:
         self.publisher = publisher
@@ -142,6 +144,7 @@ class WriterProxy:
         self._is_signed = writer is not None
         self._before = ended
         self._is_restarted = restarted
+        self._waits_since_s = now_s if waits_since_s is None else waits_since_s
         self._described = 0  # number of the Heartbeat that brought it
         self._openers: dict[tuple[int, int], Opener] = {}
         self._parity_openers: dict[int, ParityOpener] = {}
@@ -339,7 +342,9 @@ class WriterProxy:
         if self.state is WriterProxyState.NEW:
             schedule.due_s = now_s + ANNOUNCE_S
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
-            return self._over_paths(self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence)))
+            waited_us = max(round((now_s - self._waits_since_s) * 1e6), 0)
+            acknack = AckNack(AckNackFlag.NEW, number, 0, (), sequence, held_us=waited_us)
+            return self._over_paths(self._sealer.seal_first(acknack))
         missing, awaited_s = self._missing(now_s) if self._is_reliable else ((), _NEVER)
         if (self._copies is not None or self._data.repeats.copies) and self._is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)

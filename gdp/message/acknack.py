@@ -49,7 +49,8 @@ class AckNack(NamedTuple):
     of striped messages the second path is to carry, in 255ths.
 
     ``received`` counts the verified DATA frames of this incarnation, modulo 2^32; the newest of them was (newest,
-    newest_part), which came ``held_us`` microseconds before this report left. The writer measures the path by them.
+    newest_part), which came ``held_us`` microseconds before this report left. The writer measures the path by them. In
+    a report flagged NEW, ``held_us`` is for how long its reader has waited for a publisher.
 
     ``frames`` counts the frames of messages that came, copies included, modulo 2**32.
     """

@@ -122,6 +122,10 @@ class SendWindow:
         """Return the highest message number that every reader, suspended or not, has acknowledged."""
         return min(self._readers.least(), self._newest + 1) - 1
 
+    def first_since(self, since_s: float) -> int | None:
+        """Return the number of the first cached message that was added since a second, or None."""
+        return next((number for number, each in self._cache.messages.items() if each.added_s >= since_s), None)
+
     def set_history_depth(self, depth: int, next_number: int) -> None:
         """Change how many messages stay for late joiners; ``next_number`` is the lowest that ``add`` will get."""
         self._cache.depth = depth

@@ -12,6 +12,7 @@ from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
+from gdp.limits import READER_LEASE_S
 from gdp.message.loss import LossReason
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
@@ -172,6 +173,8 @@ class ExposedTopic:
         if publisher is None:
             return  # the description always comes first: an earlier message belongs to a subscription that was replaced
         self.taken += 1
+        if self.last_s is None and self._dispatcher.endpoint.is_live:
+            publisher.await_readers(now_s + READER_LEASE_S)  # the path to readers that wait may come later
         self.last_s = now_s
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
@@ -182,7 +185,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE)
             return
-        if not publisher.is_wanted and not self._qos.depth:
+        if not publisher.is_wanted and not publisher.keeps_unread:
             traffic.unread += 1
             publisher.skip(LossReason.NO_READER)
             self._count(event)

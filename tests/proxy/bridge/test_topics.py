@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from gdp.limits import READER_LEASE_S
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites, named
 from tests.proxy.endpoints.fake import Publication
@@ -190,9 +191,11 @@ def test_messages_without_a_far_reader_are_counted_and_not_sent(sites: Sites) ->
     robot = sites.add(ROBOT, expose=[CHATTER])
     talker = talk(robot)
     sites.run(2)
+    talker.publish(string("kept for readers that wait"))
+    sites.run(READER_LEASE_S + 1)
     talker.publish(string("?"))
     sites.run(1)
-    assert (robot.context.traffic.unread, robot.context.traffic.messages_out) == (1, 0)
+    assert (robot.context.traffic.unread, robot.stream.losses.total) == (1, 2)
 
 
 def test_each_side_may_call_the_topic_otherwise(sites: Sites) -> None:
