@@ -214,7 +214,7 @@ class Bridge:
     @property
     def best_effort(self) -> list[SentStats]:
         """Return the statistics of the best-effort topics that are exposed now."""
-        exposed = [(spec.local, flow.publisher) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
+        exposed = [(local, flow.publisher) for local, flow in self._exposed_topics()]
         return [SentStats.of(local, each) for local, each in exposed if each is not None and not each.confirms]
 
     def answered_by(self, name: Name) -> Name | None:
@@ -292,12 +292,19 @@ class Bridge:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
+        for local, exposed_topic in self._exposed_topics():
+            due_s = exposed_topic.get_timer()
+            if due_s is not None and due_s <= now_s:
+                self._context.contain(local, b"", now_s, exposed_topic.handle_timer, now_s)
         for topic in self._status_topics:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
             self._context.traffic.dropped = sum(dispatcher.endpoint.dropped for dispatcher in self._dispatchers)
+
+    def _exposed_topics(self) -> Iterator[tuple[str, ExposedTopic]]:
+        return ((spec.local, flow) for spec, flow in self._flows.values() if isinstance(flow, ExposedTopic))
 
     def poll_changes(self) -> list[FlowChange]:
         """Return the flows that began or ended since the last call, in order; the oldest are forgotten first."""
@@ -309,10 +316,11 @@ class Bridge:
         """Return the monotonic second of the next timer, or None."""
         if self._is_stale:
             return 0.0
-        if not self._timed and not self._probes:
-            return self._tick_at_s if self._since or self._finishing else None
+        has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
         times = [each.get_timer() for each in (*self._timed, *self._probes.values())]
-        return min([self._tick_at_s, *(time for time in times if time is not None)])
+        times += [each.get_timer() for _, each in self._exposed_topics()]
+        times += [self._tick_at_s] if has_ticks else []
+        return min((time for time in times if time is not None), default=None)
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""

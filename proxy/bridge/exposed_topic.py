@@ -20,6 +20,7 @@ from proxy.bridge.core.adaptation import adaptation_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
 from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos
+from proxy.bridge.depth_probe import DepthProbe
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
@@ -71,6 +72,8 @@ class ExposedTopic:
         self._channels: tuple[Channel, ...] = ()  # as the endpoint describes them
         self._encoders: list[MessageEncoder] = []
         self.local_publishers = len(ends)
+        self._depth_probe: DepthProbe | None = None
+        self._keys = {end.key for end in ends}
         self._compressor = compressor_of(flow_spec.rule)
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self._adaptation = adaptation_of(flow_spec.rule)
@@ -84,7 +87,16 @@ class ExposedTopic:
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local publishers."""
         self.local_publishers = len(ends)
+        keys = {end.key for end in ends}
+        is_found = self._depth_probe is not None and self._depth_probe.depth is not None
+        if keys != self._keys and self._depth_probe is not None:
+            self._depth_probe.close()
+            self._depth_probe = None
+            self._qos.set_depth(None)
         change = self._qos.receive_publishers(ends)
+        if change is Change.NONE and keys != self._keys and is_found:
+            change = Change.DESCRIPTION
+        self._keys = keys
         if change is Change.NONE:
             return
         if change is Change.SUBSCRIPTION:
@@ -106,8 +118,20 @@ class ExposedTopic:
         elif isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        return None if self._depth_probe is None else self._depth_probe.get_timer()
+
+    def handle_timer(self, now_s: float) -> None:
+        """Keep as much for late joiners as the local publisher does, once that is known."""
+        if self._depth_probe is not None and self._depth_probe.handle_timer(now_s):
+            self._qos.set_depth(self._depth_probe.depth)
+            self._describe(self._channels)
+
     def finish(self, now_s: float) -> None:
         """Publish nothing from now on."""
+        if self._depth_probe is not None:
+            self._depth_probe.close()
         self._dispatcher.close(self.handle)
         self._context.member.flush(now_s)
 
@@ -176,6 +200,10 @@ class ExposedTopic:
         if self.last_s is None and self._dispatcher.endpoint.is_live:
             publisher.await_readers(now_s + READER_LEASE_S)  # the path to readers that wait may come later
         self.last_s = now_s
+        if self._qos.asks_depth:
+            if self._depth_probe is None:
+                self._depth_probe = DepthProbe(self._dispatcher, self._flow_spec.local, self._flow_spec.type_name)
+            self._depth_probe.handle_message(self._qos.request, now_s)
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             self.thinned += 1

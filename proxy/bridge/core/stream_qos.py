@@ -13,7 +13,7 @@ from typing import Protocol
 from gdp.client.send_options import SendOptions
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity
-from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, kept, request
+from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, is_depth_unknown, kept, request
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
@@ -46,6 +46,13 @@ class StreamQos(Protocol):
     def options(self) -> SendOptions:
         """Return how fresh, how much and how often messages leave."""
 
+    @property
+    def asks_depth(self) -> bool:
+        """Return whether only a probe shows what the local publisher keeps."""
+
+    def set_depth(self, depth: int | None) -> None:
+        """Set what a probe found; None: another publisher is there."""
+
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Update the local publishers; return the consequence."""
 
@@ -64,6 +71,7 @@ class LiveQos:
         self._rule = rule
         self._publishers, self._offers = len(ends), _offers(ends)
         self._is_latched = False
+        self._found_depth: int | None = None
 
     @property
     def request(self) -> Qos | None:
@@ -85,8 +93,19 @@ class LiveQos:
         if self._rule.wants_latched is False:
             return 0
         if self._rule.latched or self._is_latched:
-            return max(kept(self._offers), DEPTH_MAX if self._is_latched and self._publishers > 1 else 1)
-        return kept(self._offers)
+            shared = DEPTH_MAX if self._is_latched and self._publishers > 1 else 1
+            return max(kept(self._offers, self._found_depth), shared)
+        return kept(self._offers, self._found_depth)
+
+    @property
+    def asks_depth(self) -> bool:
+        """Return whether only a probe shows what the local publisher keeps."""
+        rule = self._rule
+        return rule.history is None and rule.wants_latched is not False and is_depth_unknown(self._offers)
+
+    def set_depth(self, depth: int | None) -> None:
+        """Set what a probe found; None: another publisher is there."""
+        self._found_depth = depth
 
     @property
     def options(self) -> SendOptions:
@@ -145,6 +164,14 @@ class RecordedQos:
     def options(self) -> SendOptions:
         """Return the rule's values; where it has no deadline, that of the recorded publishers."""
         return self._rule.send_options(self._recorded_deadline_s)
+
+    @property
+    def asks_depth(self) -> bool:
+        """Return False: it is recorded."""
+        return False
+
+    def set_depth(self, depth: int | None) -> None:
+        """Ignore it: it is recorded."""
 
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Return NONE: the publishers of a recording do not change."""

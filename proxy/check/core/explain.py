@@ -19,6 +19,7 @@ from proxy.check.core.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
 from proxy.config.rule import SALT, Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.qos import is_depth_unknown
 from proxy.serial.channel import Qos
 
 __all__ = ["Delegated", "explain"]
@@ -187,6 +188,9 @@ class _Look:
             yield self._side.negative
         if not type_name:
             yield "its type is not known yet"
+        offers = [end.qos for end in ends if end.qos is not None]
+        if self._direction == "expose" and self._rule.history is None and is_depth_unknown(offers):
+            yield "DDS does not tell its depth: the proxy counts what a late reader gets; the rule's 'history' sets it"
         if self._direction == "expose" and self._rule.wants_reliable:
             for end in ends:
                 if end.qos is not None and end.qos.reliability == "best_effort":

@@ -11,7 +11,17 @@ from typing import Final
 
 from proxy.serial.channel import NEVER, Qos
 
-__all__ = ["DEPTH_MAX", "deadline_s", "default", "depth_of", "kept", "offer", "request", "unmatched"]
+__all__ = [
+    "DEPTH_MAX",
+    "deadline_s",
+    "default",
+    "depth_of",
+    "is_depth_unknown",
+    "kept",
+    "offer",
+    "request",
+    "unmatched",
+]
 
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
@@ -28,10 +38,15 @@ def default(*, reliable: bool = True, latched: bool = False, depth: int = _DEPTH
 
 
 def depth_of(profile: Qos) -> int:
-    """Return the number of messages that a profile keeps, as far as it states it."""
+    """Return the number of messages that a profile keeps; the discovery of DDS does not state it."""
     if profile.history == "keep_all":
         return DEPTH_MAX
-    return profile.depth or (1 if profile.durability == "transient_local" else _DEPTH)
+    return profile.depth or (DEPTH_MAX if profile.durability == "transient_local" else _DEPTH)
+
+
+def is_depth_unknown(offers: Sequence[Qos]) -> bool:
+    """Return whether these are one latched publisher's, which does not state how much it keeps."""
+    return len(offers) == 1 and offers[0].durability == "transient_local" and not offers[0].depth
 
 
 def deadline_s(offers: Sequence[Qos]) -> float | None:
@@ -54,15 +69,20 @@ def request(offers: Sequence[Qos]) -> Qos:
     )
 
 
-def kept(offers: Sequence[Qos]) -> int:
+def kept(offers: Sequence[Qos], found: int | None = None) -> int:
     """Return the number of messages for late joiners of these publishers' topic; 0: none.
 
     With several publishers, whose messages come without their sender, the number is the maximum: one that publishes
     often must not evict what another one latched.
+
+    Args:
+        found: what a single publisher keeps that does not state it; None: unknown.
     """
     latched = [each for each in offers if each.durability == "transient_local"]
     if not latched or len(latched) < len(offers):
         return 0
+    if found is not None and is_depth_unknown(latched):
+        return found
     return DEPTH_MAX if len(latched) > 1 else min(depth_of(latched[0]), DEPTH_MAX)
 
 

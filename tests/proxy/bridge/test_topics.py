@@ -68,7 +68,9 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     talker.publish(string("before"))
     assert sites.run(1, lambda: len(ear.heard) == 1)
     talker.close()
-    assert sites.run(1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies()))
+    assert sites.run(
+        READER_LEASE_S + 1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies())
+    )
     talker = talk(robot)
     assert sites.run(1, robot.is_read)
     talker.publish(string("after"))
@@ -82,7 +84,7 @@ def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Site
     talker.publish(string("goodbye"))
     talker.close()
     assert sites.run(1, lambda: ear.texts == ["goodbye"])
-    assert sites.run(1, lambda: not robot.member.publishers())
+    assert sites.run(READER_LEASE_S + 1, lambda: not robot.member.publishers())
 
 
 @pytest.mark.parametrize("size", [20, 60_000])
@@ -97,7 +99,7 @@ def test_the_last_message_of_a_publisher_that_leaves_at_once_arrives_by_a_thin_l
     talker.publish(string("x" * size))
     talker.close()
     assert sites.run(5, lambda: len(ear.heard) == 1)
-    assert sites.run(2, lambda: not robot.member.publishers())
+    assert sites.run(READER_LEASE_S + 1, lambda: not robot.member.publishers())
     assert robot.faults == {}
 
 

@@ -106,10 +106,13 @@ class FakeGraph:
         self.endpoints: list[FakeEndpoint] = []
         self._keys = count()
 
-    def publish(self, node: str, topic: str, type_name: str, qos: Qos | None = None) -> Publication:
-        """Add a node's publisher."""
+    def publish(
+        self, node: str, topic: str, type_name: str, qos: Qos | None = None, *, hides_depth: bool = False
+    ) -> Publication:
+        """Add a node's publisher; ``hides_depth``: the graph does not show its depth, as in DDS."""
         qos = qos or default()
-        end = self._end(Role.PUBLISHES, node, topic, type_name, qos)
+        shown = replace(qos, history="unknown", depth=0) if hides_depth else qos
+        end = self._end(Role.PUBLISHES, node, topic, type_name, shown)
         publication = Publication(self, end, qos, deque(maxlen=depth_of(qos)))
         self.publications.append(publication)
         self.changed()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import orjson
@@ -227,6 +227,16 @@ def test_reliability_cannot_be_added_to_what_comes_best_effort(place: Path) -> N
     ends = [end(Role.PUBLISHES, qos=BEST_EFFORT)]
     match = only(place, "expose", f"name: /image, type: {IMAGE}, reliable: true", ends, given(Right.PUBLISH))
     assert match.notes == ("/node offers best effort: what is lost before the proxy stays lost",)
+
+
+def test_a_latched_depth_that_dds_does_not_tell_is_named(place: Path) -> None:
+    unknown = replace(LATCHED, history="unknown", depth=0)
+    match = only(place, "expose", f"name: /image, type: {IMAGE}", [end(Role.PUBLISHES, qos=unknown)])
+    assert match.notes == (
+        "DDS does not tell its depth: the proxy counts what a late reader gets; the rule's 'history' sets it",
+    )
+    match = only(place, "expose", f"name: /image, type: {IMAGE}, history: 5", [end(Role.PUBLISHES, qos=unknown)])
+    assert match.notes == ()
 
 
 def test_an_action_is_known_by_its_goals(place: Path) -> None:

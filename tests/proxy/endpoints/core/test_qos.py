@@ -75,7 +75,7 @@ def test_late_joiners_get_what_one_latched_publisher_keeps_and_as_much_as_may_be
 
 def test_a_depth_that_is_not_said_is_ros_2s_default_and_one_of_what_is_latched() -> None:
     assert depth_of(replace(default(), depth=0)) == 10
-    assert depth_of(replace(LATCHED, depth=0)) == 1
+    assert depth_of(replace(LATCHED, depth=0)) == DEPTH_MAX
 
 
 def test_what_a_rule_latches_or_not_is_offered_so_unless_a_reader_insists() -> None:
