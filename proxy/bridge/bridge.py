@@ -384,29 +384,14 @@ class Bridge:
             for flow_spec in self._flow_specs(at, view.graph, complaints):
                 key = _Key(at, flow_spec.is_exposed, flow_spec.rule.kind, flow_spec.local, flow_spec.name)
                 shown.add(key)
-                conflict = view.conflicts.before_us(_shown_as(flow_spec), is_begun=key in self._flows)
-                if conflict:
-                    complaints.append(
-                        ConfigProblem(flow_spec.local, Fault.OTHER_BRIDGE, f"{conflict} carries it in this graph")
-                    )
-                    continue
-                wished.add(key)
-                if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
-                    self._end(key)
-                if not self._is_ready(key, flow_spec, now_s):
+                if not self._context.contain(
+                    flow_spec.local, b"", now_s, self._refresh_flow, key, flow_spec, view, now_s, wished, complaints
+                ):
+                    wished.add(key)
                     if key in self._flows:
-                        self._finish(key)
-                    self._since.pop(key, None)
-                    complaints += [self._failed[key]] if key in self._failed else []
-                    continue
-                if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
-                    self._begin(key, flow_spec, view)
-                try:
-                    self._follow(key, flow_spec, view, now_s)
-                except LocalError as error:
-                    self._end(key)
-                    self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_GRAPH, str(error))
-                complaints += [self._failed[key]] if key in self._failed else []
+                        self._end(key)
+                    self._failed[key] = ConfigProblem(flow_spec.local, Fault.REFUSED, "an error here; see the log")
+                    complaints.append(self._failed[key])
         for key in [key for key in self._flows if key not in wished]:
             if key in shown or not self._may_finish(key):
                 self._end(key)
@@ -417,6 +402,40 @@ class Bridge:
         self._since = {key: since for key, since in self._since.items() if key in wished}
         self._undelegated = {key: each for key, each in self._undelegated.items() if key in wished}
         self._tell(complaints)
+
+    def _refresh_flow(
+        self,
+        key: _Key,
+        flow_spec: FlowSpec,
+        view: _View,
+        now_s: float,
+        wished: set[_Key],
+        complaints: list[ConfigProblem],
+    ) -> None:
+        """Begin a desired flow when it is our turn, and pass the graph to it."""
+        conflict = view.conflicts.before_us(_shown_as(flow_spec), is_begun=key in self._flows)
+        if conflict:
+            complaints.append(
+                ConfigProblem(flow_spec.local, Fault.OTHER_BRIDGE, f"{conflict} carries it in this graph")
+            )
+            return
+        wished.add(key)
+        if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
+            self._end(key)
+        if not self._is_ready(key, flow_spec, now_s):
+            if key in self._flows:
+                self._finish(key)
+            self._since.pop(key, None)
+            complaints += [self._failed[key]] if key in self._failed else []
+            return
+        if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
+            self._begin(key, flow_spec, view)
+        try:
+            self._follow(key, flow_spec, view, now_s)
+        except LocalError as error:
+            self._end(key)
+            self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_GRAPH, str(error))
+        complaints += [self._failed[key]] if key in self._failed else []
 
     def _is_ready(self, key: _Key, flow_spec: FlowSpec, now_s: float) -> bool:
         """Return whether the local server's probe passes; one without a probe is ready."""

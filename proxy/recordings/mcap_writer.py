@@ -9,9 +9,8 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
-from io import BytesIO, StringIO
-from pathlib import Path
-from typing import Final
+from io import BytesIO, FileIO, StringIO
+from typing import BinaryIO, Final
 
 from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
@@ -34,15 +33,14 @@ class McapWriter:
     """An MCAP file in progress.
 
     Args:
-        path: where no file is yet.
+        file: empty, open for writing without a buffer.
 
     Attributes:
-        file: open for writing.
         written: messages in complete chunks.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.file = path.open("xb", buffering=0)
+    def __init__(self, file: BinaryIO | FileIO) -> None:
+        self.file = file
         self._end = 0  # of what is complete in the file
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels = 0

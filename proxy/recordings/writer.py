@@ -12,7 +12,7 @@ import fcntl
 import os
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
-from io import RawIOBase
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, Protocol
@@ -43,7 +43,7 @@ class _Format(Protocol):
     written: int  # messages in complete chunks
 
     @property
-    def file(self) -> RawIOBase | BinaryIO:
+    def file(self) -> BinaryIO | FileIO:
         """Return the open file."""
 
     @property
@@ -85,7 +85,9 @@ class BagWriter:
         self.failure = ""
         refuse_existing(self.path)
         try:
-            self._format: _Format = _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial)
+            self._format: _Format = (
+                _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
+            )
             fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error

@@ -7,10 +7,12 @@ states, ``z`` whether the body is compressed here before it is sent.
 from __future__ import annotations
 
 from collections.abc import Callable
+from io import BytesIO
 from types import SimpleNamespace
 from typing import Any, Final, cast
 
 import cbor2
+import orjson
 
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message, Participant, Topic
@@ -28,12 +30,14 @@ from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
-from proxy.doors.rosbridge_json import RosbridgeCodec
+from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
 from proxy.endpoints.core.endpoint import RosEndpoint
+from proxy.recordings.mcap_writer import McapWriter
 from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Encoding
+from proxy.tools.message_text import MessageText
 from proxy.wire.message import RosMessage, Step
 from tests.fuzzing.decoder import Decoder
 
@@ -80,13 +84,14 @@ class _Quiet(Faults):
 
 
 class _Endpoint:
-    """Graph without a type of its own; it reads each message as a door does."""
+    """Graph without a type of its own; it reads each message as a door, a tool and a recorder do."""
 
     ros: Final = 2
 
     def __init__(self, *, is_live: bool) -> None:
         self.is_live = is_live
         self._channels: list[Channel] = []
+        self._recorder = McapWriter(BytesIO())
 
     def channel(self, topic: str, type_name: str) -> Channel:
         raise LocalError(f"{topic}: no {type_name} here")
@@ -96,11 +101,19 @@ class _Endpoint:
 
     def advertise(self, channel: Channel) -> int:
         self._channels.append(channel)
+        self._recorder.connect(channel)
         return len(self._channels) - 1
 
     def publish(self, handle: int, raw: bytes) -> None:
-        if self._channels[handle].ros == 2:
-            RosbridgeCodec(self._channels[handle]).to_json(raw)
+        channel = self._channels[handle]
+        self._recorder.write(handle, 0, raw)
+        self._recorder.flush()
+        if channel.ros == 2:
+            _outcome(lambda: RosbridgeCodec(channel).to_json(raw))
+            _outcome(lambda: cbor_raw("/t", 0, raw))
+        text = MessageText(channel)
+        _outcome(lambda: text.to_yaml(raw).encode())
+        orjson.dumps(text.to_json(raw))
 
     def close(self, handle: int) -> None:
         """Keep it."""

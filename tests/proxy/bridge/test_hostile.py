@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from gdp.control.boundary import ErrorBoundary
 from gdp.errors import LocalError
 from proxy.endpoints.core.qos import default
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Qos
 from proxy.wire.message import RosMessage, TopicDescription
 from proxy.wire.service import Answer, Exchange, News, Outcome, Request
 from tests.proxy.bridge import known
@@ -47,6 +48,28 @@ def say(sites: Sites, robot: Machine, channel: Channel, body: bytes) -> None:
     robot.member.flush(sites.now_s)
     sites.world.network.send_pending(robot.label)
     sites.run(0.5)
+
+
+def test_a_name_on_which_the_library_fails_ends_neither_the_proxy_nor_other_flows(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ErrorBoundary, "reraises", False)
+    robot, server = sites.add(ROBOT, expose=[CHATTER, OTHER]), sites.add(SERVER, imports=[CHATTER, OTHER])
+    ear, subscribe = Ear(server.graph, "/chatter"), robot.endpoint.subscribe
+
+    def failing(topic: str, type_name: str, qos: Qos | None) -> int:
+        if topic == "/other":
+            raise KeyError(topic)  # as a library does that this program does not know
+        return subscribe(topic, type_name, qos)
+
+    monkeypatch.setattr(robot.endpoint, "subscribe", failing)
+    robot.graph.publish("/talker", "/other", STRING)
+    talker = robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    assert robot.carried == {("/chatter", True)}
+    assert [(each.local, each.detail) for each in robot.bridge.problems] == [("/other", "an error here; see the log")]
 
 
 def test_a_far_depth_without_bound_is_bounded_here(sites: Sites) -> None:
