@@ -33,10 +33,13 @@ from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard_types import standard_definition, type_hash
 
-__all__ = ["from_connection", "from_ros2", "offered_qos", "ros2_type", "to_qos"]
+__all__ = ["from_connection", "from_ros1", "from_ros2", "offered_qos", "ros2_type", "to_qos"]
 
 _QOS_TEXT_MAX = 64 << 10
 
+_RENAMED = {  # types of equal definition: by the old name and the md5 sum
+    ("tf/msg/tfMessage", "94810edda583a504dfda3829e70d7eec"): "tf2_msgs/msg/TFMessage",
+}
 _FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
     MessageDefinitionFormat.MSG: "msg",
     MessageDefinitionFormat.IDL: "idl",
@@ -54,13 +57,12 @@ def from_connection(connection: Connection) -> Channel:
     extra = connection.ext
     definition_format = _FORMATS[connection.msgdef.format]
     if isinstance(extra, ConnectionExtRosbag1):
-        return Channel(
-            topic=resolved(connection.topic),
-            type_name=connection.msgtype,
-            ros=1,
-            hash=connection.digest,
-            definition=connection.msgdef.data,
-            definition_format=definition_format,
+        return from_ros1(
+            connection.topic,
+            connection.msgtype,
+            connection.digest,
+            connection.msgdef.data,
+            definition_format,
             latched=bool(extra.latching),
             callerid=extra.callerid,
         )
@@ -73,6 +75,29 @@ def from_connection(connection: Connection) -> Channel:
         connection.msgdef.data,
         definition_format,
         extra.offered_qos_profiles,
+    )
+
+
+def from_ros1(
+    topic: str,
+    type_name: str,
+    md5: str,
+    definition: str,
+    definition_format: DefinitionFormat,
+    *,
+    latched: bool,
+    callerid: str | None,
+) -> Channel:
+    """Return a ROS 1 channel; the topic gets its full name, a type that was renamed since its present one."""
+    return Channel(
+        topic=resolved(topic),
+        type_name=_RENAMED.get((type_name, md5), type_name),
+        ros=1,
+        hash=md5,
+        definition=definition,
+        definition_format=definition_format,
+        latched=latched,
+        callerid=callerid,
     )
 
 

@@ -9,6 +9,7 @@ in ``unread``.
 from __future__ import annotations
 
 import contextlib
+import functools
 import struct
 import sys
 import tempfile
@@ -235,9 +236,10 @@ def _open_ros1(path: Path) -> Source:
 
 
 class _IndexedSource:
-    """A recording whose index rosbags can read."""
+    """A recording whose index rosbags can read; what follows damage is found by a scan of the file."""
 
-    def __init__(self, connections: list[Connection], count: int) -> None:
+    def __init__(self, connections: list[Connection], count: int, scan: Callable[[], Source]) -> None:
+        self._scan = scan
         self.channels = [from_connection(connection) for connection in connections]
         self.count = count
         self.counts: list[int] | None = [connection.msgcount for connection in connections]
@@ -245,24 +247,51 @@ class _IndexedSource:
         self._index = {_key(connection): index for index, connection in enumerate(connections)}
 
     def _messages(self, read: Callable[[], Iterator[tuple[Connection, int, bytes]]]) -> Iterator[Message]:
-        given = 0
+        given, last_ns, equal = 0, -1, 0  # how many of the newest time
         try:
             for connection, stamp_ns, raw in read():
                 if isinstance(raw, int | str):
                     raise ReaderError2("a message that is not bytes")
                 yield Message(self._index[_key(connection)], stamp_ns, bytes(raw))
                 given += 1
+                equal = equal + 1 if stamp_ns == last_ns else 1
+                last_ns = stamp_ns
         except MemoryError:
             raise
         except _FOREIGN as error:
-            self.unread = f"after {given} of {self.count} messages: {_reason(error)}"
+            found = 0
+            for message in self._rest(last_ns, equal):
+                found += 1
+                yield message
+            if given + found < self.count:
+                more = f", {found} more were found behind it" if found else ""
+                self.unread = f"after {given} of {self.count} messages: {_reason(error)}{more}"
+
+    def _rest(self, last_ns: int, equal: int) -> Iterator[Message]:
+        """Yield the messages after a time, and those of that time but for the first ``equal``."""
+        known = {(each.topic, each.type_name): index for index, each in enumerate(self.channels)}
+        try:
+            with contextlib.closing(self._scan()) as scanned:
+                indexes = [known.get((each.topic, each.type_name)) for each in scanned.channels]
+                for message in scanned.messages():
+                    index = indexes[message.channel]
+                    is_equal = message.stamp_ns == last_ns
+                    if message.stamp_ns < last_ns or index is None or (is_equal and equal > 0):
+                        equal -= is_equal
+                        continue
+                    yield message._replace(channel=index)
+        except MemoryError:
+            raise
+        except _FOREIGN:
+            return  # the count shows what is missing
 
 
 class _Rosbag1Source(_IndexedSource):
     def __init__(self, path: Path) -> None:
         self._reader = Reader1(path)
         self._reader.open()
-        super().__init__(self._reader.connections, self._reader.message_count)
+        scan = functools.partial(salvage_ros1.scan, path)
+        super().__init__(self._reader.connections, self._reader.message_count, scan)
 
     def messages(self) -> Iterator[Message]:
         return self._messages(self._reader.messages)
@@ -276,7 +305,8 @@ class _McapSource(_IndexedSource):
         self._reader = Reader2(path)
         self._reader.open()
         try:
-            super().__init__(self._reader.connections, self._reader.message_count)
+            scan = functools.partial(salvage_mcap.scan, path)
+            super().__init__(self._reader.connections, self._reader.message_count, scan)
         except _FOREIGN:
             self._reader.close()
             raise

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -23,7 +25,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER_BYTES: Final = 37  # the record and the closing magic
 _FOOTER: Final = b"\x02\x14" + bytes(7)
 
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END, _END = 0x03, 0x04, 0x05, 0x06, 0x0F, 0x02
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _DATA_END, _END = 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x02
 _RECORD: Final = struct.Struct("<BQ")
 _ID: Final = struct.Struct("<H")
 _IDS: Final = struct.Struct("<HH")
@@ -31,17 +33,35 @@ _COUNT: Final = struct.Struct("<I")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")  # first time, last time, unpacked bytes, crc
 _LENGTH: Final = struct.Struct("<Q")
+_FOOTER_FIELDS: Final = struct.Struct("<QQI")  # start of the summary, of its offsets, crc
 _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "msg"}
 
 
 def is_indexed(path: Path) -> bool:
-    """Return whether the file has its end and a summary."""
+    """Return whether the file has its end, and an undamaged summary that names a chunk."""
     with path.open("rb") as file:
         if file.seek(0, os.SEEK_END) < len(MAGIC) + _FOOTER_BYTES:
             return False
-        file.seek(-_FOOTER_BYTES, os.SEEK_END)
+        end = file.seek(-_FOOTER_BYTES, os.SEEK_END)
         footer = file.read()
-    return footer.endswith(MAGIC) and footer.startswith(_FOOTER) and footer[9:17] != bytes(8)
+        if not (footer.endswith(MAGIC) and footer.startswith(_FOOTER)):
+            return False
+        start, _, crc = _FOOTER_FIELDS.unpack_from(footer, _RECORD.size)
+        if not 0 < start < end:
+            return False
+        file.seek(start)
+        summary = file.read(end - start)
+    covered = summary + footer[: _RECORD.size + _FOOTER_FIELDS.size - _COUNT.size]
+    return crc in (0, zlib.crc32(covered)) and any(code == _CHUNK_INDEX for code in _codes(summary))
+
+
+def _codes(records: bytes) -> Iterator[int]:
+    """Yield the opcodes of records."""
+    at = 0
+    while at + _RECORD.size <= len(records):
+        code, length = _RECORD.unpack_from(records, at)
+        yield code
+        at += _RECORD.size + length
 
 
 def scan(path: Path) -> ScannedSource:

@@ -13,7 +13,7 @@ from typing import BinaryIO, Final
 
 from rosbags.typesys.msg import normalize_msgtype
 
-from gdp.ros_names import resolved
+from proxy.recordings.channels import from_ros1
 from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
@@ -104,13 +104,12 @@ class _Found(Scan):
 def channel_of(topic: str, about: Mapping[bytes, bytes]) -> Channel:
     """Return a channel from a connection's header. Comments of its definition need not be UTF-8."""
     callerid = about.get(b"callerid")
-    return Channel(
-        topic=resolved(topic),
-        type_name=normalize_msgtype(about[b"type"].decode()),
-        ros=1,
-        hash=about.get(b"md5sum", b"").decode(),
-        definition=about[b"message_definition"].decode("utf-8", "replace"),
-        definition_format="msg",
+    return from_ros1(
+        topic,
+        normalize_msgtype(about[b"type"].decode()),
+        about.get(b"md5sum", b"").decode(),
+        about[b"message_definition"].decode("utf-8", "replace"),
+        "msg",
         latched=about.get(b"latching") == b"1",
         callerid=None if callerid is None else callerid.decode("utf-8", "replace"),
     )
