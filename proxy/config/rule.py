@@ -481,11 +481,16 @@ class Rule(Section):
             raise ValueError("a pattern cannot be remapped; write a rule for each name")
         return text
 
-    @field_validator("wants_reliable", "wants_latched", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
+    @field_validator("wants_reliable", "wants_latched", *_OF_TOPICS[2:], *_OF_CALLS, *_OF_SERVICES)
     @classmethod
-    def _is_of_topics(cls, value: object, info: ValidationInfo) -> object:
-        if info.data.get("kind", "topic") != "topic":
-            raise ValueError("only topics have this")
+    def _is_of_kind(cls, value: object, info: ValidationInfo) -> object:
+        name = str(info.field_name)
+        if name in _OF_CALLS:
+            kinds = "services and actions"
+        else:
+            kinds = "services" if name in _OF_SERVICES else "topics"
+        if str(info.data.get("kind", kinds)) not in kinds:
+            raise ValueError(f"only {kinds} have this")
         return value
 
     @field_validator("history")
@@ -509,20 +514,6 @@ class Rule(Section):
     def _is_of_jpeg(cls, value: int, info: ValidationInfo) -> int:
         if info.data.get("image", "jpeg") != "jpeg":
             raise ValueError("this needs 'image: jpeg'")
-        return value
-
-    @field_validator("timeout_s", "on_timeout", "replication", "readiness", "sign")
-    @classmethod
-    def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
-        if info.data.get("kind", "service") == "topic":
-            raise ValueError("only services and actions have this")
-        return value
-
-    @field_validator("stop", "at_once", "state", "state_node")
-    @classmethod
-    def _is_of_services(cls, value: object, info: ValidationInfo) -> object:
-        if info.data.get("kind", "service") != "service":
-            raise ValueError("only services have this")
         return value
 
     @field_validator("stop", "state_node")

@@ -98,7 +98,7 @@ def test_a_later_reader_gets_nothing_that_another_waited_for(sites: Sites) -> No
     assert waiting.texts == ["stand up", "sit down"]
 
 
-def test_what_nobody_waits_for_is_kept_for_a_moment_and_counted(sites: Sites) -> None:
+def test_what_no_reader_waits_for_is_kept_for_a_moment_and_counted(sites: Sites) -> None:
     robot = sites.add(ROBOT, expose=[CHATTER])
     talker = robot.graph.publish("/talker", "/chatter", STRING)
     sites.run(2)

@@ -1,4 +1,4 @@
-"""Depth of latched topics: a late reader far away gets what a late reader beside the publisher gets."""
+"""Depth of latched topics: a late reader far away gets what a late reader near the publisher gets."""
 
 from __future__ import annotations
 

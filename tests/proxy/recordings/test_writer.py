@@ -228,7 +228,7 @@ def test_a_recording_that_is_being_written_is_not_finished_by_another(tmp_path: 
     assert bag.path.exists()
 
 
-def test_a_damaged_recording_of_others_is_finished_beside_it(tmp_path: Path) -> None:
+def test_a_damaged_recording_of_others_is_finished_next_to_it(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.mcap", 2) as bag:
         handle = bag.add(string(2))
         for number in range(10):
