@@ -26,7 +26,7 @@ _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
     "lab": LazyCommand("gdp.cli.lab:lab"),
     "endpoints": LazyCommand("gdp.cli.endpoints:endpoints"),
-    "join": LazyCommand("gdp.cli.join:join"),
+    "join": LazyCommand("gdp.cli.join:join", no_args_is_help=False),
     "up": LazyCommand("gdp.cli.join:up"),
     "agent": LazyCommand("gdp.cli.join:agent"),
     "expose": LazyCommand("gdp.cli.share:expose"),

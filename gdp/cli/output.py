@@ -12,7 +12,7 @@ from pathlib import Path
 
 import typer
 
-from gdp.cli.salt import SALT, read_salt
+from gdp.cli.salt import NAME_SALT, SALT, read_salt
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
@@ -91,10 +91,7 @@ def items_from_text(texts: Iterable[str]) -> dict[str, str]:
         if not equals or not key:
             raise LocalError(f"--meta {text!r}: expected key=value")
         if key == SALT:
-            raise LocalError(
-                "--meta salt=...: every user of this host reads arguments; put it into a private file and say"
-                " --salt-file FILE, or set GDP_SALT"
-            )
+            raise NAME_SALT.refused("--meta salt=...")
         if key in items:
             raise LocalError(f"metadata {key!r} is given twice")
         items[key] = value

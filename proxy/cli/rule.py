@@ -16,6 +16,7 @@ import yaml
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.cli.salt import NAME_SALT, SALT
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
@@ -79,6 +80,8 @@ def add(
         keys = {"kind": kind, **keys, **({"type": type_} if type_ else {}), "owner": str(owner)}
         for text in settings:
             key, value = _setting(text)
+            if isinstance(value, dict) and SALT in value:
+                raise NAME_SALT.refused(f"--set {key}={{salt: ...}}", "--set salt_file=FILE")
             if key in keys:
                 raise LocalError(f"--set {key}: it is stated already")
             keys[key] = value
