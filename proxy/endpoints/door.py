@@ -2,7 +2,8 @@
 
 I/O. A thread runs the WebSocket server (the library ``websockets``) and the hub; the bridge's thread passes commands to
 it and takes events from it. Each client has a task that sends what its queue holds, so a slow client delays its own
-messages only. Browsers state the origin of the page that connects: only listed origins may.
+messages only. Browsers state the origin of the page that connects: only listed origins may. Every user of the host may
+connect, so a client states the token of the door in its URL.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from itertools import count
 from typing import TYPE_CHECKING, Final, TypeAlias
+from urllib.parse import quote
 
+from gdp.access_token import is_access_token, query_token
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
@@ -32,10 +36,13 @@ from proxy.serial.service import Service
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
 __all__ = ["DoorEndpoint", "DoorSettings", "NewSession"]
 
 log = logging.getLogger(__name__)
+wire_log = logging.getLogger(f"{__name__}.wire")
+wire_log.setLevel(logging.INFO)  # the library's DEBUG has URLs with tokens, and what clients send
 
 NewSession: TypeAlias = "Callable[[Hub, int, ClientQueue], DoorSession]"
 
@@ -55,12 +62,14 @@ class DoorSettings:
         listen: ``host:port``.
         origins: values of the header Origin that are accepted; a client without the header is no browser, and accepted.
         subprotocols: WebSocket subprotocols, one of which a client must speak; none: it needs no subprotocol.
+        token: that a client states in its URL; empty: all who reach the address have the rights of the door.
     """
 
     label: str
     listen: str
     origins: tuple[str, ...] = ()
     subprotocols: tuple[str, ...] = ()
+    token: str = field(default="", repr=False)
     clients_max: int = 64
     queue_max_bytes: int = DATA_MAX_BYTES
     queue_max_messages: int = DATA_MAX_MESSAGES
@@ -136,8 +145,17 @@ class DoorEndpoint:
     @property
     def label(self) -> str:
         """Return the display name."""
+        return f"{self._settings.label} {self._origin}"
+
+    @property
+    def url(self) -> str:
+        """Return the address for clients, with the token; ``label`` has none."""
+        return f"{self._origin}/?token={quote(self._settings.token)}" if self._settings.token else self._origin
+
+    @property
+    def _origin(self) -> str:
         host, port = self.address
-        return f"{self._settings.label} ws://{f'[{host}]' if ':' in host else host}:{port}"
+        return f"ws://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
     def is_live(self) -> bool:
@@ -307,11 +325,13 @@ class DoorEndpoint:
         server = await serve(
             self._attend,
             sock=self._socket,
+            process_request=self._admit,
             origins=[None, *map(Origin, self._settings.origins)],
             subprotocols=[Subprotocol(each) for each in self._settings.subprotocols] or None,
             compression=None,
             max_size=MESSAGE_MAX_BYTES,
             ping_timeout=_SILENT_S,
+            logger=wire_log,
         )
         started.set()
         try:
@@ -319,6 +339,14 @@ class DoorEndpoint:
         finally:
             server.close()
             await server.wait_closed()
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return a refusal; None: the client knows the token."""
+        token = self._settings.token
+        if not token or is_access_token(query_token(request.path), token):
+            return None
+        log.info("client without the token refused")
+        return connection.respond(HTTPStatus.UNAUTHORIZED, "connect to the URL that the command of this door printed\n")
 
     async def _attend(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
