@@ -50,5 +50,7 @@ def door_token(file: Path | None, *, no_token: bool) -> str:
     if token is None:
         return new_access_token()
     if len(token) < _CHARACTERS_MIN:
-        raise LocalError(f"a door token has at least {_CHARACTERS_MIN} characters, such as 'openssl rand -hex 24' makes")
+        raise LocalError(
+            f"a door token has at least {_CHARACTERS_MIN} characters, such as 'openssl rand -hex 24' makes"
+        )
     return token

@@ -141,7 +141,9 @@ def _tell_ready(node: ProxyNode, door: DoorEndpoint, rules: DoorRules, *, json: 
     if json:
         host, port = door.address
         reads, writes = [each.name for each in rules.imports], [each.name for each in rules.expose]
-        emit("ready", name=node.member.name.to_text(), host=host, port=port, url=door.url, reads=reads, publishes=writes)
+        emit(
+            "ready", name=node.member.name.to_text(), host=host, port=port, url=door.url, reads=reads, publishes=writes
+        )
         return
     typer.echo(f"door {node.member.name.short} is attached, at {door.url}; Ctrl-C ends it")
     for verb, listed in (("offers", rules.imports), ("takes", rules.expose)):
