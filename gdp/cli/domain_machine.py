@@ -28,6 +28,7 @@ from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import bind_server, serve_domain
 from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible
+from gdp.terminal import echo
 from gdp.trust.join_token import JoinRole
 
 __all__ = ["create", "ls", "remove", "serve", "token"]
@@ -134,7 +135,7 @@ def ls(
     with Registry(files.config.state) as registry:
         rows = [_row(each) for each in registry.machines(with_removed=everything)]
     if as_json:
-        typer.echo(json.dumps(rows, ensure_ascii=False))
+        echo(json.dumps(rows, ensure_ascii=False))
         return
     titles = {"label": "label", "role": "role", "name": "name", "joined": "joined", "seen": "last seen",
               "expires": "expires", "state": "state"}  # fmt: skip
@@ -142,7 +143,7 @@ def ls(
     table = [{**each, "name": each["name"][:8]} for each in table]
     widths = {key: max(len(each[key]) for each in table) for key in titles}
     for each in table:
-        typer.echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
+        echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
 
 
 def remove(

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.printable import printable
 from proxy.endpoints.core.endpoint import Graph, Role
-from proxy.printable import printable
 
 __all__ = ["Offered", "Traffic", "offered_names", "suggested_file"]
 

@@ -20,6 +20,7 @@ from gdp.cli.salt import NAME_SALT, SALT
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
+from gdp.terminal import echo
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 
 __all__ = ["app", "main"]
@@ -164,5 +165,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp rule")
     except GdpError as error:
-        typer.echo(f"gdp: {error}", err=True)
+        echo(f"gdp: {error}", err=True)
         sys.exit(2)

@@ -234,9 +234,12 @@ def test_z03_what_waits_for_all_clients_is_bounded_and_the_one_with_most_gives_w
         assert is_served(first)
         assert is_served(second)
         one, two = (each.queue for each in door._clients.values())
-        one.put_control("x" * 300)
-        two.put_control("x" * 900)
-        door._do(lambda: None)
+
+        def put() -> None:
+            one.put_control("x" * 300)
+            two.put_control("x" * 900)
+
+        door._do(put)
         with pytest.raises(ConnectionClosed):
             hear_all(second)
         first.recv(PATIENCE_S)
