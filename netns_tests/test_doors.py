@@ -30,7 +30,7 @@ RIGHTS = {
 CLIENT = """
 import json, struct, sys
 from websockets.sync.client import connect
-with connect("ws://127.0.0.1:8765", subprotocols=["foxglove.websocket.v1"], max_size=None) as socket:
+with connect(sys.argv[1], subprotocols=["foxglove.websocket.v1"], max_size=None) as socket:
     print(json.loads(socket.recv())["op"], flush=True)
     channels = {}
     while len(channels) < 2:
@@ -87,7 +87,7 @@ def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -
     door = lab.start("-m", "gdp.cli.gdp", "foxglove", "viewer", "--json")
     ready = json.loads(lines_of(door, 1)[0])
     assert (ready["event"], sorted(ready["reads"])) == ("ready", ["/camera/image", "/odom"])
-    client = lab.start("-c", CLIENT)
+    client = lab.start("-c", CLIENT, ready["url"])
     info, channels = lines_of(client, 2)
     assert info == "serverInfo"
     assert json.loads(channels) == {
@@ -105,8 +105,8 @@ def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -
 
 
 ROSLIBPY = """
-import json, threading, roslibpy
-ros = roslibpy.Ros("127.0.0.1", 9090)
+import json, sys, threading, roslibpy
+ros = roslibpy.Ros(sys.argv[1])
 ros.run(20)
 waiting = threading.Semaphore(0)
 got = []
@@ -130,8 +130,9 @@ ros.terminate()
 def test_a_replayed_recording_reaches_roslibpy(lab: SessionLab) -> None:
     pytest.importorskip("roslibpy")
     door = lab.start("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json")
-    assert '"ready"' in lines_of(door, 1)[0]
-    client = lab.start("-c", ROSLIBPY)
+    ready = json.loads(lines_of(door, 1)[0])
+    assert ready["event"] == "ready"
+    client = lab.start("-c", ROSLIBPY, ready["url"])
     assert lines_of(client, 1) == ["ready"]
     replay = lab.start("-m", "proxy.cli.replay", "drive.mcap", "--config", "odom.yaml")
     lab.output(replay)

@@ -30,16 +30,25 @@ GDP = (sys.executable, "-m", "gdp.cli.gdp")
 
 
 @contextlib.contextmanager
-def running(host: Host, folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """Run ``gdp`` on a host while within; end it as Ctrl-C does."""
+def running(host: Host, folder: Path, *words: str, answer: str = "") -> Iterator[subprocess.Popen[str]]:
+    """Run ``gdp`` on a host while within, with what it gets when it asks; end it as Ctrl-C does."""
     with (folder / f"{host.label}.log").open("w") as log:
         process = subprocess.Popen(
-            host.command([*GDP, *words]), stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+            host.command([*GDP, *words]),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            start_new_session=True,
         )
+        assert process.stdin is not None
+        process.stdin.write(answer)
+        process.stdin.close()
         try:
             yield process
         finally:
             process.send_signal(signal.SIGINT)
+            process.stdin = None  # closed: communicate() would flush it
             process.communicate(timeout=PATIENCE_S)
 
 
@@ -89,10 +98,10 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         assert select.select([created.stdout], [], [], PATIENCE_S)[0]
         tokens = [created.stdout.readline(), run("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
         until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
-        for host, line in zip((robot, arm), tokens, strict=True):
+        for host, token in zip((robot, arm), tokens, strict=True):
             home = str(tmp_path / host.label)
-            line_words = (*line.split()[1:], "--label", host.label, "--directory", home, "--no-systemd")
-            stack.enter_context(running(host, tmp_path, *line_words))
+            join = ("join", "--label", host.label, "--directory", home, "--no-systemd")
+            stack.enter_context(running(host, tmp_path, *join, answer=token))
         until(lambda: up(lab) == {"robot", "arm"}, said, PATIENCE_S)
         until(lambda: "border" in up(tmp_path / "robot"), said, PATIENCE_S)
         until(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), said, PATIENCE_S)

@@ -28,6 +28,7 @@ pytestmark = [
 ]
 
 PATIENCE_S = 60.0
+JOIN = "gdp join --label robot"
 HOURS_OFF = "import time; true = time.time; time.time = lambda: true() - 10_800"
 LISTEN = "import socket, time; bound = socket.{}; print('bound', flush=True); time.sleep(600)"
 
@@ -49,17 +50,13 @@ class Field:
             around: a shell command in a mount namespace of its own, around the command.
         """
         words = shlex.quote(around.format(command))
-        shell = machine.type(f"unshare --mount -- sh -c {words}")
+        shell = machine.type(f"unshare --mount -- sh -c {words}", self.tokens[-1])
         assert shell.exit_code(PATIENCE_S) == 2, shell.text
         assert len(shell.text.splitlines()) == 1, shell.text
         left = machine.type("ls -A /var/lib")
         left.wait(PATIENCE_S)
         assert left.text == ""
         return shell.text
-
-    def join(self) -> str:
-        """Return the command that joins with a token that no other machine has."""
-        return f"gdp join {self.tokens[-1]} --label robot"
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +77,7 @@ def site() -> Iterator[Field]:
             address = border.host.lease().address.partition("/")[0]
             created = border.type(f"gdp domain create lab --public {address} --tokens 2")
             created.wait_for("listening on TCP port", PATIENCE_S)
-            lines = [line.split() for line in created.text.splitlines()]
-            made.tokens += [words[2] for words in lines if words[:2] == ["gdp", "join"]]
+            made.tokens += [line for line in created.text.splitlines() if line.startswith("gdp1")]
             yield made
     finally:
         run.end()
@@ -89,21 +85,21 @@ def site() -> Iterator[Field]:
 
 def test_without_wireguard_a_machine_does_not_join(site: Field) -> None:
     hidden = "mount --bind /dev/null $(command -v wireguard-go) && {}"
-    assert "install --no-install-recommends wireguard-go" in site.refusal(site.robot, site.join(), hidden)
+    assert "install --no-install-recommends wireguard-go" in site.refusal(site.robot, JOIN, hidden)
 
 
 def test_without_a_tun_device_a_machine_does_not_join(site: Field) -> None:
-    text = site.refusal(site.robot, site.join(), "mount --bind /var/lib /dev/net && {}")
+    text = site.refusal(site.robot, JOIN, "mount --bind /var/lib /dev/net && {}")
     assert "needs /dev/net/tun, which does not exist; modprobe tun" in text
 
 
 def test_without_the_right_to_make_devices_a_machine_does_not_join(site: Field) -> None:
-    text = site.refusal(site.robot, site.join(), "setpriv --bounding-set=-net_admin -- {}")
+    text = site.refusal(site.robot, JOIN, "setpriv --bounding-set=-net_admin -- {}")
     assert "not permitted; run this as root" in text
 
 
 def test_a_machine_whose_clock_is_hours_off_does_not_join(site: Field) -> None:
-    words = site.join().split()[1:]
+    words = JOIN.split()[1:]
     command = f"python -c {shlex.quote(f'{HOURS_OFF}; from gdp.cli.gdp import main; main({words})')}"
     assert "clock is 3.0 hours behind the server's: set the clock" in site.refusal(site.robot, command)
 
@@ -111,7 +107,7 @@ def test_a_machine_whose_clock_is_hours_off_does_not_join(site: Field) -> None:
 def test_a_machine_that_does_not_reach_the_border_does_not_join(site: Field) -> None:
     site.border.host.unplug()
     try:
-        text = site.refusal(site.robot, site.join())
+        text = site.refusal(site.robot, JOIN)
     finally:
         site.border.host.plug()
     assert "the enrolment server is not reachable" in text
@@ -120,9 +116,7 @@ def test_a_machine_that_does_not_reach_the_border_does_not_join(site: Field) -> 
 
 @pytest.mark.parametrize("command", ["join", "create"])
 def test_on_a_full_disk_no_directory_is_left_and_no_token_used(site: Field, command: str) -> None:
-    words = (
-        site.join() if command == "join" else "gdp domain create lab --public 192.0.2.1 --listen 51821 --relay-port 0"
-    )
+    words = JOIN if command == "join" else "gdp domain create lab --public 192.0.2.1 --listen 51821 --relay-port 0"
     small = "mount -t tmpfs -o size=512k tmpfs /var/lib && {}; code=$?; ls -A /var/lib/gdp; exit $code"
     text = site.refusal(site.robot, words, small)
     assert "No space left on device" in text
@@ -147,11 +141,11 @@ def test_a_border_whose_port_is_taken_creates_no_domain(site: Field, bound: str,
 
 
 def test_a_machine_whose_network_lets_only_tcp_443_through_joins(site: Field) -> None:
-    joined = site.blocked.type(f"gdp join {site.tokens[0]} --label blocked")
+    joined = site.blocked.type("gdp join --label blocked", site.tokens[0])
     joined.wait_for("joined the domain lab as blocked", PATIENCE_S)
     joined.wait_for("frames pass through TLS at the border", PATIENCE_S)
 
 
 def test_after_all_refusals_the_same_token_is_good(site: Field) -> None:
-    joined = site.robot.type(site.join())
+    joined = site.robot.type(JOIN, site.tokens[-1])
     joined.wait_for("tunnels are up: border", PATIENCE_S)

@@ -22,6 +22,7 @@ from fog.supervisor.background import ensure, is_running, pid_of
 from fog.supervisor.infrastructure import local_provider, open_provider, tear_down
 from fog.supervisor.journal import Journal
 from gdp.errors import LocalError, StoreError
+from gdp.terminal import echo
 
 __all__ = ["clear", "down", "end_cluster"]
 
@@ -67,7 +68,7 @@ def down(
         if as_json:
             print_json({"ended": names, "machines": sum(ended)})
         elif not names:
-            typer.echo("nothing is up")
+            echo("nothing is up")
 
 
 def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-import typer
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -27,6 +26,7 @@ from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway
+from gdp.terminal import echo
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
 
@@ -121,7 +121,7 @@ def show_plan(said: Priced, ends: str = BY_HAND, *, as_json: bool) -> None:
     """
     fields = priced(said)
     if as_json:
-        typer.echo(json.dumps(fields, ensure_ascii=False))
+        echo(json.dumps(fields, ensure_ascii=False))
         return
     plan = said.loaded.plan
     table = Table(title=f"cluster {plan.name}", title_justify="left", title_style="bold")

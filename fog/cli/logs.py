@@ -22,6 +22,7 @@ from fog.supervisor.final_logs import MACHINE
 from fog.supervisor.infrastructure import open_provider
 from fog.supervisor.journal import Journal
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 __all__ = ["logs", "new_lines"]
 
@@ -64,7 +65,7 @@ def logs(
                 if as_json:
                     print_json({"machine": machine, "program": program, "line": text})
                 else:
-                    typer.echo(text)
+                    echo(text)
             sys.stdout.flush()
 
         if machine == _SUPERVISOR:
@@ -78,7 +79,7 @@ def logs(
         record = machine_of(journal, cluster, machine)
         if record.is_gone:
             end, kept = _final_log(journal, record, program or MACHINE)
-            typer.echo(end, err=as_json)
+            echo(end, err=as_json)
             say(kept[-lines:])
             return
         with closing(open_provider(here)) as provider:
@@ -90,7 +91,7 @@ def logs(
 
             _show(lines_of_machine, lines, say, max(_LOOK_S, provider.poll_s) if follow else None)
         if follow:
-            typer.echo(f"{machine} is gone; its last lines: fog logs {machine} {program}", err=True)
+            echo(f"{machine} is gone; its last lines: fog logs {machine} {program}", err=True)
 
 
 def new_lines(known: Sequence[str], now: Sequence[str]) -> Sequence[str]:

@@ -27,6 +27,7 @@ from fog.site import peek_site
 from gdp.cli.console import Columns, folding
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 __all__ = ["cost_table", "plan"]
 
@@ -97,7 +98,7 @@ def plan(
         )
         result = answer(question, _offers(provider, region), measured())
         if as_json:
-            typer.echo(json.dumps(_document(question, result), ensure_ascii=False))
+            echo(json.dumps(_document(question, result), ensure_ascii=False))
         else:
             _show(question, result)
 
@@ -151,7 +152,7 @@ def cost_table(
                 }
             )
         if as_json:
-            typer.echo(json.dumps({"provider": provider, "sources": list(_sources(provider)), "offers": rows}))
+            echo(json.dumps({"provider": provider, "sources": list(_sources(provider)), "offers": rows}))
             return
         shown = rows if everything else rows[:_MOST_ROWS]
         prices = _right("ms", "on demand /h", "spot /h", "spot /month")

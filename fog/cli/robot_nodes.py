@@ -14,11 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-import typer
-
 from fog.child_environment import child_environment
 from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 if TYPE_CHECKING:
     from fog.cluster import RobotNode
@@ -63,7 +62,7 @@ def _start(each: RobotNode, words: Sequence[str], path: Path) -> subprocess.Pope
     if each.output in ("screen", "both"):
         return subprocess.Popen(words, env=environment)
     path.parent.mkdir(mode=0o700, exist_ok=True)
-    typer.echo(f"{each.node.executable} prints to {path}", err=True)
+    echo(f"{each.node.executable} prints to {path}", err=True)
     with path.open("wb") as file:
         return subprocess.Popen(words, env=environment, stdout=file)
 

@@ -22,6 +22,7 @@ from fog.supervisor.background import ensure
 from fog.supervisor.infrastructure import open_provider, set_up
 from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, set_up_logging
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 __all__ = ["push", "scale", "ssh", "supervise"]
 
@@ -177,4 +178,4 @@ def _say(fields: dict[str, object], *, as_json: bool) -> None:
     if as_json:
         print_json(fields)
     else:
-        typer.echo(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in fields.items()))
+        echo(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in fields.items()))

@@ -34,6 +34,7 @@ from fog.supervisor.background import pid_of
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
 from gdp.cli.console import Columns
+from gdp.terminal import echo
 
 __all__ = ["cost", "ls", "status"]
 
@@ -69,7 +70,7 @@ def ls(
         elif rows:
             show(clusters_table(rows))
         else:
-            typer.echo("no cluster is up")
+            echo("no cluster is up")
 
 
 def status(
@@ -138,7 +139,7 @@ def cost(
         elif rows:
             show(costs_table(rows))
         else:
-            typer.echo("there was no cluster yet")
+            echo("there was no cluster yet")
 
 
 def _left(journal: Journal, cluster: Cluster) -> bool:

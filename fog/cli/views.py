@@ -11,7 +11,6 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Final
 
-import typer
 from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -22,6 +21,7 @@ from fog.plan.duration import duration_text
 from fog.supervisor.core.record import Record, cost_usd, stage
 from fog.supervisor.journal import Cluster, Entry
 from gdp.cli.console import console, folding
+from gdp.terminal import echo
 
 __all__ = [
     "a_console",
@@ -217,7 +217,7 @@ def show(*parts: RenderableType) -> None:
 
 def print_json(value: object) -> None:
     """Print one JSON value."""
-    typer.echo(json.dumps(value, ensure_ascii=False, default=asdict))
+    echo(json.dumps(value, ensure_ascii=False, default=asdict))
 
 
 def ms_text(latency: Latency) -> str:

@@ -14,6 +14,7 @@ from fog.cli.options import AsJson
 from fog.cli.views import print_json
 from fog.software.wheels import DEBIAN_12, Platform, wheels
 from gdp.cli.node import failing_clearly
+from gdp.terminal import echo
 
 __all__ = ["wheels_command"]
 
@@ -52,4 +53,4 @@ def wheels_command(
             print_json([each.name for each in found])
         else:
             size_mb = sum(each.stat().st_size for each in found) / 1e6
-            typer.echo(f"{folder}: {len(found)} wheels, {size_mb:.0f} MB")
+            echo(f"{folder}: {len(found)} wheels, {size_mb:.0f} MB")

@@ -19,6 +19,7 @@ from fog.host.bundle import JOIN_FILE, TICKET_FILE
 from gdp.cli.completion import allow_completion
 from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, emit, failing_clearly, set_up_logging
 from gdp.cli.version import HELP, Version
+from gdp.terminal import echo
 
 __all__ = ["main"]
 
@@ -63,7 +64,7 @@ def machine(
         if json:
             emit("done", reason=reason)
         else:
-            typer.echo(f"machine ends: {reason}")
+            echo(f"machine ends: {reason}")
 
 
 def _become_member(home: Path) -> str:

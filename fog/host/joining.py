@@ -1,6 +1,6 @@
 """Joining of a machine at its first start: it becomes a member of the border's domain with its token.
 
-I/O. It does what ``gdp join TOKEN --no-start`` does: keys are made here, and the domain's root is pinned by the token.
+I/O. It does what ``gdp join --no-start`` does: keys are made here, and the domain's root is pinned by the token.
 Afterwards the file with the token is deleted; a machine without one does not join.
 """
 

@@ -38,6 +38,7 @@ from gdp.stores.issue import (
 from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_delegation, load_domain, load_node_keys, load_root, parsed
 from gdp.stores.ledger import LEDGER, read_ledger
 from gdp.stores.rollover import trust_successor
+from gdp.terminal import echo
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
@@ -212,10 +213,10 @@ def issued(domain: Domain, as_json: options.Json = False) -> None:
     for line in lines:
         until = moment(line.until_unix_s)
         if as_json:
-            typer.echo(json.dumps(asdict(line)))
+            echo(json.dumps(asdict(line)))
         else:
-            typer.echo(f"{moment(line.at_unix_s)}  {line.role:<6}  {line.label}  {line.name}  until {until}")
-    typer.echo(f"{domain / LEDGER}: {len(lines)} memberships, the chain of hashes holds", err=True)
+            echo(f"{moment(line.at_unix_s)}  {line.role:<6}  {line.label}  {line.name}  until {until}")
+    echo(f"{domain / LEDGER}: {len(lines)} memberships, the chain of hashes holds", err=True)
 
 
 @app.command("install")
@@ -287,7 +288,7 @@ def _state(
         raise LocalError(f"the request asks for the role {role}, not {wanted.value}: nothing was signed")
     if called is not None and called != label:
         raise LocalError(f"the request asks for the label {label!r}, not {called!r}: nothing was signed")
-    typer.echo(f"about to sign: {role} {label!r}, name {name.to_text()}, for {days:g} days at most", err=True)
+    echo(f"about to sign: {role} {label!r}, name {name.to_text()}, for {days:g} days at most", err=True)
     if wanted is not None and called is not None:
         return
     if not (sys.stdin.isatty() and sys.stderr.isatty()):

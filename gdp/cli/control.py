@@ -17,6 +17,7 @@ from gdp.cli.output import show
 from gdp.errors import LocalError
 from gdp.management.control_client import NotRunningError, find_control_socket, request_control
 from gdp.state.control_protocol import Command, Response
+from gdp.terminal import echo
 
 __all__ = ["drain", "reload", "status"]
 
@@ -97,12 +98,12 @@ def _run(command: Command, node: Path | None, socket: Path | None, timeout_s: fl
         _fail(f"{path}: {last.error}", _FAILED, as_json=as_json)
     show(last.result, as_json=as_json)
     if last.result.get("complete") is False:
-        typer.echo(f"gdp: {path}: the node ended with unfinished work", err=True)
+        echo(f"gdp: {path}: the node ended with unfinished work", err=True)
         raise typer.Exit(_FAILED)
 
 
 def _fail(reason: str, code: int, *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps({"error": reason}))
-    typer.echo(f"gdp: {reason}", err=True)
+        echo(json.dumps({"error": reason}))
+    echo(f"gdp: {reason}", err=True)
     raise typer.Exit(code)

@@ -14,6 +14,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.node import emit, failing_clearly
+from gdp.terminal import echo
 
 __all__ = ["dashboard"]
 
@@ -61,8 +62,8 @@ async def _serve(nodes: tuple[Path, ...], states: tuple[Path, ...], port: int, *
         if as_json:
             emit("ready", url=server.url, nodes=found)
             return
-        typer.echo(f"live view of {found} nodes: {server.url}")
+        echo(f"live view of {found} nodes: {server.url}")
         if not found:
-            typer.echo("no node runs here as far as this user may see; start one, or use sudo")
+            echo("no node runs here as far as this user may see; start one, or use sudo")
 
     await server.run_until(ready, stop)

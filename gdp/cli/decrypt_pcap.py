@@ -25,6 +25,7 @@ from gdp.frame.kinds import ETHERTYPE
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.keyring import DELEGATIONS, load_delegations, load_identity, load_owner
+from gdp.terminal import echo
 
 if TYPE_CHECKING:
     from gdp.ports.pcap_files import CapturedFrame
@@ -85,10 +86,10 @@ def decrypt_pcap(
         return
     for row in rows:
         if row["frames"] != row["not_sealed"]:
-            typer.echo(_line(row))
-    typer.echo(f"{sum(counts[Outcome.NOT_SEALED] for counts in opener.outcomes.values())} frames are not sealed")
+            echo(_line(row))
+    echo(f"{sum(counts[Outcome.NOT_SEALED] for counts in opener.outcomes.values())} frames are not sealed")
     more = f", of which {cut} are cut to what Wireshark reads" if cut else ""
-    typer.echo(f"{written} opened messages in {out}{more}")
+    echo(f"{written} opened messages in {out}{more}")
 
 
 def _keys(nodes: Sequence[Path], owners: Sequence[Path]) -> tuple[CaptureKeys, dict[Name, Metadata]]:
@@ -101,7 +102,7 @@ def _keys(nodes: Sequence[Path], owners: Sequence[Path]) -> tuple[CaptureKeys, d
             try:
                 grants = delegation.open(identity)
             except GdpError as error:
-                typer.echo(f"left out: the delegation of {delegation.name.to_text()}: {error}", err=True)
+                echo(f"left out: the delegation of {delegation.name.to_text()}: {error}", err=True)
                 continue
             secrets.setdefault(delegation.name, {}).update({epoch: each.secret for epoch, each in grants.items()})
             if delegation.metadata is not None:

@@ -36,6 +36,7 @@ from gdp.stores.checkout import work_tree_of
 from gdp.stores.files import private, public, write_all
 from gdp.stores.issue import DELEGATION_DAYS, delegate, delegate_route, install_delegation
 from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
+from gdp.terminal import echo
 from gdp.trust.adcert import AdCert
 from gdp.trust.audit import Action
 
@@ -131,7 +132,7 @@ def name(
     )
     write_all(out.parent, {out.name: private(made.to_wire())}, force=force)
     if (tree := work_tree_of(out)) is not None:
-        typer.echo(f"{out} is private and lies in the git work tree {tree}; do not commit it", err=True)
+        echo(f"{out} is private and lies in the git work tree {tree}; do not commit it", err=True)
     show({**described(made), "label": face.label, "delegation": str(out)}, as_json=as_json)
 
 
@@ -212,5 +213,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp-delegate")
     except GdpError as error:
-        typer.echo(f"gdp-delegate: {error}", err=True)
+        echo(f"gdp-delegate: {error}", err=True)
         sys.exit(2)

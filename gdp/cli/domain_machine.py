@@ -28,6 +28,7 @@ from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import bind_server, serve_domain
 from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible
+from gdp.terminal import echo
 from gdp.trust.join_token import JoinRole
 
 __all__ = ["create", "ls", "remove", "serve", "token"]
@@ -43,7 +44,7 @@ Public = Annotated[
 JoinRoleText = Annotated[str, typer.Option("--role", help="robot, switch or leaf; see the how-to page on joining")]
 Valid = Annotated[str, typer.Option("--valid", metavar="TIME", help="how long the token can be used: 30m, 1h, 7d")]
 RelayPort = Annotated[int, typer.Option("--relay-port", min=0, max=65_535, help="TCP port of the relay; 0: none")]
-Tokens = Annotated[int, typer.Option("--tokens", min=1, max=100, help="how many lines to print: one joins one machine")]
+Tokens = Annotated[int, typer.Option("--tokens", min=1, max=100, help="how many to print: one joins one machine")]
 Listen = Annotated[int, typer.Option("--listen", min=1, max=65_535, help="UDP port of tunnels, TCP port of enrolment")]
 
 
@@ -59,7 +60,7 @@ def create(
     start: Start = True,
     as_json: options.Json = False,
 ) -> None:
-    """Create a trust domain on a reachable machine, start its border, and print a line for each machine to join.
+    """Create a trust domain on a reachable machine, start its border, and print a token for each machine to join.
 
     \b
     Examples:
@@ -86,7 +87,8 @@ def create(
     say(f"domain {name} is in {files.directory}; keep a copy of {files.directory / 'domain'} in a safe place")
     made = [make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h")).to_text() for _ in range(tokens)]
     result = {"domain": name, "directory": str(files.directory), "servers": servers, "tokens": made}
-    show(result, as_json=as_json, plain="\n".join(f"gdp join {each}" for each in made))
+    say("on each machine: gdp join, which asks for a token; each is good once, for an hour")
+    show(result, as_json=as_json, plain="\n".join(made))
     sys.stdout.flush()
     if start:
         start_machine(files.directory, no_systemd=no_systemd)
@@ -100,7 +102,7 @@ def token(
     directory: AtDirectory = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a token: one machine joins with it, once, in one role.
+    """Print a token: one machine joins with it, once, in one role. Type gdp join there, which asks for it.
 
     \b
     Examples:
@@ -113,7 +115,7 @@ def token(
     made = make_token(files, JoinRole(role), valid_s=duration_s(valid), label=label)
     until = moment(made.expires_unix_s)
     result = {"token": made.to_text(), "role": role, "label": label or None, "until": until}
-    show(result, as_json=as_json, plain=f"gdp join {made.to_text()}")
+    show(result, as_json=as_json, plain=made.to_text())
 
 
 def ls(
@@ -133,7 +135,7 @@ def ls(
     with Registry(files.config.state) as registry:
         rows = [_row(each) for each in registry.machines(with_removed=everything)]
     if as_json:
-        typer.echo(json.dumps(rows, ensure_ascii=False))
+        echo(json.dumps(rows, ensure_ascii=False))
         return
     titles = {"label": "label", "role": "role", "name": "name", "joined": "joined", "seen": "last seen",
               "expires": "expires", "state": "state"}  # fmt: skip
@@ -141,7 +143,7 @@ def ls(
     table = [{**each, "name": each["name"][:8]} for each in table]
     widths = {key: max(len(each[key]) for each in table) for key in titles}
     for each in table:
-        typer.echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
+        echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
 
 
 def remove(

@@ -18,6 +18,7 @@ from gdp.diagnosis.answer import Answer, Verdict
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.errors import LocalError
 from gdp.management.running_nodes import RunningNode
+from gdp.terminal import echo
 
 __all__ = ["explain"]
 
@@ -90,11 +91,11 @@ def _print(answer: Answer, place: str, *, as_json: bool) -> None:
     command = answer.command.replace("NODE_DIR", place)
     if as_json:
         fields = {**answer.to_fields(), "command": command or None}
-        typer.echo(json.dumps(fields, ensure_ascii=False))
+        echo(json.dumps(fields, ensure_ascii=False))
         return
-    typer.echo(answer.sentence)
+    echo(answer.sentence)
     if command:
-        typer.echo(f"next: {command}")
+        echo(f"next: {command}")
     if answer.cause.verdict is not Verdict.FINE:
         for each in answer.unknown:
-            typer.echo(f"not asked: {each}")
+            echo(f"not asked: {each}")

@@ -17,6 +17,7 @@ from gdp.cli.extension import ExtendedGroup
 from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.version import HELP, Version, versioned
 from gdp.errors import GdpError
+from gdp.terminal import echo
 
 __all__ = ["app", "main"]
 
@@ -26,7 +27,7 @@ _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
     "lab": LazyCommand("gdp.cli.lab:lab"),
     "endpoints": LazyCommand("gdp.cli.endpoints:endpoints"),
-    "join": LazyCommand("gdp.cli.join:join"),
+    "join": LazyCommand("gdp.cli.join:join", no_args_is_help=False),
     "up": LazyCommand("gdp.cli.join:up"),
     "agent": LazyCommand("gdp.cli.join:agent"),
     "expose": LazyCommand("gdp.cli.share:expose"),
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp")
     except GdpError as error:
-        typer.echo(f"gdp: {error}", err=True)
+        echo(f"gdp: {error}", err=True)
         sys.exit(2)
 
 

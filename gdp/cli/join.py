@@ -30,6 +30,7 @@ from gdp.cli.machine import (
 )
 from gdp.cli.node import set_up_logging
 from gdp.cli.output import show
+from gdp.cli.secret import PROMPT, Secret
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
 from gdp.enrolment.domain_join import JoinRequest, join_domain, prefer_server
@@ -45,7 +46,21 @@ __all__ = ["agent", "join", "run_agent", "up"]
 
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]")
 
-Token = Annotated[str, typer.Argument(metavar="TOKEN", help="as gdp domain create or gdp domain token printed it")]
+JOIN_TOKEN: Final = Secret("join token", "--token-file", "GDP_TOKEN")
+
+Argument = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Argument(metavar="[-]", help="ask for the token, as without a file and without GDP_TOKEN"),
+]
+TokenFile = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--token-file",
+        metavar="FILE",
+        help="a private file with a token of gdp domain create or gdp domain token; -: ask for it, the default."
+        " Without: GDP_TOKEN, if set",
+    ),
+]
 LabelText = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--label", help="the machine's name for people; by default its host name"),
@@ -58,7 +73,8 @@ Uplinks = Annotated[
 
 
 def join(
-    token: Token,
+    argument: Argument = None,
+    token_file: TokenFile = None,
     label: LabelText = None,
     directory: AtDirectory = None,
     uplink: Uplinks = [],  # noqa: B006 (the library copies it)
@@ -68,12 +84,15 @@ def join(
 ) -> None:
     """Join the domain of a token: make keys, fetch the memberships, and start switch, proxy and agent.
 
+    It asks for the token, so that no other user of the machine sees it. A token as an argument is refused.
+
     \b
     Examples:
-      gdp join gdp1aeag...
-      gdp join gdp1aeag... --label robot-7 --uplink wlan0 --uplink wwan0
+      gdp join
+      gdp join --token-file robot.token --label robot-7 --uplink wlan0 --uplink wwan0
+      ssh border gdp domain token lab | gdp join --label robot-7
     """
-    read = JoinToken.from_text(token)
+    read = JoinToken.from_text(_token_text(argument, token_file))
     if start:
         check_tunnels()
     if directory is None:
@@ -92,6 +111,13 @@ def join(
         sys.stdout.flush()
     if start:
         start_machine(directory, no_systemd=no_systemd, observed=_say_border)
+
+
+def _token_text(argument: str | None, file: Path | None) -> str:
+    if argument is not None and argument != str(PROMPT):
+        raise JOIN_TOKEN.refused("gdp join TOKEN")
+    text = JOIN_TOKEN.read(file if argument is None else PROMPT)
+    return text or JOIN_TOKEN.read(PROMPT) or ""
 
 
 def up(

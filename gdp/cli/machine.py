@@ -26,6 +26,7 @@ from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
+from gdp.terminal import echo
 
 __all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run_programs", "say", "start_machine"]
 
@@ -48,7 +49,7 @@ def directory_of(name: str, stated: Path | None) -> Path:
 
 def say(text: str) -> None:
     """Write a line for people; results go to standard output, which programs may read."""
-    typer.echo(text, err=True)
+    echo(text, err=True)
 
 
 def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path], None] | None = None) -> None:

@@ -20,6 +20,7 @@ import typer
 from gdp.cli.log_lines import JsonLines
 from gdp.config.config import UplinkPlane
 from gdp.errors import ConfigError, GdpError, LocalError
+from gdp.terminal import echo
 
 __all__ = [
     "WRONG",
@@ -117,8 +118,7 @@ def member_plane(text: str) -> UplinkPlane:
 
 def emit(event: str, **fields: object) -> None:
     """Write one line of JSON and flush it, because a reader waits for it."""
-    sys.stdout.buffer.write(orjson.dumps({"event": event, **fields}) + b"\n")
-    sys.stdout.buffer.flush()
+    echo(orjson.dumps({"event": event, **fields}).decode())
 
 
 def emit_wait(reason: str, text: str) -> None:
@@ -132,8 +132,8 @@ def failing_clearly() -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        typer.echo(str(error), err=True)
+        echo(str(error), err=True)
         raise typer.Exit(WRONG) from error
     except GdpError as error:
-        typer.echo(f"error: {error}", err=True)
+        echo(f"error: {error}", err=True)
         raise typer.Exit(WRONG) from error

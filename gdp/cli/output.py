@@ -10,12 +10,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-import typer
-
-from gdp.cli.salt import SALT, read_salt
+from gdp.cli.salt import NAME_SALT, SALT, read_salt
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
+from gdp.terminal import echo
 from gdp.trust.grants import EPOCH_MAX
 from gdp.trust.right import Right
 
@@ -25,13 +24,13 @@ __all__ = ["epochs_from_text", "items_from_text", "metadata_from_options", "mome
 def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = None) -> None:
     """Print a result; ``plain``, if given, replaces the lines for people."""
     if as_json:
-        typer.echo(json.dumps(result, ensure_ascii=False))
+        echo(json.dumps(result, ensure_ascii=False))
     elif plain is not None:
-        typer.echo(plain)
+        echo(plain)
     else:
         width = max(map(len, result))
         for key, value in result.items():
-            typer.echo(f"{key:<{width}}  {_text(value)}")
+            echo(f"{key:<{width}}  {_text(value)}")
 
 
 def moment(unix_s: int) -> str:
@@ -91,10 +90,7 @@ def items_from_text(texts: Iterable[str]) -> dict[str, str]:
         if not equals or not key:
             raise LocalError(f"--meta {text!r}: expected key=value")
         if key == SALT:
-            raise LocalError(
-                "--meta salt=...: every user of this host reads arguments; put it into a private file and say"
-                " --salt-file FILE, or set GDP_SALT"
-            )
+            raise NAME_SALT.refused("--meta salt=...")
         if key in items:
             raise LocalError(f"metadata {key!r} is given twice")
         items[key] = value

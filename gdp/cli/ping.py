@@ -19,6 +19,7 @@ from gdp.errors import LocalError
 from gdp.management.control_client import NodeConnection
 from gdp.names import Name
 from gdp.ports.readiness import readable
+from gdp.terminal import echo
 
 __all__ = ["ping"]
 
@@ -70,7 +71,7 @@ def ping(
         try:
             run.run(count, interval)
         except KeyboardInterrupt:
-            typer.echo("", err=True)
+            echo("", err=True)
         run.report(name)
     if not run.has_replies:
         raise typer.Exit(_NOTHING_CAME)
@@ -132,11 +133,11 @@ class _Run:
             line = {"number": number, "node": target, "rtt_ms": rtt_ms if came else None}
             if came:
                 line |= {key: result[key] for key in ("label", "role", "domain", "domain_label", "result")}
-            typer.echo(json.dumps(line))
+            echo(json.dumps(line))
         elif came:
-            typer.echo(f"reply {number} from {self._labels[target]}: {rtt_ms:.2f} ms")
+            echo(f"reply {number} from {self._labels[target]}: {rtt_ms:.2f} ms")
         else:
-            typer.echo(f"no reply {number} from {self._shown(target)} within {self._timeout_s:g} s")
+            echo(f"no reply {number} from {self._shown(target)} within {self._timeout_s:g} s")
 
     def report(self, name: str) -> None:
         """Print the summary."""
@@ -145,11 +146,11 @@ class _Run:
             del number
         if self._as_json:
             members = [{"node": target, **each.to_fields()} for target, each in self._statistics.items()]
-            typer.echo(json.dumps({"name": self._name.to_text(), "members": members}))
+            echo(json.dumps({"name": self._name.to_text(), "members": members}))
             return
-        typer.echo(f"--- {name} ---")
+        echo(f"--- {name} ---")
         for target, each in self._statistics.items():
-            typer.echo(f"{self._shown(target)}: {each.to_text()}")
+            echo(f"{self._shown(target)}: {each.to_text()}")
 
     def _shown(self, target: str) -> str:
         return self._labels.get(target, Name.from_text(target).short)

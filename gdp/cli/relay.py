@@ -33,6 +33,7 @@ from gdp.nodes.membership import load_member
 from gdp.nodes.relay import Relay, relay_control_path, run_relay
 from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
+from gdp.terminal import echo
 
 __all__ = ["main"]
 
@@ -82,11 +83,9 @@ def _report_check(identity: Identity, settings: RelayConfig, *, json: bool) -> N
     if json:
         emit("checked", name=identity.name.to_text(), port=port, devices=devices)
         return
-    typer.echo(
-        f"configuration good: relay of {identity.role.value} {identity.name.short}, server port {port or 'none'}"
-    )
+    echo(f"configuration good: relay of {identity.role.value} {identity.name.short}, server port {port or 'none'}")
     for peer, device in devices.items():
-        typer.echo(f"{device} leads to {peer}")
+        echo(f"{device} leads to {peer}")
 
 
 def _report_ready(identity: Identity, relay: Relay, *, json: bool) -> None:
@@ -95,7 +94,7 @@ def _report_ready(identity: Identity, relay: Relay, *, json: bool) -> None:
     if json:
         emit("ready", name=identity.name.to_text(), port=port, devices=devices)
         return
-    typer.echo(f"relay of {identity.role.value} {identity.name.short} is up, via TLS (slower); Ctrl-C ends it")
+    echo(f"relay of {identity.role.value} {identity.name.short} is up, via TLS (slower); Ctrl-C ends it")
 
 
 def main() -> None:

@@ -32,6 +32,7 @@ from gdp.links.uplink import wait_for_device
 from gdp.names import Name
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
+from gdp.terminal import echo
 
 __all__ = ["main"]
 
@@ -73,7 +74,7 @@ def _report(event: str, text: str, name: Name, *, json: bool) -> None:
     if json:
         emit(event, name=name.to_text())
     else:
-        typer.echo(text)
+        echo(text)
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from gdp.management.control_client import NotRunningError, ask_node, find_contro
 from gdp.management.running_nodes import RunningNode, find_running_nodes, read_topics
 from gdp.names import Name
 from gdp.state.control_protocol import Command
+from gdp.terminal import echo
 
 __all__ = ["app"]
 
@@ -130,23 +131,23 @@ def _described(node: RunningNode, answer: Mapping[str, object]) -> dict[str, obj
 
 
 def _print(text: str, name: Name, answers: Mapping[RunningNode, Mapping[str, object]]) -> None:
-    typer.echo(f"{text}  {name.to_text()}")
+    echo(f"{text}  {name.to_text()}")
     for node, answer in answers.items():
         rib, state = answer.get("rib"), answer.get("state")
         through = "no RIB" if not isinstance(rib, str) else f"RIB {Name.from_text(rib).short}"
-        typer.echo(f"{node.label}, through {through}: {state}")
+        echo(f"{node.label}, through {through}: {state}")
         advertisers = answer.get("advertisers")
         for each in advertisers if isinstance(advertisers, list) else []:
-            typer.echo(f"  {each['right']} by {each['advertiser']}")
-            typer.echo(f"    at switch   {each['switch']}")
-            typer.echo(f"    in domain   {each['domain']}")
-            typer.echo(f"    lease       {each['left_s']:g} s left here; advertised for {each['lease_s']:g} s")
+            echo(f"  {each['right']} by {each['advertiser']}")
+            echo(f"    at switch   {each['switch']}")
+            echo(f"    in domain   {each['domain']}")
+            echo(f"    lease       {each['left_s']:g} s left here; advertised for {each['lease_s']:g} s")
             held = f"{each['holder']!r} of domain {each['holder_domain']}"
-            typer.echo(f"    certificate {held}, valid until {moment(each['valid_until_unix_s'])}")
-            typer.echo(f"    owner's key {each['owner_key'] or 'none: an unowned name'}")
+            echo(f"    certificate {held}, valid until {moment(each['valid_until_unix_s'])}")
+            echo(f"    owner's key {each['owner_key'] or 'none: an unowned name'}")
             for issuer in each["delegated_by"]:
                 by = "the owner" if issuer == name.to_text() else issuer
-                typer.echo(f"    delegated   by {by}")
+                echo(f"    delegated   by {by}")
         if not advertisers:
             unknown = f"  no advertiser is known: {answer.get('error', state)}"
-            typer.echo("  no node advertises it" if state in ("answered", "stored") else unknown)
+            echo("  no node advertises it" if state in ("answered", "stored") else unknown)

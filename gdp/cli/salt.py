@@ -1,26 +1,22 @@
-"""Salt of a name: its unguessable part, read from a file, the environment or a prompt, never from an argument.
+"""Salt of a name: its unguessable part, a secret that commands take.
 
-I/O. An argument is visible in ``/proc/PID/cmdline`` to every user of the host, and in the shell's history.
+I/O.
 """
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
 import typer
 
-from gdp.errors import LocalError
-from gdp.stores.files import read_private
+from gdp.cli.secret import Secret
 
-__all__ = ["SALT", "SaltFile", "hidden", "read_salt"]
+__all__ = ["NAME_SALT", "SALT", "SaltFile", "hidden", "read_salt"]
 
 SALT: Final = "salt"  # the salt's key in the metadata
-_VARIABLE: Final = "GDP_SALT"
-_PROMPT: Final = Path("-")
+NAME_SALT: Final = Secret("salt", "--salt-file", "GDP_SALT")
 
 SaltFile = Annotated[
     Optional[Path],  # noqa: UP045
@@ -36,28 +32,13 @@ def read_salt(file: Path | None) -> dict[str, str]:
     """Return the salt as an item of metadata; empty if none is given.
 
     Args:
-        file: a private file (mode 0600) with the salt as its only line; ``-``: read it from a prompt, or from standard
-            input if that is not a terminal.
+        file: as for ``Secret.read``.
 
     Raises:
         LocalError: the file is not private, or the salt is empty or not text.
     """
-    if file is None:
-        where, text = _VARIABLE, os.environ.get(_VARIABLE)
-        if text is None:
-            return {}
-    elif file == _PROMPT:
-        where = "the salt"
-        text = typer.prompt("Salt of the name", hide_input=True, err=True) if sys.stdin.isatty() else sys.stdin.read()
-    else:
-        where = str(file)
-        try:
-            text = read_private(file).decode()
-        except UnicodeDecodeError as error:
-            raise LocalError(f"{file}: UTF-8 text is expected") from error
-    if not text.strip():
-        raise LocalError(f"{where}: a salt is not empty")
-    return {SALT: text.strip()}
+    text = NAME_SALT.read(file)
+    return {} if text is None else {SALT: text}
 
 
 def hidden(metadata: Mapping[str, str | int]) -> dict[str, str | int]:

@@ -32,6 +32,7 @@ from gdp.sharing.sharing import Sharing
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, load_card, load_owner
+from gdp.terminal import echo
 
 __all__ = ["expose", "import_names", "share"]
 
@@ -348,7 +349,7 @@ def _show_change(
     lines += [f"  {each.ros_name} [{each.type_name}] from {each.sender}" for each in offers or ()]
     show(fields, as_json=as_json, plain="\n".join(lines))
     for text in report.problems:
-        typer.echo(f"gdp: {text}", err=True)
+        echo(f"gdp: {text}", err=True)
 
 
 def _issued_fields(issued: IssuedDelegation) -> dict[str, object]:

@@ -18,6 +18,7 @@ from gdp.cli.tables import print_table, select_columns
 from gdp.errors import LocalError
 from gdp.management.control_client import NodeConnection, NotRunningError
 from gdp.management.running_nodes import RunningNode
+from gdp.terminal import echo
 
 __all__ = ["Table", "show_table"]
 
@@ -70,13 +71,13 @@ def show_table(what: What, node: OneNode = None, columns: Columns = None, as_jso
     """
     rows = _of_one(what, node) if node is not None else _of_all(what)
     if as_json:
-        typer.echo(json.dumps({"table": what.value, "rows": rows}))
+        echo(json.dumps({"table": what.value, "rows": rows}))
         return
     chosen = select_columns(rows, columns)
     if rows:
         print_table(rows, chosen)
     else:
-        typer.echo(f"gdp: the table {what.value} is empty", err=True)
+        echo(f"gdp: the table {what.value} is empty", err=True)
 
 
 def _of_one(what: Table, node: str) -> list[Mapping[str, object]]:

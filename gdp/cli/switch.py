@@ -38,6 +38,7 @@ from gdp.enrolment.addresses import default_directory
 from gdp.errors import LocalError
 from gdp.nodes.membership import load_member
 from gdp.nodes.switch import run_switch
+from gdp.terminal import echo
 
 __all__ = ["main"]
 
@@ -119,16 +120,16 @@ def _report_check(identity: Identity, ports: int, *, json: bool) -> None:
     if json:
         emit("checked", name=identity.name.to_text(), role=identity.role.value, ports=ports)
     else:
-        typer.echo(f"configuration good: {identity.role.value} {identity.name.short}, {ports} ports")
+        echo(f"configuration good: {identity.role.value} {identity.name.short}, {ports} ports")
 
 
 def _report_ready(identity: Identity, plane: str, reason: str, *, json: bool) -> None:
     if json:
         emit("ready", name=identity.name.to_text(), role=identity.role.value, data_plane=plane, reason=reason)
         return
-    typer.echo(f"{identity.role.value} {identity.name.short} is up, data plane {plane}; Ctrl-C ends it")
+    echo(f"{identity.role.value} {identity.name.short} is up, data plane {plane}; Ctrl-C ends it")
     if reason:
-        typer.echo(f"not the kernel data plane: {reason}")
+        echo(f"not the kernel data plane: {reason}")
 
 
 def main() -> None:

@@ -9,10 +9,9 @@ import shutil
 import sys
 from collections.abc import Mapping, Sequence
 
-import typer
-
 from gdp.errors import LocalError
 from gdp.names import NAME_BYTES, Name
+from gdp.terminal import echo
 
 __all__ = ["cell", "print_table", "select_columns"]
 
@@ -47,7 +46,7 @@ def print_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) ->
     width = shutil.get_terminal_size().columns if is_terminal else 0
     for line in [[column.upper() for column in columns], *cells]:
         text = "  ".join(word.ljust(size) for word, size in zip(line, widths, strict=True)).rstrip()
-        typer.echo(text if not width or len(text) <= width else text[: width - 1] + _LAST)
+        echo(text if not width or len(text) <= width else text[: width - 1] + _LAST)
 
 
 def cell(value: object, *, is_short: bool) -> str:

@@ -20,8 +20,10 @@ from gdp.cli.output import show
 from gdp.cli.topic import Host, JsonLines, Sockets, answers_of
 from gdp.management.running_nodes import find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, rated_rows
+from gdp.printable import escaped
 from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction
+from gdp.terminal import echo
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -102,9 +104,9 @@ def _print_json(rounds: Iterator[list[RatedRow]]) -> None:
 def _print_lines(rounds: Iterator[list[RatedRow]]) -> None:
     for number, rows in enumerate(rounds):
         if number:
-            typer.echo()
+            echo()
         for line in columns(_HEAD, [_cells(row) for row in rows]):
-            typer.echo(line)
+            echo(line)
         sys.stdout.flush()
 
 
@@ -130,5 +132,5 @@ def _table(rows: Sequence[RatedRow], space: int) -> Table:
     for at, heading in enumerate(_HEAD):
         drawn.add_column(heading, no_wrap=True, justify="right" if 2 <= at <= 7 else "left")
     for row in rows[:space]:
-        drawn.add_row(*map(Text, _cells(row)), style="red" if row.lost or row.late else None)
+        drawn.add_row(*(Text(escaped(each)) for each in _cells(row)), style="red" if row.lost or row.late else None)
     return drawn

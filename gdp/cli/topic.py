@@ -24,6 +24,7 @@ from gdp.nodes.membership import load_member
 from gdp.session.settings import settings_of
 from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
+from gdp.terminal import echo
 
 __all__ = ["Host", "JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
 
@@ -100,9 +101,9 @@ def list_topics(
             show(row.to_fields(), as_json=True)
         return
     for line in columns(_HEAD, [_cells(row) for row in shown]):
-        typer.echo(line)
+        echo(line)
     if held := len(rows) - len(shown):
-        typer.echo(f"{held} more held and not used; --all shows them", err=True)
+        echo(f"{held} more held and not used; --all shows them", err=True)
 
 
 @app.command(no_args_is_help=True)
@@ -124,11 +125,11 @@ def info(
     """
     rows = [row for row in _measured(seconds, socket, node, is_host=host) if _fits(row, name, type_name)]
     if not rows:
-        typer.echo(f"gdp: {name}: no running node of this machine knows it; 'gdp topic list --all' shows all", err=True)
+        echo(f"gdp: {name}: no running node of this machine knows it; 'gdp topic list --all' shows all", err=True)
         raise typer.Exit(_UNKNOWN)
     for at, row in enumerate(rows):
         if at and not as_json:
-            typer.echo()
+            echo()
         show(row.to_fields() if as_json else _described(row), as_json=as_json)
 
 
@@ -141,12 +142,12 @@ def answers_of(sockets: Sequence[Path], *, is_host: bool, is_needed: bool = True
     found = find_running_nodes(sockets, is_host=is_host)
     answers = read_topics(found)
     for problem in found.problems:
-        typer.echo(f"gdp: left out: {problem}", err=True)
+        echo(f"gdp: left out: {problem}", err=True)
     if not answers and is_needed:
         raise none_runs(found)
     for answer in answers:
         if answer.left_out:
-            typer.echo(f"gdp: {answer.node.label}: {answer.left_out} names with fewer messages left out", err=True)
+            echo(f"gdp: {answer.node.label}: {answer.left_out} names with fewer messages left out", err=True)
     return found, answers
 
 
@@ -154,7 +155,7 @@ def none_runs(found: Found) -> typer.Exit:
     """Report that no node runs that could answer; return the end of the command, with exit code 3."""
     more = f"; {found.elsewhere} run in other network namespaces: --host asks them" if found.elsewhere else ""
     text = "no switch or proxy runs on this machine, as far as this user may see; start one, or use sudo"
-    typer.echo(f"gdp: {text}{more}", err=True)
+    echo(f"gdp: {text}{more}", err=True)
     return typer.Exit(_NOT_RUNNING)
 
 

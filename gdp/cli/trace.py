@@ -19,6 +19,7 @@ from gdp.cli.path_view import path_lines
 from gdp.cli.ping import NameText
 from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 __all__ = ["trace"]
 
@@ -57,11 +58,11 @@ def trace(name: NameText, timeout: Budget = 0.45, node: Node = None, as_json: op
             found.append({"right": place.right, **probe.path_to(place.node, time.monotonic() + timeout)})
             if not as_json:
                 for line in path_lines(name, found[-1]):
-                    typer.echo(line)
+                    echo(line)
     elapsed_ms = round(1e3 * (time.monotonic() - begun_s), 1)
     if as_json:
-        typer.echo(json.dumps({"name": asked.to_text(), "elapsed_ms": elapsed_ms, "paths": found}))
+        echo(json.dumps({"name": asked.to_text(), "elapsed_ms": elapsed_ms, "paths": found}))
     else:
-        typer.echo(f"traced in {elapsed_ms:.0f} ms")
+        echo(f"traced in {elapsed_ms:.0f} ms")
     if not all(path["answered"] for path in found):
         raise typer.Exit(_NOTHING_CAME)

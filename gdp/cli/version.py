@@ -12,6 +12,7 @@ import typer
 from typer.main import get_command
 
 import gdp
+from gdp.terminal import echo
 
 __all__ = ["HELP", "Version", "versioned", "with_version"]
 
@@ -20,7 +21,7 @@ HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-c
 
 def _print_and_end(context: typer.Context, is_wanted: bool) -> None:
     if is_wanted:
-        typer.echo(f"{context.find_root().info_name} {gdp.__version__}")
+        echo(f"{context.find_root().info_name} {gdp.__version__}")
         raise typer.Exit
 
 

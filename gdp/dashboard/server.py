@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import secrets
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 import orjson
 
+from gdp.access_token import is_access_token, new_access_token
 from gdp.dashboard.core.scene import Scene
 from gdp.dashboard.poller import Poller
 from gdp.errors import LocalError
@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 POLL_S: Final = 0.75  # with the time of a poll, a change is on the page within a second
 CLIENTS_MAX: Final = 8
 _LOOPBACK: Final = "127.0.0.1"
-_TOKEN_BYTES: Final = 24
 _REQUEST_MAX_BYTES: Final = 4_096
 _TRY_AGAIN: Final = 1013  # close code of the IANA registry
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
@@ -78,7 +77,7 @@ class DashboardServer:
         self.scene = Scene()
         self._poller = poller
         self._poll_s = poll_s
-        self._token = secrets.token_urlsafe(_TOKEN_BYTES) if token is None else token
+        self._token = new_access_token() if token is None else token
         self._files = page_files()
         self._clients = 0
         self._polled = asyncio.Condition()
@@ -142,7 +141,7 @@ class DashboardServer:
         if request.headers.get("Host") not in (host, f"localhost:{self.port}"):
             return _response(connection, HTTPStatus.FORBIDDEN)  # a name that points here: DNS rebinding
         token, _, name = request.path.removeprefix("/").partition("/")
-        if not secrets.compare_digest(token.encode(), self._token.encode()):
+        if not is_access_token(token, self._token):
             return _response(connection, HTTPStatus.NOT_FOUND)
         if name == "live":
             origin = request.headers.get("Origin")

@@ -21,6 +21,7 @@ from typing import Final
 
 from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
+from gdp.terminal import echo
 
 __all__ = ["Failures", "supervise"]
 
@@ -117,10 +118,10 @@ async def _log_output(process: asyncio.subprocess.Process, prefix: str) -> None:
         if len(rest) >= _LINE_MAX:
             lines, rest = [*lines, rest], b""
         for line in lines:
-            sys.stderr.write(f"{prefix}{line.decode(errors='replace')}\n")
+            echo(f"{prefix}{line.decode(errors='replace')}", err=True)
         sys.stderr.flush()
     if rest:
-        sys.stderr.write(f"{prefix}{rest.decode(errors='replace')}\n")
+        echo(f"{prefix}{rest.decode(errors='replace')}", err=True)
         sys.stderr.flush()
 
 

@@ -1,7 +1,8 @@
 """Capture files: pcap and pcapng to read, pcapng to write.
 
 I/O. Scapy reads, because it is here for the layers anyway. It writes no file of several link types, so the writer is
-here. Source: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng; LINKTYPE_WIRESHARK_UPPER_PDU (252) and its tags are
+here. What a block says of its length is checked before memory is asked for.
+Source: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng; LINKTYPE_WIRESHARK_UPPER_PDU (252) and its tags are
 those of Wireshark's ``epan/exported_pdu.h``::
 
     section    0A0D0D0A  length (4)  1A2B3C4D  1 (2)  0 (2)  -1 (8)                              length (4)
@@ -11,7 +12,11 @@ those of Wireshark's ``epan/exported_pdu.h``::
 
 from __future__ import annotations
 
+import contextlib
+import gzip
+import os
 import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol, cast
@@ -25,6 +30,7 @@ __all__ = ["ETHERNET", "LONGEST_BYTES", "CapturedFrame", "PcapngWriter", "read_c
 
 ETHERNET: Final = 1
 LONGEST_BYTES: Final = 1 << 18  # Wireshark refuses longer frames
+_BLOCK_MAX_BYTES: Final = 16 << 20  # of pcapng: a frame, its comments, names or secrets
 _EXPORTED: Final = 252
 _MAGICS: Final = frozenset(map(bytes.fromhex, ("a1b2c3d4", "d4c3b2a1", "a1b23c4d", "4d3cb2a1", "0a0d0d0a")))
 _GZIP: Final = b"\x1f\x8b"
@@ -62,6 +68,36 @@ class _NgFacts(Protocol):
     ifname: bytes | str | None
 
 
+class _BoundedFile:
+    """Part of a file's interface that Scapy reads by, which never asks for more bytes than the file has left.
+
+    Raises:
+        LocalError: a block is said to be longer than 16 MiB.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._raw = path.open("rb")
+        is_packed = self._raw.peek(2)[:2] == _GZIP
+        self._file: BinaryIO = cast("BinaryIO", gzip.GzipFile(fileobj=self._raw)) if is_packed else self._raw
+        self._left_bytes = _BLOCK_MAX_BYTES if is_packed else os.fstat(self._raw.fileno()).st_size
+        self._is_packed = is_packed
+
+    def read(self, size: int = -1) -> bytes:
+        """Return the next bytes, fewer at the end of the file."""
+        if not 0 <= size <= _BLOCK_MAX_BYTES:
+            raise LocalError(f"{self.name}: a block is said to have {size} bytes, more than {_BLOCK_MAX_BYTES}")
+        data = self._file.read(min(size, self._left_bytes))
+        if not self._is_packed:
+            self._left_bytes -= len(data)
+        return data
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        self._raw.close()
+
+
 def read_capture(path: Path) -> Iterator[CapturedFrame]:
     """Yield the frames of a pcap or pcapng file; an incomplete last one is left out.
 
@@ -69,11 +105,11 @@ def read_capture(path: Path) -> Iterator[CapturedFrame]:
         LocalError: the file cannot be read, or is no capture.
     """
     try:
-        with path.open("rb") as file:
+        with contextlib.closing(_BoundedFile(path)) as file:
             magic = file.read(4)
-        if magic not in _MAGICS and magic[:2] != _GZIP:
+        if magic not in _MAGICS:
             raise LocalError(f"{path}: neither pcap nor pcapng")
-        with RawPcapReader(str(path)) as reader:
+        with contextlib.closing(_BoundedFile(path)) as file, RawPcapReader(cast("str", file)) as reader:
             for data, read in reader:
                 if isinstance(reader, RawPcapNgReader):
                     facts = cast("_NgFacts", read)
@@ -84,7 +120,7 @@ def read_capture(path: Path) -> Iterator[CapturedFrame]:
                 else:
                     stamp_ns = read.sec * _NS + read.usec * (1 if reader.nano else 1_000)
                     yield CapturedFrame(reader.linktype, "", stamp_ns, data, read.wirelen)
-    except (OSError, Scapy_Exception) as error:
+    except (OSError, EOFError, zlib.error, Scapy_Exception) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise LocalError(f"{path}: {reason}") from error
 

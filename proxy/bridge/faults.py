@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
-from proxy.printable import printable
+from gdp.printable import printable
 
 __all__ = ["Fault", "Faults"]
 

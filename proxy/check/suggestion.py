@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.printable import printable
 from gdp.ros_names import Kind, is_of_every_node
 from proxy.bridge.core.action_interface import action_of
 from proxy.endpoints.core.endpoint import Graph, Role
-from proxy.printable import printable
 
 __all__ = ["Offered", "Traffic", "offered_names", "suggested_file"]
 

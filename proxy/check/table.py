@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from gdp.printable import escaped
 from proxy.check.core.finding import Finding, Match
 
 __all__ = ["table"]
@@ -28,7 +29,7 @@ def table(findings: Sequence[Finding]) -> Group:
         if not finding.matches:
             drawn.add_row(rule, "-", style="dim")
         for match in finding.matches:
-            drawn.add_row(rule, *map(Text, _cells(match)), style=_style(match))
+            drawn.add_row(rule, *(Text(escaped(each)) for each in _cells(match)), style=_style(match))
     return Group(drawn, *_lines(findings))
 
 

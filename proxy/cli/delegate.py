@@ -22,6 +22,7 @@ from gdp.errors import LocalError, StatementError
 from gdp.limits import CHAIN_MAX
 from gdp.stores.issue import DELEGATION_DAYS, delegate
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner, save_delegation
+from gdp.terminal import echo
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
@@ -75,7 +76,7 @@ def delegate_what_is_needed(
                     save_delegation(machine.config.delegations, _made(owner, card, need, held, days), force=True)
                 _tell(file, need, is_new=is_new, json=json)
             for rule in unmet([*machine.config.expose, *machine.config.imports], key, found):
-                typer.echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
+                echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -97,7 +98,7 @@ def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], con
     if len(missing) == len(files):
         raise LocalError("\n".join(missing))
     for text in missing:
-        typer.echo(text, err=True)
+        echo(text, err=True)
 
 
 def _owners_named(file: Path) -> str:
@@ -143,7 +144,7 @@ def _tell(file: Path, need: RequiredDelegation, *, is_new: bool, json: bool) -> 
         emit("delegated" if is_new else "held", file=str(file), **fields)
         return
     kind, name, type_name = (need.metadata[key] for key in ("kind", "name", "type"))
-    typer.echo(f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]")
+    echo(f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]")
 
 
 if __name__ == "__main__":

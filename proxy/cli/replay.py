@@ -35,6 +35,7 @@ from gdp.cli.node import (
 )
 from gdp.cli.version import HELP, Version
 from gdp.errors import LocalError
+from gdp.terminal import echo
 from proxy.check.command import check_proxy
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
@@ -112,7 +113,7 @@ def _failing_decoder() -> Iterator[None]:
         yield
     except RecordingError as error:
         hint = f" (see --{error.limit})" if error.limit else ""
-        typer.echo(f"error: {error}{hint}", err=True)
+        echo(f"error: {error}{hint}", err=True)
         raise typer.Exit(1) from error
 
 
@@ -200,13 +201,13 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
     best_effort = replay.best_effort()
     if best_effort:
         lines.append(f"{replay.sent_best_effort} messages sent best effort, not confirmed")
-    typer.echo("; ".join(lines) or "0 messages sent")
+    echo("; ".join(lines) or "0 messages sent")
     for stats in best_effort:
-        typer.echo(f"  {stats.words()}")
+        echo(f"  {stats.words()}")
     if reader.unread:
-        typer.echo(f"not all of the recording could be read: {reader.unread}", err=True)
+        echo(f"not all of the recording could be read: {reader.unread}", err=True)
     for each in unconfirmed:
-        typer.echo(each.words(), err=True)
+        echo(each.words(), err=True)
 
 
 def _topic_fields(replay: Replay) -> list[dict[str, object]]:

@@ -14,6 +14,7 @@ import typer
 from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import HELP, Version
 from gdp.links.uplink import wait_for_device
+from proxy.cli.door_token import NoToken, TokenFile, door_token
 from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
 
 __all__ = ["main"]
@@ -37,6 +38,8 @@ def rosbridge(
     node: DoorNode,
     listen: Listen = LISTEN,
     origin: Origins = [],  # noqa: B006  # typer copies it
+    token_file: TokenFile = None,
+    no_token: NoToken = False,
     iface: Iface = None,
     delegations: Delegations = None,
     await_iface: AwaitIface = 0.0,
@@ -58,7 +61,8 @@ def rosbridge(
         from proxy.node.door import door_config, run_door
 
         config, _ = door_config(node, iface, delegations)
-        settings = DoorSettings(label="rosbridge", listen=listen, origins=tuple(origin))
+        token = door_token(token_file, no_token=no_token)
+        settings = DoorSettings(label="rosbridge", listen=listen, origins=tuple(origin), token=token)
         wait_for_device(config.iface, await_iface)
         run_door(
             config,

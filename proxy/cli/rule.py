@@ -16,9 +16,11 @@ import yaml
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.cli.salt import NAME_SALT, SALT
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
+from gdp.terminal import echo
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 
 __all__ = ["app", "main"]
@@ -79,6 +81,8 @@ def add(
         keys = {"kind": kind, **keys, **({"type": type_} if type_ else {}), "owner": str(owner)}
         for text in settings:
             key, value = _setting(text)
+            if isinstance(value, dict) and SALT in value:
+                raise NAME_SALT.refused(f"--set {key}={{salt: ...}}", "--set salt_file=FILE")
             if key in keys:
                 raise LocalError(f"--set {key}: it is stated already")
             keys[key] = value
@@ -161,5 +165,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp rule")
     except GdpError as error:
-        typer.echo(f"gdp: {error}", err=True)
+        echo(f"gdp: {error}", err=True)
         sys.exit(2)

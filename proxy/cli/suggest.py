@@ -16,6 +16,7 @@ from rich.table import Table
 
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
+from gdp.printable import printable
 from gdp.stores.files import public, write_all
 from proxy.check.graph_snapshot import LOOK_S
 from proxy.check.suggestion import Offered, offered_names, suggested_file
@@ -23,7 +24,6 @@ from proxy.check.traffic import measured
 from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import Graph, RosEndpoint, proxy_node_name
 from proxy.endpoints.live import open_endpoint
-from proxy.printable import printable
 
 __all__ = ["suggest"]
 

@@ -17,6 +17,7 @@ import typer
 
 from gdp.cli.completion import complete_node
 from gdp.errors import GdpError
+from gdp.terminal import echo, for_stdout
 from gdp.trust.right import Right
 
 __all__ = [
@@ -73,7 +74,7 @@ def ending_quietly() -> Iterator[None]:
     try:
         yield
     except NoAnswerError as error:
-        typer.echo(f"error: {error}", err=True)
+        echo(f"error: {error}", err=True)
         raise typer.Exit(1) from error
     except BrokenPipeError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush has no reader
@@ -82,11 +83,10 @@ def ending_quietly() -> Iterator[None]:
 
 def print_json(fields: Mapping[str, object]) -> None:
     """Print one line of JSON, and flush it."""
-    sys.stdout.buffer.write(orjson.dumps(dict(fields)) + b"\n")
-    sys.stdout.buffer.flush()
+    print_text(orjson.dumps(dict(fields)).decode())
 
 
 def print_text(text: str) -> None:
     """Print text and a line feed, and flush it."""
-    sys.stdout.buffer.write(text.encode("utf-8", "backslashreplace") + b"\n")
+    sys.stdout.buffer.write(for_stdout(text).encode("utf-8", "backslashreplace") + b"\n")
     sys.stdout.buffer.flush()

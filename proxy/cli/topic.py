@@ -6,7 +6,6 @@ I/O; ``gdp`` loads them, since the package ``gdp`` does not know ``proxy``.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from gdp import terminal
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
 from gdp.errors import RemoteError
 from gdp.trust.right import Right
@@ -176,7 +176,7 @@ def echo(
         printer = _Printer(1 if once else count, None if full else truncate, is_json=json)
         _read(access, printer.print, printer.tick(access, timeout))
         if printer.is_silent:
-            print(f"error: {name}: no message within {timeout:g} s", file=sys.stderr)  # noqa: T201
+            terminal.echo(f"error: {name}: no message within {timeout:g} s", err=True)
             raise typer.Exit(1)
 
 
@@ -199,7 +199,7 @@ class _Printer:
         try:
             self._print(channel, raw)
         except RemoteError as error:
-            print(f"error: {channel.topic}: {error.detail}", file=sys.stderr)  # noqa: T201
+            terminal.echo(f"error: {channel.topic}: {error.detail}", err=True)
             return
         if self._left is not None:
             self._left -= 1
@@ -252,7 +252,7 @@ class _Hint:
         publishers = len(bridge.publishers_of(self._access.name))
         seen = f"{publishers} publishers, none of them sends" if publishers else "no publisher is known"
         text = f"{self._access.rule.name}: no message within {_SILENT_S:g} s; {seen}; still waiting"
-        print(text, file=sys.stderr)  # noqa: T201
+        terminal.echo(text, err=True)
 
 
 def _readable(
@@ -300,7 +300,7 @@ def _measure(
 
     _read(access, take, tick)
     if duration_s is not None and not is_measured:
-        print(f"error: {access.rule.name}: fewer than two messages within {duration_s:g} s", file=sys.stderr)  # noqa: T201
+        terminal.echo(f"error: {access.rule.name}: fewer than two messages within {duration_s:g} s", err=True)
         raise typer.Exit(1)
 
 

@@ -23,6 +23,7 @@ from gdp.management.control_client import NotRunningError, ask_node, find_contro
 from gdp.ros_names import covers, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles
 from gdp.state.control_protocol import Command
+from gdp.terminal import echo
 from proxy.bridge.liveliness import LivelinessEvent, LivelinessTracker, NameLiveliness, names_from_fields
 
 __all__ = ["app", "main"]
@@ -82,7 +83,7 @@ def watch(
         with contextlib.suppress(KeyboardInterrupt):
             _follow(name, socket, deadline, duration, count, as_json=as_json)
     except NotRunningError as error:
-        typer.echo(f"gdp: {error}", err=True)
+        echo(f"gdp: {error}", err=True)
         raise typer.Exit(_NOT_RUNNING) from error
 
 
@@ -96,10 +97,10 @@ def _follow(
     while True:
         names, more = _names(socket)
         if more and not is_known:
-            typer.echo(f"gdp: this proxy carries {more} names more than one answer holds; they are left out", err=True)
+            echo(f"gdp: this proxy carries {more} names more than one answer holds; they are left out", err=True)
         found = [each for each in names if covers(name, each.local) or covers(name, each.shared)]
         if not found and not is_known and not as_json:
-            typer.echo(f"gdp: {name}: this proxy carries no such name yet; 'gdp-proxy --check' says why", err=True)
+            echo(f"gdp: {name}: this proxy carries no such name yet; 'gdp-proxy --check' says why", err=True)
         is_known = True
         for event in tracker.update(found, time.monotonic()):
             _print(event, as_json=as_json)
@@ -126,10 +127,10 @@ def _names(socket: Path) -> tuple[list[NameLiveliness], int]:
 def _print(event: LivelinessEvent, *, as_json: bool) -> None:
     now = datetime.now(timezone.utc)
     if as_json:
-        typer.echo(json.dumps({"time": now.isoformat().replace("+00:00", "Z"), **event.to_fields()}))
+        echo(json.dumps({"time": now.isoformat().replace("+00:00", "Z"), **event.to_fields()}))
     else:
         clock = now.astimezone().strftime("%H:%M:%S")
-        typer.echo(f"{clock}  {event.name}  {event.role} {event.node[:_NODE_CHARS]} {event.change}")
+        echo(f"{clock}  {event.name}  {event.role} {event.node[:_NODE_CHARS]} {event.change}")
     sys.stdout.flush()
 
 
@@ -138,5 +139,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp watch")
     except GdpError as error:
-        typer.echo(f"gdp: {error}", err=True)
+        echo(f"gdp: {error}", err=True)
         sys.exit(2)

@@ -43,7 +43,7 @@ class ClientQueue:
     Attributes:
         dropped: messages dropped so far.
         dropped_bytes: their bytes.
-        is_overrun: the control messages exceed their bound.
+        is_overrun: the control messages exceed their bound, or the queues of all clients do and this one has most.
     """
 
     def __init__(self, data_max_bytes: int = DATA_MAX_BYTES, data_max_messages: int = DATA_MAX_MESSAGES) -> None:
@@ -64,11 +64,16 @@ class ClientQueue:
         """Return the bytes of the messages of subscriptions."""
         return self._held_bytes
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Return the bytes of everything that waits."""
+        return self._held_bytes + self._control_bytes
+
     def put_control(self, payload: str | bytes) -> None:
         """Add a message that must arrive."""
         self._control.append(payload)
         self._control_bytes += len(payload)
-        self.is_overrun = self._control_bytes > CONTROL_MAX_BYTES
+        self.is_overrun |= self._control_bytes > CONTROL_MAX_BYTES
 
     def put(self, key: int, stamp_ns: int, raw: bytes, depth: int = 0) -> None:
         """Add a message of a subscription; drop the oldest ones that exceed a bound.

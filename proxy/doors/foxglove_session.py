@@ -12,7 +12,7 @@ from typing import Final
 from gdp.errors import DropReason, RemoteError
 from proxy.doors import foxglove_protocol as protocol
 from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.doors.hub import Hub, Publication, TopicType
+from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
 from proxy.doors.parameter_calls import ParameterCall, ParameterCalls
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
@@ -21,6 +21,7 @@ __all__ = ["FoxgloveSession"]
 
 SUBSCRIPTIONS_MAX: Final = 4_096
 CALLS_MAX: Final = 1_024
+SCHEMAS_MAX: Final = 4 << 20  # characters of the schemas of a client's channels
 _SLOW: Final = "slow"  # number of the status that tells of dropped messages
 
 
@@ -81,7 +82,7 @@ class FoxgloveSession:
 
     def tell_wrong(self, reason: str) -> None:
         """Report an error."""
-        self.queue.put_control(protocol.status(protocol.ERROR, reason))
+        self.queue.put_control(protocol.status(protocol.ERROR, reason[:REASON_MAX]))
 
     def tell_dropped(self, total: int) -> None:
         """Report the messages that were dropped, in a status that replaces the earlier one."""
@@ -196,6 +197,8 @@ class FoxgloveSession:
             reason = f"{channel.type_name} is no standard type: state its schema, with schemaEncoding ros2msg"
         elif len(self._channels) >= SUBSCRIPTIONS_MAX:
             reason = f"more than {SUBSCRIPTIONS_MAX} channels"
+        elif sum(len(each.schema) for each in self._channels.values()) + len(channel.schema) > SCHEMAS_MAX:
+            reason = f"the schemas of this client have more than {SCHEMAS_MAX} characters"
         if reason:
             self.tell_wrong(f"advertise {channel.topic}: {reason}")
             return

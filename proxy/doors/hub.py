@@ -27,11 +27,12 @@ from proxy.endpoints.core.qos import DEPTH_MAX, default, depth_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = ["DoorSession", "Hub", "Publication", "Rights", "TopicType"]
+__all__ = ["REASON_MAX", "DoorSession", "Hub", "Publication", "Rights", "TopicType"]
 
+REASON_MAX: Final = 4_096  # characters of an error that a client hears: it may repeat what the client sent
 REPLACED_S: Final = 0.5  # a publisher that is closed and opened again within this time keeps its number
 _EARLY_MAX: Final = 64
-_EARLY_MAX_BYTES: Final = 16 << 20
+_EARLY_MAX_BYTES: Final = 16 << 20  # of all topics
 _HIDDEN: Final = "/_gdp_proxy"  # presence topics of proxies
 
 TopicType: TypeAlias = "tuple[str, str]"
@@ -307,8 +308,9 @@ class Hub:
         if not handles:
             early = self._early.setdefault((topic, type_name), deque())
             early.append((stamp_ns, raw))
-            if len(early) > _EARLY_MAX or sum(len(each) for _, each in early) > _EARLY_MAX_BYTES:
-                early.popleft()
+            waiting_bytes = sum(len(each) for kept in self._early.values() for _, each in kept)
+            while early and (len(early) > _EARLY_MAX or waiting_bytes > _EARLY_MAX_BYTES):
+                waiting_bytes -= len(early.popleft()[1])
                 self.dropped_otherwise += 1
 
     def update_graph(self) -> None:

@@ -23,6 +23,7 @@ __all__ = ["ParameterCall", "ParameterCalls"]
 Done: TypeAlias = "Callable[[Mapping[str, object]], None]"
 _LIST_MAX: Final = 4_096
 _CALLS_MAX: Final = 1_024
+_CALLS_MAX_BYTES: Final = 8 << 20  # of the requests under way, whose names are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +31,7 @@ class ParameterCall:
     """Context of a service call under way."""
 
     service: Service
+    size_bytes: int  # of the request
     done: Done
     failed: Callable[[str], None]
 
@@ -62,6 +64,7 @@ class ParameterCalls:
         self._tell_values = tell_values
         self._tell_wrong = tell_wrong
         self._open = 0  # calls under way
+        self._open_bytes = 0
 
     def get(self, parameters: Sequence[str], number: str | None) -> None:
         """Read parameters; without names, all of every node. Raises ``RemoteError``: a name has another form."""
@@ -122,12 +125,12 @@ class ParameterCalls:
 
     def pass_refusal(self, call: ParameterCall, reason: str) -> None:
         """Process the reason of a failed call."""
-        self._open -= 1
+        self._end(call)
         call.failed(reason)
 
     def pass_answer(self, call: ParameterCall, raw: bytes) -> None:
         """Process a response."""
-        self._open -= 1
+        self._end(call)
         try:
             result = orjson.loads(RosbridgeCodec(call.service.response).to_json(raw))
         except GdpError as error:
@@ -184,8 +187,16 @@ class ParameterCalls:
         except GdpError as error:
             failed(str(error))
             return
+        if self._open_bytes + len(raw) > _CALLS_MAX_BYTES:
+            failed(f"{name}: the calls under way have more than {_CALLS_MAX_BYTES} bytes")
+            return
         self._open += 1
-        self._hub.request(self._session, handle, ParameterCall(service, done, failed), raw)
+        self._open_bytes += len(raw)
+        self._hub.request(self._session, handle, ParameterCall(service, len(raw), done, failed), raw)
+
+    def _end(self, call: ParameterCall) -> None:
+        self._open -= 1
+        self._open_bytes -= call.size_bytes
 
 
 def _by_node(parameters: Sequence[str]) -> dict[str, list[str]]:

@@ -70,7 +70,10 @@ def to_value(parameter: Mapping[str, object]) -> dict[str, object]:
     if kind in (_DOUBLE, _ARRAY[_DOUBLE]):
         value = [float(each) for each in value] if isinstance(value, list) else float(str(value))
     if kind == _BYTES:
-        value = list(base64.b64decode(str(value)))
+        try:
+            value = list(base64.b64decode(str(value)))
+        except ValueError as error:
+            raise RemoteError(DropReason.MALFORMED, "a byte_array is base64 text") from error
     return {"type": kind, _FIELDS[kind][0]: value}
 
 

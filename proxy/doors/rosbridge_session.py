@@ -16,7 +16,7 @@ import orjson
 from gdp.errors import DropReason, GdpError, LocalError, RemoteError
 from gdp.ros_names import resolved
 from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.doors.hub import Hub, Publication, TopicType
+from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
 from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
 from proxy.doors.throttle import Throttle
 from proxy.serial.bounded_cache import BoundedCache, digest_of
@@ -25,7 +25,7 @@ from proxy.serial.service import Service
 
 __all__ = ["RosbridgeSession"]
 
-SUBSCRIPTIONS_MAX: Final = 4_096
+IDS_MAX: Final = 4_096  # of all subscriptions and advertised topics
 CALLS_MAX: Final = 1_024
 _TEXT_MAX: Final = 1_024
 _QUEUE_MAX: Final = 1_024
@@ -66,7 +66,7 @@ class _Subscription:
 class _Call:
     service: Service
     name: str  # as the client writes it
-    number: object  # the client's id, whatever it is
+    number: object  # the client's id: a text or a number
 
 
 class RosbridgeSession:
@@ -84,6 +84,7 @@ class RosbridgeSession:
         self._readers: defaultdict[str, list[_Subscription]] = defaultdict(list)  # by topic
         self._published: dict[str, tuple[str, set[str]]] = {}  # topic to type and ids
         self._keys = 0
+        self._ids = 0  # of subscriptions and advertised topics
         self._calls = 0
         self._operations: Mapping[str, Callable[[dict[str, object]], None]] = {
             "subscribe": self._subscribe,
@@ -105,14 +106,15 @@ class RosbridgeSession:
             raise _wrong("a message that is not JSON") from error
         if not isinstance(fields, dict):
             raise _wrong("a message is a JSON object")
-        operation = self._operations.get(str(fields.get("op")))
+        name, number = _word(fields, "op"), _id(fields, None)
+        operation = self._operations.get(name)
         if operation is None:
             known = ", ".join(self._operations)
-            raise _wrong(f"operation {fields.get('op')!r} is not supported; supported are {known}"[:300])
+            raise _wrong(f"operation {name!r} is not supported; supported are {known}"[:300])
         try:
             operation(fields)
         except GdpError as error:
-            self._tell("error", str(error), fields.get("id"))
+            self._tell("error", str(error), number)
 
     def tell_wrong(self, reason: str) -> None:
         """Report an error."""
@@ -208,7 +210,7 @@ class RosbridgeSession:
             self._respond(context.name, context.number, reason, result=False)
 
     def _subscribe(self, fields: dict[str, object]) -> None:
-        name, number = _word(fields, "topic"), str(fields.get("id", ""))
+        name, number = _word(fields, "topic"), str(_id(fields))
         topic = resolved(name)
         type_name = _type(_word(fields, "type", is_optional=True), "msg")
         period_s = _number(fields, "throttle_rate", _PERIOD_MAX_MS) / 1e3
@@ -219,16 +221,14 @@ class RosbridgeSession:
         if reason := self._hub.rights().may_read(topic, type_name):
             raise LocalError(f"subscribe {topic}: {reason}")
         each = self._subscriptions.get(name)
+        if each is None or number not in each.wishes:
+            self._take_id(f"subscribe {topic}")
         if each is None:
-            if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
-                raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} topics")
             self._keys += 1
             each = self._subscriptions[name] = _Subscription(self._keys, topic, type_name)
             self._names[each.key] = name
             self._readers[topic].append(each)
         is_new = not each.wishes
-        if len(each.wishes) >= SUBSCRIPTIONS_MAX:
-            raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} ids")
         each.wishes[number] = (period_s, queue_length, compression)
         each.merge()
         if is_new and (offered := self._offered.get(topic)) is not None:
@@ -241,10 +241,12 @@ class RosbridgeSession:
         each = self._subscriptions.get(name)
         if each is None:
             raise LocalError(f"unsubscribe {name}: it is not subscribed")
+        before = len(each.wishes)
         if "id" in fields:
-            each.wishes.pop(str(fields["id"]), None)
+            each.wishes.pop(str(_id(fields)), None)
         else:
             each.wishes.clear()
+        self._ids -= before - len(each.wishes)
         if each.wishes:
             each.merge()
             return
@@ -259,10 +261,11 @@ class RosbridgeSession:
         topic, type_name = resolved(_word(fields, "topic")), _type(_word(fields, "type"), "msg")
         if reason := self._hub.rights().may_publish(topic, type_name):
             raise LocalError(f"advertise {topic}: {reason}")
-        if len(self._published) >= SUBSCRIPTIONS_MAX:
-            raise LocalError(f"advertise {topic}: more than {SUBSCRIPTIONS_MAX} topics")
+        number = str(_id(fields))
+        if topic not in self._published or number not in self._published[topic][1]:
+            self._take_id(f"advertise {topic}")
         _, numbers = self._published.setdefault(topic, (type_name, set()))
-        numbers.add(str(fields.get("id", "")))
+        numbers.add(number)
         self._hub.update_graph()
 
     def _unadvertise(self, fields: dict[str, object]) -> None:
@@ -270,10 +273,18 @@ class RosbridgeSession:
         if topic not in self._published:
             raise LocalError(f"unadvertise {topic}: it is not advertised")
         numbers = self._published[topic][1]
-        numbers.discard(str(fields.get("id", "")))
-        if not numbers or "id" not in fields:
+        gone = {str(_id(fields))} & numbers if "id" in fields else set(numbers)
+        numbers -= gone
+        self._ids -= len(gone)
+        if not numbers:
             del self._published[topic]
             self._hub.update_graph()
+
+    def _take_id(self, what: str) -> None:
+        """Count one more id. Raises ``LocalError``: the client has too many."""
+        if self._ids >= IDS_MAX:
+            raise LocalError(f"{what}: more than {IDS_MAX} ids")
+        self._ids += 1
 
     def _publish(self, fields: dict[str, object]) -> None:
         topic = resolved(_word(fields, "topic"))
@@ -288,7 +299,7 @@ class RosbridgeSession:
         self._hub.input(topic, type_name, self._received_ns, raw)
 
     def _call(self, fields: dict[str, object]) -> None:
-        name, number = _word(fields, "service"), fields.get("id")
+        name, number = _word(fields, "service"), _id(fields, None)
         full, args = resolved(name), fields.get("args", {})
         if full.startswith(_ROSAPI):
             self._rosapi(name, full.removeprefix(_ROSAPI), number, args if isinstance(args, dict) else {})
@@ -338,10 +349,11 @@ class RosbridgeSession:
     def _tell(self, level: str, text: str, number: object) -> None:
         if _LEVELS.index(level) <= self._level:
             named = {} if number is None else {"id": number}
-            self.queue.put_control(_text(op="status", level=level, msg=text, **named))
+            self.queue.put_control(_text(op="status", level=level, msg=text[:REASON_MAX], **named))
 
     def _respond(self, service: str, number: object, values: object, *, result: bool) -> None:
         named = {} if number is None else {"id": number}
+        values = values[:REASON_MAX] if isinstance(values, str) else values
         self.queue.put_control(_text(op="service_response", service=service, values=values, result=result, **named))
 
 
@@ -381,6 +393,14 @@ def _word(fields: dict[str, object], key: str, *, is_optional: bool = False) -> 
     if not isinstance(value, str) or len(value) > _TEXT_MAX:
         raise _wrong(f"{key}: a text of at most {_TEXT_MAX} characters was expected")
     return value
+
+
+def _id(fields: dict[str, object], default: object = "") -> object:
+    """Return the client's id of a request, as it is to be repeated. Raises ``RemoteError``: it is no text or number."""
+    value = fields.get("id", default)
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    return _word(fields, "id") if "id" in fields else value
 
 
 def _number(fields: dict[str, object], key: str, limit: int) -> int:

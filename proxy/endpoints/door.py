@@ -2,7 +2,8 @@
 
 I/O. A thread runs the WebSocket server (the library ``websockets``) and the hub; the bridge's thread passes commands to
 it and takes events from it. Each client has a task that sends what its queue holds, so a slow client delays its own
-messages only. Browsers state the origin of the page that connects: only listed origins may.
+messages only. Browsers state the origin of the page that connects: only listed origins may. Every user of the host may
+connect, so a client states the token of the door in its URL.
 """
 
 from __future__ import annotations
@@ -16,32 +17,41 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from itertools import count
 from typing import TYPE_CHECKING, Final, TypeAlias
+from urllib.parse import quote
 
+from gdp.access_token import is_access_token, query_token
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
 from gdp.ports.listening import listen_tcp
+from proxy.doors.arrivals import Arrivals
 from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
 from proxy.doors.hub import DoorSession, Hub, Rights
 from proxy.doors.types import known_channel
-from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived
+from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
 __all__ = ["DoorEndpoint", "DoorSettings", "NewSession"]
 
 log = logging.getLogger(__name__)
+wire_log = logging.getLogger(f"{__name__}.wire")
+wire_log.setLevel(logging.INFO)  # the library's DEBUG has URLs with tokens, and what clients send
 
 NewSession: TypeAlias = "Callable[[Hub, int, ClientQueue], DoorSession]"
 
-INPUT_MAX_BYTES: Final = 64 << 20  # messages of clients that wait for the bridge
+INPUT_MAX_BYTES: Final = 64 << 20  # messages and requests of clients that wait for the bridge
 OUTPUT_MAX_BYTES: Final = 64 << 20  # messages of the bridge that wait for the server's thread
 MESSAGE_MAX_BYTES: Final = 32 << 20  # of one message of a client
+ARRIVING_MAX_BYTES: Final = 64 << 20  # of the messages of all clients that have not come whole yet
+WAITING_MAX_BYTES: Final = 256 << 20  # of what waits for all clients
 _REPORT_S: Final = 1.0  # at most one report of dropped messages a second
 _SILENT_S: Final = 60.0  # a client that answers no ping for so long is disconnected
 _TRY_AGAIN: Final = 1013  # close code of the IANA registry
@@ -55,12 +65,14 @@ class DoorSettings:
         listen: ``host:port``.
         origins: values of the header Origin that are accepted; a client without the header is no browser, and accepted.
         subprotocols: WebSocket subprotocols, one of which a client must speak; none: it needs no subprotocol.
+        token: that a client states in its URL; empty: all who reach the address have the rights of the door.
     """
 
     label: str
     listen: str
     origins: tuple[str, ...] = ()
     subprotocols: tuple[str, ...] = ()
+    token: str = field(default="", repr=False)
     clients_max: int = 64
     queue_max_bytes: int = DATA_MAX_BYTES
     queue_max_messages: int = DATA_MAX_MESSAGES
@@ -72,6 +84,9 @@ class _Client:
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     reported: int = 0  # dropped messages that the client knows of
     reported_at_s: float = 0.0
+
+    given_bytes: int = 0  # of what it sent to the bridge; written by the server's thread
+    taken_bytes: int = 0  # the same, by the bridge's thread
 
     @property
     def queue(self) -> ClientQueue:
@@ -90,7 +105,9 @@ class DoorEndpoint:
         require_extra("doors", ["websockets"], settings.label)
         self._settings = settings
         self._new_session = new_session
-        self._events: deque[Event] = deque()
+        self._events: deque[tuple[Event, _Client | None]] = deque()
+        self._speaker: _Client | None = None  # whose message is being processed
+        self._arrivals = Arrivals["ServerConnection"](ARRIVING_MAX_BYTES)
         self._input_bytes = 0  # written by the server's thread
         self._taken_bytes = 0  # written by the bridge's thread
         self._output_bytes = 0  # written by the bridge's thread
@@ -136,8 +153,17 @@ class DoorEndpoint:
     @property
     def label(self) -> str:
         """Return the display name."""
+        return f"{self._settings.label} {self._origin}"
+
+    @property
+    def url(self) -> str:
+        """Return the address for clients, with the token; ``label`` has none."""
+        return f"{self._origin}/?token={quote(self._settings.token)}" if self._settings.token else self._origin
+
+    @property
+    def _origin(self) -> str:
         host, port = self.address
-        return f"{self._settings.label} ws://{f'[{host}]' if ':' in host else host}:{port}"
+        return f"ws://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
     def is_live(self) -> bool:
@@ -164,9 +190,11 @@ class DoorEndpoint:
             os.eventfd_read(self._wake)
         events = list[Event]()
         while self._events:
-            event = self._events.popleft()
-            if isinstance(event, MessageReceived):
+            event, speaker = self._events.popleft()
+            if isinstance(event, MessageReceived | RequestReceived):
                 self._taken_bytes += len(event.raw)
+                if speaker is not None:
+                    speaker.taken_bytes += len(event.raw)
             events.append(event)
         return events
 
@@ -259,6 +287,9 @@ class DoorEndpoint:
 
     def _settle(self) -> None:
         """Wake the tasks that send, and set the timer."""
+        queues = [each.queue for each in self._clients.values()]
+        if sum(each.waiting_bytes for each in queues) > WAITING_MAX_BYTES:
+            max(queues, key=lambda each: each.waiting_bytes).is_overrun = True
         self._wake_clients()
         due_s = self._hub.get_timer()
         if due_s is None or (self._timer is not None and self._due_s <= due_s):
@@ -282,13 +313,24 @@ class DoorEndpoint:
             client.wake.set()
 
     def _emit(self, event: Event) -> None:
-        if isinstance(event, MessageReceived):
-            if self._input_bytes - self._taken_bytes > INPUT_MAX_BYTES:
+        speaker = self._speaker
+        if isinstance(event, MessageReceived | RequestReceived):
+            if not self._has_capacity(speaker, len(event.raw)):
                 self._lost += 1
+                if isinstance(event, RequestReceived):
+                    self._hub.pass_refusal(event.ticket, "the door has too much to do; call again later")
                 return
             self._input_bytes += len(event.raw)
-        self._events.append(event)
+            if speaker is not None:
+                speaker.given_bytes += len(event.raw)
+        self._events.append((event, speaker))
         os.eventfd_write(self._wake, 1)
+
+    def _has_capacity(self, speaker: _Client | None, size_bytes: int) -> bool:
+        """Return whether the bridge's input has capacity for one more message; a client never has more than is free."""
+        free_bytes = INPUT_MAX_BYTES - (self._input_bytes - self._taken_bytes)
+        own_bytes = 0 if speaker is None else speaker.given_bytes - speaker.taken_bytes
+        return size_bytes + own_bytes <= free_bytes
 
     def _run(self, started: threading.Event) -> None:
         try:
@@ -301,17 +343,37 @@ class DoorEndpoint:
             started.set()
 
     async def _serve(self, started: threading.Event) -> None:
-        from websockets.asyncio.server import serve
+        from websockets.asyncio.server import ServerConnection, serve
         from websockets.typing import Origin, Subprotocol
+
+        arrivals = self._arrivals
+
+        class Connection(ServerConnection):
+            """Connection whose bytes are counted before the library keeps them."""
+
+            def data_received(self, data: bytes) -> None:
+                """Process bytes of the client."""
+                for each in arrivals.receive(self, len(data)):
+                    log.info("client disconnected: its message does not end, and those of all exceed their bound")
+                    each.transport.abort()
+                super().data_received(data)
+
+            def connection_lost(self, exc: Exception | None) -> None:
+                """Process the end of the connection."""
+                arrivals.end(self)
+                super().connection_lost(exc)
 
         server = await serve(
             self._attend,
+            create_connection=Connection,
             sock=self._socket,
+            process_request=self._admit,
             origins=[None, *map(Origin, self._settings.origins)],
             subprotocols=[Subprotocol(each) for each in self._settings.subprotocols] or None,
             compression=None,
             max_size=MESSAGE_MAX_BYTES,
             ping_timeout=_SILENT_S,
+            logger=wire_log,
         )
         started.set()
         try:
@@ -319,6 +381,14 @@ class DoorEndpoint:
         finally:
             server.close()
             await server.wait_closed()
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return a refusal; None: the client knows the token."""
+        token = self._settings.token
+        if not token or is_access_token(query_token(request.path), token):
+            return None
+        log.info("client without the token refused")
+        return connection.respond(HTTPStatus.UNAUTHORIZED, "connect to the URL that the command of this door printed\n")
 
     async def _attend(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -333,10 +403,14 @@ class DoorEndpoint:
         sender = asyncio.create_task(self._send(connection, client))
         try:
             async for data in connection:
+                self._arrivals.end(connection)
+                self._speaker = client
                 try:
                     client.session.handle_message(data, time.time_ns())
                 except GdpError as error:
                     client.session.tell_wrong(str(error))
+                finally:
+                    self._speaker = None
                 self._settle()
         except ConnectionClosed as error:
             log.debug("client gone session=%d reason=%s", client.session.number, error)

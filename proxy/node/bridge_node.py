@@ -11,12 +11,11 @@ import time
 from pathlib import Path
 from typing import Final
 
-import typer
-
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
+from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge, FlowChange
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.desired_flows import FlowSpec
@@ -98,12 +97,12 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                 if median_ms is not None or stats.lost:
                     median = "-" if median_ms is None else f"{median_ms:.1f} ms"
                     lost = f", {stats.losses.words()}" if stats.losses.total else ""
-                    typer.echo(f"  {stats.topic}: {stats.received} received, median {median}{lost}")
+                    echo(f"  {stats.topic}: {stats.received} received, median {median}{lost}")
             for sent_stats in best_effort:
                 if not sent_stats.is_whole:
-                    typer.echo(f"  {sent_stats.words()}")
+                    echo(f"  {sent_stats.words()}")
             carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
-            typer.echo(f"{carried}, {node.faults.total} faults")
+            echo(f"{carried}, {node.faults.total} faults")
 
 
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
@@ -149,7 +148,7 @@ def _tell_change(change: FlowChange, *, json: bool) -> None:
     if json:
         emit("flow", change="begun" if change.is_begun else "ended", **_described(change.flow_spec))
     else:
-        typer.echo(f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}")
+        echo(f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}")
 
 
 def _line(flow_spec: FlowSpec) -> str:
@@ -162,9 +161,9 @@ def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
     if json:
         emit("ready", name=node.member.name.to_text())
         return
-    typer.echo(f"proxy {node.member.name.short} is attached, in {', '.join(bridge.labels)}; Ctrl-C ends it")
+    echo(f"proxy {node.member.name.short} is attached, in {', '.join(bridge.labels)}; Ctrl-C ends it")
     for flow_spec, _ in bridge.flows:
-        typer.echo(f"  {_line(flow_spec)}")
+        echo(f"  {_line(flow_spec)}")
 
 
 def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Final
 
 import orjson
-import typer
 from pydantic import ValidationError
 
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.session.settings import SessionConfig, settings_of
+from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.flow_fields import flow_fields
@@ -115,9 +115,7 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
         if json:
             emit("done", **totals, faults=dict(node.faults.counts))
         else:
-            typer.echo(
-                "{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals)
-            )
+            echo("{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals))
 
 
 def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorRules], *, json: bool) -> None:
@@ -141,9 +139,11 @@ def _tell_ready(node: ProxyNode, door: DoorEndpoint, rules: DoorRules, *, json: 
     if json:
         host, port = door.address
         reads, writes = [each.name for each in rules.imports], [each.name for each in rules.expose]
-        emit("ready", name=node.member.name.to_text(), host=host, port=port, reads=reads, publishes=writes)
+        emit(
+            "ready", name=node.member.name.to_text(), host=host, port=port, url=door.url, reads=reads, publishes=writes
+        )
         return
-    typer.echo(f"door {node.member.name.short} is attached, at {door.label}; Ctrl-C ends it")
+    echo(f"door {node.member.name.short} is attached, at {door.url}; Ctrl-C ends it")
     for verb, listed in (("offers", rules.imports), ("takes", rules.expose)):
         for rule in listed:
-            typer.echo(f"  {verb} {rule.kind} {rule.name} [{rule.type_name}]")
+            echo(f"  {verb} {rule.kind} {rule.name} [{rule.type_name}]")

@@ -10,10 +10,9 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-import typer
-
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
+from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.config.config import ProxyConfig, Record
@@ -102,7 +101,7 @@ def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: 
             if json:
                 emit("ready", name=node.member.name.to_text())
             else:
-                typer.echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
+                echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
         if time.monotonic() >= tick_at_s:
             tick_at_s = time.monotonic() + TICK_S
             if writer is not None:
@@ -127,8 +126,8 @@ def _report(topics: Sequence[TopicStats], writer: SplitWriter | None, *, json: b
         emit("done", topics=[stats.to_fields() for stats in topics], **about)
         return
     received, lost = sum(stats.received for stats in topics), sum(stats.lost for stats in topics)
-    typer.echo(f"{received} messages received, {lost} lost")
+    echo(f"{received} messages received, {lost} lost")
     for stats in topics:
         if stats.lost:
             refused = f", {stats.refused} not handed over" if stats.refused else ""
-            typer.echo(f"  {stats.topic}: {stats.received} received, {stats.losses.words()}{refused}")
+            echo(f"  {stats.topic}: {stats.received} received, {stats.losses.words()}{refused}")

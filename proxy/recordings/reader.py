@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Final
 
 from gdp.errors import ConfigError, LocalError, RemoteError
-from proxy.printable import printable
+from gdp.printable import printable
 from proxy.recordings.limits import BagLimits
 from proxy.recordings.process import BagProcess, Cost, RecordingError, StoppedError
 from proxy.recordings.source import ZSTD, Message

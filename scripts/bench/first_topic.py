@@ -39,7 +39,7 @@ WHOLE, ALL, FOREIGN = "first command to first image", "on all machines", "other 
 _SITES: Final = {"border": Access.PUBLIC, "robot": Access.PORT_RESTRICTED, "server": Access.PORT_RESTRICTED}
 _PATIENCE_S: Final = 120.0
 _DELAY_MS: Final = 10.0  # of each uplink, each way
-_JOIN: Final = re.compile(r"^gdp join (gdp1\S+)$", re.MULTILINE)
+_TOKEN: Final = re.compile(r"^gdp1\S+$", re.MULTILINE)
 _ENDPOINT: Final = str(Path(__file__).with_name("first_topic_endpoint.py"))
 _DONE: Final = {"gdp domain create": "listening on TCP port", "gdp join": "tunnels are up"}  # they go on running
 
@@ -60,14 +60,13 @@ class Tutorial:
     def type(self, command: TypedCommand) -> None:
         """Type a command; return when it has said that it is done, or has ended. Raises ``LocalError``: it fails."""
         text = command.text.replace(BORDER_HOST, self._border)
-        if "gdp1..." in text:
-            text = text.replace("gdp1...", self._tokens.pop(0))
-        shell = self.machines[command.machine].type(text)
+        answer = self._tokens.pop(0) if text.startswith("gdp join") else ""
+        shell = self.machines[command.machine].type(text, answer)
         try:
             self._wait(command, shell)
         except LocalError as error:
             raise FailedError(f"{command.machine}: {command.text}: {error}") from error
-        self._tokens += _JOIN.findall(shell.text)
+        self._tokens += _TOKEN.findall(shell.text)
 
     def _wait(self, command: TypedCommand, shell: Shell) -> None:
         done = next((words for start, words in _DONE.items() if command.text.startswith(start)), "")

@@ -7,6 +7,7 @@ nothing stays. Each command runs in a shell of its own, as in several terminals.
 from __future__ import annotations
 
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -124,11 +125,16 @@ class FreshMachine:
         entered = ["nsenter", f"--mount=/proc/{self._holder.pid}/ns/mnt", "--", "env", f"HOME={_HOME}", *argv]
         return self.host.command(entered)
 
-    def type(self, command: str) -> Shell:
-        """Start a command as a person types it in a root shell, in which the environment of Python is active."""
+    def type(self, command: str, answer: str = "") -> Shell:
+        """Start a command as a person types it in a root shell, in which the environment of Python is active.
+
+        Args:
+            answer: what the command gets when it asks; empty: it has the input of this program.
+        """
+        answered = f" <<< {shlex.quote(answer)}" if answer else ""
         path = f"{Path(sys.executable).parent}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
         environment = ["LANG=C.UTF-8", f"PATH={path}", f"PYTHONPATH={_ROOT}", f"HOME={_HOME}"]
         log = self._folder / f"{self.host.label}-{len(self._shells)}.log"
-        shell = Shell(self.command(["env", "-i", *environment, "bash", "-c", f"exec {command}"]), log)
+        shell = Shell(self.command(["env", "-i", *environment, "bash", "-c", f"exec {command}{answered}"]), log)
         self._shells.append(shell)
         return shell

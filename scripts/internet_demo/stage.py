@@ -122,11 +122,11 @@ class Stage:
         lease = self.cloud_b.lease()
         addresses = [each.partition("/")[0] for each in (lease.address, lease.address6)]
         public = [f"--public={Endpoint(each, LISTEN_PORT).to_text()}" for each in addresses]
-        return self._command(self.cloud_b, "domain", "create", _DOMAIN, *public).split()[-1]
+        return self._command(self.cloud_b, "domain", "create", _DOMAIN, *public).strip()
 
     def make_token(self) -> str:
         """Return a token for one more machine."""
-        return self.type_at(self.cloud_b, "domain", "token", _DOMAIN).split()[-1]
+        return self.type_at(self.cloud_b, "domain", "token", _DOMAIN).strip()
 
     def type_at(self, host: Host, *words: str) -> str:
         """Run a command of ``gdp`` about a machine on it; return its output."""
@@ -135,7 +135,7 @@ class Stage:
 
     def join(self, host: Host, token: str, *options: str) -> None:
         """Let a machine join by a token."""
-        self._command(host, "join", token, f"--label={host.label}", *options)
+        self._command(host, "join", f"--label={host.label}", *options, answer=token)
 
     def remove(self, label: str) -> None:
         """Remove a machine from the domain."""
@@ -191,11 +191,15 @@ class Stage:
     def _directory(self, host: Host) -> Path:
         return self._folder / host.label
 
-    def _command(self, host: Host, *words: str) -> str:
-        """Execute a command that makes a machine, without its last step; return its output."""
+    def _command(self, host: Host, *words: str, answer: str = "") -> str:
+        """Execute a command that makes a machine, without its last step; return its output.
+
+        Args:
+            answer: what the command gets when it asks.
+        """
         self._typed(host, words)
         directory = self._directory(host)
-        said = self._run(host, *words, f"--directory={directory}", "--no-start")
+        said = self._run(host, *words, f"--directory={directory}", "--no-start", answer=answer)
         self.machines[host.label] = Machine(host.label, host, directory)
         return said
 
@@ -203,10 +207,10 @@ class Stage:
         shown = " ".join(word if len(word) < _SHOWN else f"{word[: _SHOWN - 3]}..." for word in words)
         self.typed.append(f"{host.label}: gdp {shown}")
 
-    def _run(self, host: Host, *words: str) -> str:
+    def _run(self, host: Host, *words: str, answer: str = "") -> str:
         argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
         environment = python_environment(self.environments.get(host.label, {}))
-        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=environment)
+        done = subprocess.run(argv, input=answer, capture_output=True, check=False, text=True, env=environment)
         if done.returncode:
             raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
         return done.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import subprocess
 import sys
 import zipfile
@@ -15,6 +16,7 @@ from fog.providers.cloud_init import Setup, placed
 from fog.site import SiteConfig
 from gdp.errors import ConfigError, LocalError
 from tests.fog.test_site import border
+from tests.pages import ROOT
 
 HASH = "0a" * 32
 
@@ -112,3 +114,10 @@ def test_a51_pip_refuses_a_wheel_that_was_exchanged(tmp_path: Path, is_right: bo
     )
     assert (done.returncode == 0) == is_right, done.stderr
     assert (tmp_path / "there" / "nodes.py").exists() == is_right
+
+
+def test_z07_the_build_backend_is_the_one_of_its_lock() -> None:
+    required = re.findall(r'^requires = \["(.+)"\]', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    locked = re.findall(r"^(\S+==\S+) ", (ROOT / "requirements/build.lock").read_text(), re.MULTILINE)
+    assert len(locked) == 1
+    assert required == locked

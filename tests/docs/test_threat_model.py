@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import itertools
 import re
 from typing import NamedTuple
 
@@ -91,6 +92,25 @@ def test_an_attack_that_a_test_is_named_after_is_not_open() -> None:
 def test_every_attacker_of_the_tables_is_introduced() -> None:
     introduced = {name.casefold() for name in re.findall(r"^- (.+?): ", _part("Attackers"), re.M)}
     assert {row.attacker.casefold() for row in (*ANSWERED, *OPEN)} <= introduced
+
+
+def test_every_row_of_a_table_has_the_cells_of_its_head_and_none_stands_without_one() -> None:
+    """A row among those of another table would be garbage on the page."""
+    cells, wrong = 0, list[str]()  # of the head of the table
+    for before, line in itertools.pairwise(["", *PAGE.read_text().splitlines()]):
+        if not line.startswith("|"):
+            continue
+        found = len(re.split(r"(?<!\\)\|", line)) - 2
+        if not before.startswith("|"):
+            cells = found
+        if found != cells:
+            wrong.append(line)
+    assert wrong == []
+
+
+def test_a_row_with_ids_stands_below_attacks_only() -> None:
+    whole = len(re.findall(r"^\| (?:[a-z]\d\d,?)+ ", PAGE.read_text(), re.M))
+    assert whole == len({id(row.cells) for row in (*ANSWERED, *OPEN)})
 
 
 def test_every_source_is_cited_and_every_citation_has_a_source() -> None:

@@ -28,6 +28,7 @@ import typer
 from fog.host.preemption_notice import write_notice
 from fog.providers.aws.core.instances import DRAIN
 from gdp.cli.version import HELP
+from gdp.terminal import echo
 
 __all__ = ["Metadata", "Watch", "main"]
 
@@ -131,12 +132,12 @@ def watch(
     machine = os.getppid()
 
     def notice(leaves_at_unix_s: float) -> None:
-        typer.echo(f"EC2 takes this machine at {leaves_at_unix_s:.0f}")
+        echo(f"EC2 takes this machine at {leaves_at_unix_s:.0f}")
         write_notice(home, leaves_at_unix_s)
         os.kill(machine, signal.SIGUSR2)
 
     def drain() -> None:
-        typer.echo("the machine drains")
+        echo("the machine drains")
         os.kill(machine, signal.SIGUSR1)
 
     seen = Watch(Metadata(url), notice, drain)
@@ -147,7 +148,7 @@ def watch(
             trouble = ""
         except OSError as error:
             if str(error) != trouble:
-                typer.echo(f"metadata cannot be read: {error}", err=True)
+                echo(f"metadata cannot be read: {error}", err=True)
             trouble = str(error)
 
 

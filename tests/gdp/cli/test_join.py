@@ -28,26 +28,29 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield made
 
 
-def _run(*words: str) -> int:
-    """Return the exit code of ``gdp``."""
-    with pytest.raises(SystemExit) as ended:
-        main(words)
+def _run(*words: str, token: str = "") -> int:
+    """Return the exit code of ``gdp``, which gets a token by GDP_TOKEN."""
+    with pytest.MonkeyPatch.context() as patch:
+        if token:
+            patch.setenv("GDP_TOKEN", token)
+        with pytest.raises(SystemExit) as ended:
+            main(words)
     return int(ended.value.code or 0)
 
 
 def _made(lab: Lab, capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert _run("domain", "token", "lab", "--directory", str(lab.files.directory), *words) == 0
     line = capsys.readouterr().out
-    assert line.startswith("gdp join gdp1")
-    return line.split()[2]
+    assert line.startswith("gdp1")
+    return line.strip()
 
 
-def test_create_prints_one_line_that_a_person_copies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_create_prints_one_token_that_a_person_copies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("domain", "create", "lab", "--public", "203.0.113.7", "--directory", str(tmp_path / "lab"), "--no-start")
     assert _run(*words) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1
-    assert JoinToken.from_text(lines[0].removeprefix("gdp join ")).servers == (
+    assert JoinToken.from_text(lines[0]).servers == (
         "203.0.113.7:51820",
         "203.0.113.7:443",
     )
@@ -57,7 +60,7 @@ def test_create_prints_a_token_for_each_machine(tmp_path: Path, capsys: pytest.C
     words = ("domain", "create", "lab", "--public", "203.0.113.7", "--directory", str(tmp_path / "lab"), "--no-start")
     assert _run(*words, "--tokens", "2") == 0
     lines = capsys.readouterr().out.splitlines()
-    secrets = {JoinToken.from_text(each.removeprefix("gdp join ")).secret for each in lines}
+    secrets = {JoinToken.from_text(each).secret for each in lines}
     assert len(lines) == len(secrets) == 2
 
 
@@ -110,8 +113,8 @@ def test_create_refuses_a_name_that_is_no_file_name(name: str, tmp_path: Path) -
 
 def test_join_writes_a_good_configuration_of_each_node(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
     token, home = _made(lab, capsys), lab.folder / "robot-1"
-    words = ("join", token, "--label", "robot-1", "--directory", str(home), "--no-start", "--json")
-    assert _run(*words, "--uplink", "wlan0", "--uplink", "wwan0") == 0
+    words = ("join", "--label", "robot-1", "--directory", str(home), "--no-start", "--json")
+    assert _run(*words, "--uplink", "wlan0", "--uplink", "wwan0", token=token) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["domain"], result["label"], result["role"]) == ("lab", "robot-1", "robot")
     assert not (home / "relay.yaml").exists()  # this domain's border has no relay
@@ -127,7 +130,7 @@ def test_the_role_of_a_token_decides_what_runs(
     role: str, programs: list[str], lab: Lab, capsys: pytest.CaptureFixture[str]
 ) -> None:
     token, home = _made(lab, capsys, "--role", role, "--label", f"by-{role}"), lab.folder / f"by-{role}"
-    assert _run("join", token, "--label", f"by-{role}", "--directory", str(home), "--no-start") == 0
+    assert _run("join", "--label", f"by-{role}", "--directory", str(home), "--no-start", token=token) == 0
     found = [each.name for each in programs_of(MemberFiles.load(home))]
     assert [each for each in found if each != "proxy"] == [each for each in programs if each != "proxy"]
     assert (home / "proxy.yaml").exists() is ("proxy" in programs)
@@ -136,7 +139,7 @@ def test_the_role_of_a_token_decides_what_runs(
 def test_a_token_that_was_typed_wrong_ends_with_exit_code_2(capsys: pytest.CaptureFixture[str], lab: Lab) -> None:
     token = _made(lab, capsys)
     wrong = token[:30] + ("a" if token[30] != "a" else "b") + token[31:]
-    assert _run("join", wrong) == 2
+    assert _run("join", token=wrong) == 2
     assert "the token was typed or copied wrong" in capsys.readouterr().err
 
 
@@ -144,7 +147,8 @@ def test_a_refused_token_ends_with_exit_code_2_and_leaves_nothing(lab: Lab, caps
     token = _made(lab, capsys)
     for number, code in ((1, 0), (2, 2)):
         home = lab.folder / f"user-{number}"
-        assert _run("join", token, "--label", f"user-{number}", "--directory", str(home), "--no-start") == code
+        words = ("join", "--label", f"user-{number}", "--directory", str(home), "--no-start")
+        assert _run(*words, token=token) == code
         assert home.exists() is (code == 0)
     assert "this token was used already by 'user-1'" in capsys.readouterr().err
 

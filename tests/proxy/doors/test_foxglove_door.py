@@ -48,6 +48,7 @@ def door_of(rights: Rights | None = None, **bounds: int) -> DoorEndpoint:
         listen="127.0.0.1:" + str(free_port()),
         origins=("https://app.example",),
         subprotocols=SUBPROTOCOLS,
+        token="",
         **bounds,
     )
     return DoorEndpoint(
