@@ -13,12 +13,14 @@ from typing import Final
 from gdp.crypto.certificates import Root
 from gdp.errors import GdpError
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.sharing.exchange import Exchange, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.state import ExposedName, ShareState
 from gdp.stores.keyring import load_delegation, load_owner, save_delegation
+from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
@@ -113,19 +115,18 @@ class Grants:
         *,
         days: float,
     ) -> IssuedDelegation:
-        """Issue and deliver one delegation; its epochs are those of the proxy of this machine.
+        """Issue and deliver one delegation, with the epochs of its name.
 
         Raises:
             LocalError: the owner's keys are missing, or a record cannot be written.
         """
         is_own = node.name == self.own.name
         name = load_owner(store.owner).subject(metadata).name
-        epochs = {0}
         file = self.files.delegations / f"{name.to_text()}.delegation"
         if file.exists():
             held = load_delegation(file)
-            epochs |= set(held.grants)
             rights = frozenset(rights) | (held.rights if is_own and held.node == node.name else frozenset())
+        epochs = self._epochs(store, name)
         issued = store.issue(node, label, metadata, rights, epochs, days=days, is_own=is_own, unix_s=self.unix_s)
         return self.deliver(store, issued)
 
@@ -150,9 +151,9 @@ class Grants:
         return issued
 
     def renew(self, owners: Iterable[IssuedStore]) -> None:
-        """Renew the delegations that have used two thirds of their life, and deliver what was not delivered.
+        """Renew the delegations that have used two thirds of their life, grant tomorrow's epoch, deliver what waits.
 
-        A node that has left the domain gets no renewal.
+        A node that has left the domain gets nothing.
         """
         for store in owners:
             for issued in store:
@@ -166,15 +167,26 @@ class Grants:
     def _renew(self, store: IssuedStore, issued: IssuedDelegation) -> None:
         if issued.is_revoked:
             return
-        if issued.is_delivered and not issued.is_due(self.unix_s):
+        given = issued.delegation
+        epochs = self._epochs(store, given.name)
+        lacks_epoch = self.files.has_daily_epochs and not epochs <= set(given.grants)
+        if issued.is_delivered and not lacks_epoch and not issued.is_due(self.unix_s):
             return
         present = self.own if issued.is_own else self._present(issued)
         if present is None or present.name != issued.descriptor.name:
             return  # it has left the domain, or joined again as another node
         if issued.is_due(self.unix_s):
-            self.deliver(store, store.renew(issued, present, self.unix_s))
+            self.deliver(store, store.renew(issued, present, epochs, self.unix_s))
+        elif lacks_epoch:
+            self.deliver(store, store.rotate(issued, present, epochs))
         elif not issued.is_delivered:
             self.deliver(store, issued)
+
+    def _epochs(self, store: IssuedStore, name: Name) -> set[int]:
+        """Return the epochs that the holders of a name have, or are to have from today on."""
+        file = self.files.delegations / f"{name.to_text()}.delegation"
+        held = store.epochs(name) | (set(load_delegation(file).grants) if file.exists() else set()) or {0}
+        return daily_epochs(held, self.unix_s) if self.files.has_daily_epochs else held
 
     def _present(self, issued: IssuedDelegation) -> NodeDescriptor | None:
         """Return the descriptor of a node, None if it has left; without an answer the one at the time of issue."""

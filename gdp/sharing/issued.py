@@ -120,7 +120,7 @@ class IssuedStore:
         is_own: bool,
         unix_s: float,
     ) -> IssuedDelegation:
-        """Delegate a name to a node and record it; rights and epochs of a present delegation stay with it.
+        """Delegate a name to a node and record it; rights of a present delegation stay with it.
 
         Raises:
             LocalError: the owner's keys are missing, or the record cannot be written.
@@ -132,7 +132,7 @@ class IssuedStore:
             descriptor,
             metadata,
             frozenset(rights) | (frozenset() if held is None else held.rights),
-            {*epochs, *(() if held is None else held.grants)},
+            epochs,
             days=days,
             unix_s=unix_s,
         )
@@ -155,15 +155,30 @@ class IssuedStore:
         self.save(issued)
         return issued
 
-    def renew(self, issued: IssuedDelegation, descriptor: NodeDescriptor, unix_s: float) -> IssuedDelegation:
-        """Issue a delegation again, with the same rights, epochs and life. Raises ``LocalError``: as ``issue``."""
+    def epochs(self, name: Name) -> set[int]:
+        """Return the epochs of a name that any node got. Raises ``LocalError``: a file is invalid."""
+        records = map(self._load, self._folder.glob(f"{name.to_text()}.*.json"))
+        return {epoch for each in records if not each.is_revoked for epoch in each.delegation.grants}
+
+    def rotate(self, issued: IssuedDelegation, descriptor: NodeDescriptor, epochs: Iterable[int]) -> IssuedDelegation:
+        """Give a delegation other epochs; its rights and life stay. Raises ``LocalError``: as ``issue``."""
+        given = load_owner(self.owner).regrant(issued.delegation, descriptor, epochs)
+        wire = base64.b64encode(given.to_wire()).decode()
+        rotated = issued.model_copy(update={"wire": wire, "is_delivered": False})
+        self.save(rotated)
+        return rotated
+
+    def renew(
+        self, issued: IssuedDelegation, descriptor: NodeDescriptor, epochs: Iterable[int], unix_s: float
+    ) -> IssuedDelegation:
+        """Issue a delegation again, with the same rights and life. Raises ``LocalError``: as ``issue``."""
         given = issued.delegation
         return self.issue(
             descriptor,
             issued.label,
             issued.metadata,
             given.rights,
-            given.grants,
+            epochs,
             days=issued.days,
             is_own=issued.is_own,
             unix_s=unix_s,

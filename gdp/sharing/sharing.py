@@ -342,7 +342,7 @@ class Sharing:
         _verify(delegation, at)
         offer = Offer(delegation=delegation, sender=mail.sender, received_unix_s=at.grants.unix_s)
         for each in at.offers:
-            if each.delegation.name == delegation.name and each.until_unix_s > offer.until_unix_s:
+            if each.delegation.name == delegation.name and each.age > offer.age:
                 return  # an earlier mail that was delayed
         at.state = self._folder.save_offer(at.state, delegation, mail.sender, at.grants.unix_s)
         at.offers = list(self._folder.offers(at.state))
