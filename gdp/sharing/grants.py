@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Root
@@ -24,16 +25,17 @@ from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["GIVING", "TAKING", "Grants", "described"]
+__all__ = ["GIVING", "SALT", "TAKING", "Grants", "described"]
 
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+SALT: Final = "salt"  # its key in the metadata
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
 
 
 def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:
     """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
     own = {"kind": kind, "name": name, "type": type_name}
-    return Metadata({**own, "salt": salt} if salt else own)
+    return Metadata({**own, SALT: salt} if salt else own)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -122,11 +124,11 @@ class Grants:
         """
         is_own = node.name == self.own.name
         name = load_owner(store.owner).subject(metadata).name
-        file = self.files.delegations / f"{name.to_text()}.delegation"
+        file = self._own_file(name)
         if file.exists():
             held = load_delegation(file)
             rights = frozenset(rights) | (held.rights if is_own and held.node == node.name else frozenset())
-        epochs = self._epochs(store, name)
+        epochs = self._epochs(store, name, metadata)
         issued = store.issue(node, label, metadata, rights, epochs, days=days, is_own=is_own, unix_s=self.unix_s)
         return self.deliver(store, issued)
 
@@ -151,7 +153,7 @@ class Grants:
         return issued
 
     def renew(self, owners: Iterable[IssuedStore]) -> None:
-        """Renew the delegations that have used two thirds of their life, grant tomorrow's epoch, deliver what waits.
+        """Renew delegations after two thirds of their life, grant tomorrow's epoch, and deliver what waits.
 
         A node that has left the domain gets nothing.
         """
@@ -168,8 +170,8 @@ class Grants:
         if issued.is_revoked:
             return
         given = issued.delegation
-        epochs = self._epochs(store, given.name)
-        lacks_epoch = self.files.has_daily_epochs and not epochs <= set(given.grants)
+        epochs = self._epochs(store, given.name, issued.metadata)
+        lacks_epoch = not epochs <= set(given.grants)
         if issued.is_delivered and not lacks_epoch and not issued.is_due(self.unix_s):
             return
         present = self.own if issued.is_own else self._present(issued)
@@ -182,11 +184,17 @@ class Grants:
         elif not issued.is_delivered:
             self.deliver(store, issued)
 
-    def _epochs(self, store: IssuedStore, name: Name) -> set[int]:
-        """Return the epochs that the holders of a name have, or are to have from today on."""
-        file = self.files.delegations / f"{name.to_text()}.delegation"
+    def _epochs(self, store: IssuedStore, name: Name, metadata: Metadata) -> set[int]:
+        """Return the epochs that the holders of a name have, or are to have from today on.
+
+        Holders of a plain name may have delegations that a person wrote, and would get no later epoch.
+        """
+        file = self._own_file(name)
         held = store.epochs(name) | (set(load_delegation(file).grants) if file.exists() else set()) or {0}
-        return daily_epochs(held, self.unix_s) if self.files.has_daily_epochs else held
+        return daily_epochs(held, self.unix_s) if self.files.has_daily_epochs and SALT in metadata else held
+
+    def _own_file(self, name: Name) -> Path:
+        return self.files.delegations / f"{name.to_text()}.delegation"
 
     def _present(self, issued: IssuedDelegation) -> NodeDescriptor | None:
         """Return the descriptor of a node, None if it has left; without an answer the one at the time of issue."""

@@ -17,7 +17,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
-from gdp.sharing.grants import GIVING, TAKING, Grants, described
+from gdp.sharing.grants import GIVING, SALT, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Side, StatedRule, fits
 from gdp.sharing.report import ShareReport
@@ -32,7 +32,6 @@ from gdp.trust.revocation import Revocation
 __all__ = ["GROUPS", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
-SALT: Final = "salt"  # its key in the metadata
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 

@@ -6,8 +6,8 @@ the node's key, signed by the owner. The owner stores one master secret::
     secret(name, epoch) = HKDF-SHA256(master, salt "", info "gdp-topic-secret-1" || name || epoch (2)), 32 bytes
     HPKE info           = "gdp-grant-1" || name || epoch (2) || the node's name
 
-Epochs below ``DAILY_FROM`` are numbered by hand, and begin when a node has them. Any other is the number of a day since
-1970 (UTC), and begins with that day. So grants for a day arrive before it, and all writers change together.
+Epochs below ``DAILY_FROM`` are numbered by hand, and begin when a node has them. Any other is a day since 1970 (UTC),
+and begins with it. So grants arrive before their day, and all writers change together.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""seccomp filters: a node is refused calls that it does not need, a mere reader of files all that it does not make.
+"""seccomp filters: nodes are refused calls that they do not need, mere readers of files all that they do not make.
 
 I/O. Source: seccomp(2); include/uapi/linux/seccomp.h, filter.h, audit.h. For nodes it is a deny list, because ROS
 middleware and Python libraries differ in the calls that they make. A refused call fails with EPERM. Calls of another

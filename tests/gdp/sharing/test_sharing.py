@@ -401,10 +401,14 @@ def test_a_revoked_node_and_one_that_left_get_no_later_epoch(site: Site, robot: 
     assert newest == {"robot": before + 2, "server": before, "laptop": before}
 
 
-def test_epochs_by_hand_stay_as_they_are(site: Site, stack: ExitStack) -> None:
-    robot, server = site.add("robot", "epochs: manual\n"), site.add("server")
+@pytest.mark.parametrize("is_plain", [False, True])
+def test_epochs_by_hand_and_those_of_plain_names_stay_as_they_are(
+    site: Site, stack: ExitStack, *, is_plain: bool
+) -> None:
+    robot, server = site.add("robot", "" if is_plain else "epochs: manual\n"), site.add("server")
     robot.start(stack)
-    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    wanted = robot.exposing("/camera/image", "server", type_name=IMAGE)
+    robot.sharing.expose(wanted, site.now_s, is_plain=is_plain)
     server.sharing.accept(importing("/camera/image"), site.now_s)
     site.now_s += 3 * DAY_S
     robot.sharing.work(site.now_s)
