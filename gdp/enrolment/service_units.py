@@ -66,7 +66,9 @@ def _unit(machine: Machine, program: MachineProgram, switch: str | None) -> str:
         rights = " ".join(program.capabilities)
         changes |= {key: f"{key}={rights}" for key in ("AmbientCapabilities", "CapabilityBoundingSet")}
         changes |= {"Restart": "Restart=always"} | ({} if is_node else _OF_OTHERS)
-    changes["ProtectHome"] = f"ProtectHome={'read-only' if any(_below(each, *_HOMES) for each in folders) else 'yes'}"
+    of_ros = (Path(each) for _, value in program.environment for each in value.split(":") if each.startswith("/"))
+    is_at_home = any(_below(each, *_HOMES) for each in (*folders, *of_ros))
+    changes["ProtectHome"] = f"ProtectHome={'read-only' if is_at_home else 'yes'}"
     lines = [f"{MARK}{machine.directory}"]
     for line in template.splitlines():
         key, equals, value = line.partition("=")
@@ -81,7 +83,7 @@ def _unit(machine: Machine, program: MachineProgram, switch: str | None) -> str:
             units = ["network-online.target"] if machine.is_member else []
             units += [each for each in value.split() if each != "gdp-switch.service"]
             units += [switch] if switch is not None and program.name != "switch" else []
-            lines += [f"{key}={' '.join(units)}"] if units else []
+            lines += [f"{key}={' '.join(dict.fromkeys(units))}"] if units else []
         else:
             lines.append(line)
             if line == "[Service]":

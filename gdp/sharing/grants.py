@@ -6,9 +6,9 @@ whose delivery fails is delivered at the next upkeep.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Root
@@ -124,11 +124,15 @@ class Grants:
         """
         is_own = node.name == self.own.name
         name = load_owner(store.owner).subject(metadata).name
-        file = self._own_file(name)
+        epochs = store.epochs(name)
+        file = self.files.delegations / f"{name.to_text()}.delegation"
         if file.exists():
             held = load_delegation(file)
+            epochs |= set(held.grants)
             rights = frozenset(rights) | (held.rights if is_own and held.node == node.name else frozenset())
-        epochs = self._epochs(store, name, metadata)
+        epochs = epochs or {0}
+        if self._has_daily_epochs(metadata):
+            epochs = daily_epochs(epochs, self.unix_s)
         issued = store.issue(node, label, metadata, rights, epochs, days=days, is_own=is_own, unix_s=self.unix_s)
         return self.deliver(store, issued)
 
@@ -158,20 +162,23 @@ class Grants:
         A node that has left the domain gets nothing.
         """
         for store in owners:
-            for issued in store:
+            issued_of, held = list(store), defaultdict[Name, set[int]](set)
+            for each in issued_of:
+                held[each.delegation.name] |= set() if each.is_revoked else set(each.delegation.grants)
+            for issued in issued_of:
                 try:
-                    self._renew(store, issued)
+                    self._renew(store, issued, held[issued.delegation.name])
                 except GdpError as error:
                     self.report.problems.append(
                         f"the delegation of {issued.metadata['name']} to {issued.label} is not renewed: {error}"
                     )
 
-    def _renew(self, store: IssuedStore, issued: IssuedDelegation) -> None:
+    def _renew(self, store: IssuedStore, issued: IssuedDelegation, held: Collection[int]) -> None:
         if issued.is_revoked:
             return
-        given = issued.delegation
-        epochs = self._epochs(store, given.name, issued.metadata)
-        lacks_epoch = not epochs <= set(given.grants)
+        given = set(issued.delegation.grants)
+        epochs = daily_epochs(held, self.unix_s) if self._has_daily_epochs(issued.metadata) else given
+        lacks_epoch = not epochs <= given
         if issued.is_delivered and not lacks_epoch and not issued.is_due(self.unix_s):
             return
         present = self.own if issued.is_own else self._present(issued)
@@ -184,17 +191,9 @@ class Grants:
         elif not issued.is_delivered:
             self.deliver(store, issued)
 
-    def _epochs(self, store: IssuedStore, name: Name, metadata: Metadata) -> set[int]:
-        """Return the epochs that the holders of a name have, or are to have from today on.
-
-        Holders of a plain name may have delegations that a person wrote, and would get no later epoch.
-        """
-        file = self._own_file(name)
-        held = store.epochs(name) | (set(load_delegation(file).grants) if file.exists() else set()) or {0}
-        return daily_epochs(held, self.unix_s) if self.files.has_daily_epochs and SALT in metadata else held
-
-    def _own_file(self, name: Name) -> Path:
-        return self.files.delegations / f"{name.to_text()}.delegation"
+    def _has_daily_epochs(self, metadata: Metadata) -> bool:
+        """Return whether a name gets them; holders of a plain one may have delegations that a person wrote."""
+        return self.files.has_daily_epochs and SALT in metadata
 
     def _present(self, issued: IssuedDelegation) -> NodeDescriptor | None:
         """Return the descriptor of a node, None if it has left; without an answer the one at the time of issue."""

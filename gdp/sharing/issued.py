@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -68,7 +69,7 @@ class IssuedDelegation(Section):
     @property
     def delegation(self) -> Delegation:
         """Return the delegation."""
-        return Delegation.from_wire(base64.b64decode(self.wire))
+        return _delegation(self.wire)
 
     @property
     def descriptor(self) -> NodeDescriptor:
@@ -86,6 +87,12 @@ class IssuedDelegation(Section):
     def is_due(self, unix_s: float) -> bool:
         """Return whether it is time to renew it."""
         return not self.is_revoked and unix_s >= self.issued_unix_s + RENEW_SHARE * self.days * DAY_S
+
+
+@lru_cache(maxsize=4_096)
+def _delegation(wire: str) -> Delegation:
+    """Return a delegation; the upkeep looks at each of them in every pass."""
+    return Delegation.from_wire(base64.b64decode(wire))
 
 
 class IssuedStore:
