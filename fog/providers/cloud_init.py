@@ -105,6 +105,7 @@ SystemCallArchitectures=native
 SystemCallFilter=@system-service bpf capset seccomp landlock_create_ruleset landlock_add_rule landlock_restrict_self
 SystemCallErrorNumber=EPERM
 MemoryMax=90%
+TasksMax=16384
 LimitNOFILE=65536
 RuntimeDirectory=fog wireguard
 RuntimeDirectoryMode=0700
@@ -123,6 +124,17 @@ SyslogIdentifier=%i
 StandardOutput=journal+console
 StandardError=null
 Restart=on-failure
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=strict
+ProtectHome=yes
+PrivateTmp=yes
+PrivateDevices=yes
+RestrictAddressFamilies=AF_UNIX
+SystemCallFilter=@system-service
+MemoryMax=64M
+TasksMax=4
+LimitNOFILE=64
 
 [Install]
 WantedBy=multi-user.target

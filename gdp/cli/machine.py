@@ -18,10 +18,11 @@ import typer
 
 from gdp.cli.node import set_up_logging
 from gdp.enrolment.addresses import default_directory
-from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.programs import MachineProgram, missing_ros, programs_of
+from gdp.enrolment.machine_programs import read_machine
+from gdp.enrolment.programs import MachineProgram, missing_ros
+from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.supervisor import Failures, supervise
-from gdp.enrolment.units import has_systemd, install_units, unit_texts
+from gdp.enrolment.units import has_systemd, install_units
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible
 from gdp.management.control_client import ask_node, find_control_socket
@@ -61,11 +62,11 @@ def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path
     Raises:
         LocalError: the directory is no member's, or a program or a unit cannot be started.
     """
-    programs = programs_of(MemberFiles.load(directory))
+    machine = read_machine(directory)
     if reason := missing_ros():
         say(f"no proxy runs here: {reason}")
     if has_systemd() and not no_systemd:
-        units = unit_texts(directory, programs)
+        units = service_texts(machine)
         install_units(units)
         say(f"started, now and at each boot: {' '.join(units)}")
         if observed is not None:
@@ -77,7 +78,7 @@ def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path
         if observed is not None:
             await asyncio.get_running_loop().run_in_executor(None, observed, directory)
 
-    run_programs(programs, started)
+    run_programs(machine.programs, started)
 
 
 def run_programs(programs: Sequence[MachineProgram], started: Callable[[], Awaitable[None]] | None = None) -> None:

@@ -130,7 +130,7 @@ class Participant:
         """Publish a topic from now on; ``paths`` 2: each frame twice, over two disjoint paths where they exist."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
         publisher = self._publications.add(
-            topic.name, topic.secrets, description,
+            topic.name, topic.own_secrets, description,
             reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options,
         )  # fmt: skip
         self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
@@ -300,7 +300,7 @@ class Participant:
 
     def renew(self, topic: Topic) -> None:
         """Replace a topic's delegation and secrets, for what is published or read of it."""
-        self._publications.renew(topic.name, topic.secrets, self._now_s)
+        self._publications.renew(topic.name, topic.own_secrets, self._now_s)
         subscription = self._subscriptions.get(topic.name)
         if subscription is not None:
             subscription.topic = topic
@@ -505,11 +505,11 @@ class Participant:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
         publisher = self._publications.add(
-            topic.name, topic.secrets, description,
+            topic.name, topic.own_secrets, description,
             reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS, paths=paths,
             options=options,
         )  # fmt: skip
-        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent, paths=paths, options=options)
+        self._publications.enable_unicast(topic.name, topic.own_secrets, urgent=urgent, paths=paths, options=options)
         self._subscriptions.add(topic, right, self._now_s, paths, is_session=is_session)
         self._advertisement(topic, right, is_global=is_global, paths=paths, is_session=is_session)
         return publisher

@@ -274,13 +274,17 @@ class Publisher:
         """Replace the topic's secrets; messages from now on are sealed under the newest epoch.
 
         A Heartbeat announces the epoch to the readers. For ``EPOCH_GRACE_S`` their reports may still use the epoch
-        before.
+        before. Messages for late joiners, who may lack that epoch, are sealed again.
 
         Raises:
             LocalError: there is no secret.
         """
         if self._keys.renew(secrets, now_s):
             self._heartbeats.wanted = True
+            mtu = self._queue.mtu
+            move = self._queue.refragment(mtu, is_forced=True) if self._queue.depth and mtu is not None else None
+            if move is not None:
+                self._acknowledgements.renumber(move)
             self.published(self)
 
     def describe(self, description: bytes) -> None:

@@ -267,14 +267,17 @@ class SendQueue:
             self._seal_message(body, carried.sequence, carried.messages, carried.added_s)
         return bool(requeued)
 
-    def refragment(self, mtu: int) -> Renumbering | None:
+    def refragment(self, mtu: int, *, is_forced: bool = False) -> Renumbering | None:
         """Seal all that is cached again, under new numbers, if something is too large for the path.
 
+        Args:
+            is_forced: also if everything fits, because the key has changed.
+
         Returns:
-            the renumbering, or None if everything fits.
+            the renumbering, or None if nothing is sealed again.
         """
         cached = [(number, each) for number, each in self._window.cached() if isinstance(each, Sealed)]
-        if not any(each.largest > mtu for _, each in cached):
+        if not cached or not (is_forced or any(each.largest > mtu for _, each in cached)):
             return None
         first, end = cached[0][0], self.next_number
         move = Renumbering(first, end - first, end + 1)

@@ -56,15 +56,24 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A name with this participant's rights on it, and the topic's secrets by epoch."""
+    """A name with this participant's rights on it, and the topic's secrets by epoch.
+
+    ``sealing``: of the epochs that may seal; None: all.
+    """
 
     delegation: Delegation
     secrets: Secrets
+    sealing: Secrets | None = None
 
     @property
     def name(self) -> Name:
         """Return the topic's name."""
         return self.delegation.name
+
+    @property
+    def own_secrets(self) -> Secrets:
+        """Return the secrets under which this participant seals; the newest does."""
+        return self.secrets if self.sealing is None else self.sealing
 
 
 @dataclass(slots=True, kw_only=True)

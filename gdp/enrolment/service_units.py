@@ -1,7 +1,8 @@
-"""Units of nodes that were configured by hand: the packaged unit files, for the paths and the user of one machine.
+"""Units of a machine: the packaged unit files, for its paths and its user.
 
 I/O; it reads the packaged files and who owns the keys. A node runs as the owner of its keys, with the capabilities of
-its unit. Keys below ``/var/lib/gdp-ros`` belong to a dynamic user (``DynamicUser=``), as the packaged files say.
+its unit. Keys below ``/var/lib/gdp-ros`` belong to a dynamic user (``DynamicUser=``), as the packaged files say. The
+enrolment server and the agent of a machine that joined have the unit of a RIB, without its devices and reports.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Final
 
 from gdp.enrolment.machine_programs import Machine
 from gdp.enrolment.programs import MachineProgram
-from gdp.enrolment.units import MARK, quoted, unit_names, unit_texts
+from gdp.enrolment.units import MARK, quoted, unit_names
 from gdp.errors import LocalError
 
 __all__ = ["STATE_FOLDER", "service_texts"]
@@ -28,6 +29,12 @@ _HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 _OF_DYNAMIC_USER: Final = (
     "DynamicUser", "User", "Group", "StateDirectory", "StateDirectoryMode", "RuntimeDirectory", "WorkingDirectory",
 )  # fmt: skip
+_OF_OTHERS: Final = {  # of programs that any host may connect to, that touch no device and report nothing to systemd
+    **dict.fromkeys(("NotifyAccess", "WatchdogSec", "TimeoutStartSec"), ""),
+    "Type": "Type=exec",
+    "RestrictAddressFamilies": "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
+    "MemoryMax": "MemoryMax=1G",
+}
 
 
 def service_texts(machine: Machine) -> dict[str, str]:
@@ -36,36 +43,47 @@ def service_texts(machine: Machine) -> dict[str, str]:
     Raises:
         LocalError: a unit could not see the machine's files.
     """
-    if machine.is_member:
-        return unit_texts(machine.directory, machine.programs)
     names = unit_names(None if machine.directory == _CONFIG_FOLDER else machine.directory, machine.programs)
     switch = names.get("switch")
     return {names[each.name]: _unit(machine, each, switch) for each in machine.programs}
 
 
 def _unit(machine: Machine, program: MachineProgram, switch: str | None) -> str:
-    packaged = resources.files("gdp.enrolment").joinpath("service").joinpath(f"gdp-{program.name}.service")
+    templates = resources.files("gdp.enrolment").joinpath("service")
+    is_node = templates.joinpath(f"gdp-{program.name}.service").is_file()
+    template = templates.joinpath(f"gdp-{program.name if is_node else 'rib'}.service").read_text(encoding="utf-8")
     identity = machine.identity_of(program)
-    is_dynamic = _below(identity.resolve(), STATE_FOLDER, STATE_FOLDER.parent / "private" / STATE_FOLDER.name)
+    is_dynamic = not machine.is_member and _below(
+        identity.resolve(), STATE_FOLDER, STATE_FOLDER.parent / "private" / STATE_FOLDER.name
+    )
     folders = (machine.directory, identity, Path(sys.prefix), Path(sys.base_prefix), Path(__file__))
     if hidden := [each for each in folders if _below(each.resolve(), *_PRIVATE_TMP)]:
         raise LocalError(
             f"{hidden[0]}: units have a /tmp of their own and cannot see it; move it, say to {STATE_FOLDER}"
         )
     changes = {} if is_dynamic else dict(_of_owner(machine, identity))
-    changes["ProtectHome"] = f"ProtectHome={'read-only' if any(_below(each, *_HOMES) for each in folders) else 'yes'}"
+    if machine.is_member:
+        rights = " ".join(program.capabilities)
+        changes |= {key: f"{key}={rights}" for key in ("AmbientCapabilities", "CapabilityBoundingSet")}
+        changes |= {"Restart": "Restart=always"} | ({} if is_node else _OF_OTHERS)
+    of_ros = (Path(each) for _, value in program.environment for each in value.split(":") if each.startswith("/"))
+    is_at_home = any(_below(each, *_HOMES) for each in (*folders, *of_ros))
+    changes["ProtectHome"] = f"ProtectHome={'read-only' if is_at_home else 'yes'}"
     lines = [f"{MARK}{machine.directory}"]
-    for line in packaged.read_text(encoding="utf-8").splitlines():
+    for line in template.splitlines():
         key, equals, value = line.partition("=")
         if equals and key in changes:
             continue
         if key == "ExecStart":
             lines.append(f"ExecStart={_command(program, value, is_packaged=is_dynamic)}")
             lines += [f"Environment={quoted(f'{name}={text}')}" for name, text in program.environment]
+        elif key == "Description":
+            lines.append(f"Description={program.title}")
         elif key in ("After", "Wants"):
-            units = [each for each in value.split() if each != "gdp-switch.service"]
+            units = ["network-online.target"] if machine.is_member else []
+            units += [each for each in value.split() if each != "gdp-switch.service"]
             units += [switch] if switch is not None and program.name != "switch" else []
-            lines += [f"{key}={' '.join(units)}"] if units else []
+            lines += [f"{key}={' '.join(dict.fromkeys(units))}"] if units else []
         else:
             lines.append(line)
             if line == "[Service]":

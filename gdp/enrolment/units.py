@@ -26,25 +26,12 @@ __all__ = [
     "remove_units",
     "systemctl",
     "unit_names",
-    "unit_texts",
 ]
 
 MARK: Final = "# gdp service: "  # begins the first line of each unit that is written here; then the machine's folder
 UNIT_FOLDER: Final = Path("/etc/systemd/system")
 _RUNNING: Final = Path("/run/systemd/system")  # sd_booted(3)
 _TIMEOUT_S: Final = 120.0  # a node has 90 s to report that it is up
-_OF_DEVICES: Final = frozenset({"CAP_NET_ADMIN", "CAP_NET_RAW"})
-_FENCES: Final = """\
-PrivateDevices=yes
-PrivateTmp=yes
-ProtectControlGroups=yes
-ProtectKernelTunables=yes
-RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
-RestrictNamespaces=yes
-SystemCallArchitectures=native
-SystemCallErrorNumber=EPERM
-SystemCallFilter=@system-service
-"""  # of programs that any host may connect to, and that touch no device
 _RUNTIME: Final = Path("/run")
 _RUNTIME_LINE: Final = re.compile(r"^RuntimeDirectory=(.*)$", re.MULTILINE)
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
@@ -53,13 +40,6 @@ _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
 def has_systemd() -> bool:
     """Return whether systemd runs this host."""
     return _RUNNING.is_dir()
-
-
-def unit_texts(directory: Path, programs: Sequence[MachineProgram]) -> dict[str, str]:
-    """Return the units of a machine by file name, in the order in which they start."""
-    names = unit_names(directory, programs)
-    first = names[programs[0].name]
-    return {names[each.name]: _unit(directory, each, None if each is programs[0] else first) for each in programs}
 
 
 def unit_names(directory: Path | None, programs: Sequence[MachineProgram]) -> dict[str, str]:
@@ -126,43 +106,6 @@ def _remove_empty(path: Path) -> None:
             each.rmdir()
     if path.is_symlink() and not target.exists():
         path.unlink()
-
-
-def _unit(directory: Path, program: MachineProgram, after: str | None) -> str:
-    words = " ".join(quoted(each) for each in program.argv)
-    order = "After=network-online.target\nWants=network-online.target\n"
-    order += f"After={after}\nWants={after}\n" if after is not None else ""
-    environment = "".join(f"Environment={quoted(f'{key}={value}')}\n" for key, value in program.environment)
-    return f"""\
-{MARK}{directory.absolute()}
-[Unit]
-Description={program.title}
-{order}StartLimitIntervalSec=0
-
-[Service]
-Type=exec
-ExecStart={words}
-ExecReload=/bin/kill -HUP $MAINPID
-{environment}KillSignal=SIGINT
-Restart=always
-RestartSec=1
-WorkingDirectory={directory.absolute()}
-CapabilityBoundingSet={" ".join(program.capabilities)}
-NoNewPrivileges=yes
-ProtectSystem=full
-ProtectClock=yes
-ProtectHostname=yes
-ProtectKernelLogs=yes
-ProtectKernelModules=yes
-LockPersonality=yes
-RestrictRealtime=yes
-RestrictSUIDSGID=yes
-UMask=0077
-{"" if set(program.capabilities) & _OF_DEVICES else _FENCES}\
-
-[Install]
-WantedBy=multi-user.target
-"""
 
 
 def quoted(word: str) -> str:

@@ -7,19 +7,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from gdp.client.participant import Topic
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError, RemoteError
+from gdp.limits import CLOCK_SKEW_S
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.sansio import Timestamps
 from gdp.stores.keyring import load_delegations
 from gdp.trust.delegation import Delegation
+from gdp.trust.grants import EPOCH_S, begun_epochs
 from gdp.trust.right import Right
 
-__all__ = ["DelegationStore", "open_delegation"]
+__all__ = ["DelegationStore", "EpochTimer", "open_delegation"]
 
 log = logging.getLogger(__name__)
 
@@ -74,4 +77,26 @@ def open_delegation(delegation: Delegation, identity: Identity) -> Topic:
     secrets = {epoch: grant.secret for epoch, grant in delegation.open(identity).items()}
     if not secrets:
         raise LocalError("the delegation holds no secret of any epoch")
-    return Topic(delegation, secrets)
+    unix_s = time.time()
+    return Topic(delegation, begun_epochs(secrets, unix_s + CLOCK_SKEW_S), begun_epochs(secrets, unix_s))
+
+
+class EpochTimer:
+    """Timer that has delegations read again when a day's epoch begins, here or by the clock of another node.
+
+    A reader uses a new epoch from ``CLOCK_SKEW_S`` before its day on, because a publisher's clock may be ahead.
+
+    Args:
+        reload: reads them; an error stays with it.
+    """
+
+    def __init__(self, reload: Callable[[], None]) -> None:
+        self._reload = reload
+        self._days: tuple[float, float] | None = None
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Reload if an epoch has begun since the last call."""
+        days = now.unix_s // EPOCH_S, (now.unix_s + CLOCK_SKEW_S) // EPOCH_S
+        if self._days not in (None, days):
+            self._reload()
+        self._days = days

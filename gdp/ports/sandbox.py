@@ -1,6 +1,6 @@
 """Sandbox: the rights that a node drops after its sockets and programs are open.
 
-I/O. The order is: ``no_new_privs``, Landlock, seccomp, the bounding set, capabilities. A step that this kernel or this
+I/O. The order is: ``no_new_privs``, Landlock, the bounding set, capabilities, seccomp. A step that this kernel or this
 user's rights do not allow is left out; ``Rights`` is what the kernel reports afterwards. Capabilities and Landlock
 belong to a thread, so a node calls this before it starts its threads.
 """
@@ -37,7 +37,7 @@ class Needs:
         tcp_ports: TCP ports on which it listens, and it opens no TCP connection; None: any.
         starts_programs: whether it starts programs; they get no capability.
         spared_calls: system calls of ``seccomp.denied`` that it makes.
-        only_reads: it opens no socket, starts no process or thread, sends no signal, and marks no file.
+        only_reads: it makes no system call but those of ``seccomp.allowed``.
     """
 
     capabilities: frozenset[Capability] = frozenset()
@@ -79,13 +79,11 @@ class Rights:
 def confine(needs: Needs) -> Rights:
     """Drop the rights that a process does not need, irreversibly; return the remaining ones."""
     version = 0
-    has_filter = False
     try:
         prctl(_NO_NEW_PRIVS, 1)
         version = landlock.restrict(needs.writes, needs.reads, needs.tcp_ports, may_execute=needs.starts_programs)
-        has_filter = seccomp.refuse(needs.spared_calls, is_reader=needs.only_reads)
     except OSError as error:
-        log.warning("rights kept reason=%s landlock=%d seccomp=%s", error.strerror, version, has_filter)
+        log.warning("rights kept reason=%s landlock=%d", error.strerror, version)
     try:
         drop_bounding()
     except OSError as error:
@@ -94,6 +92,13 @@ def confine(needs: Needs) -> Rights:
         keep_only(needs.capabilities)
     except OSError as error:
         log.warning("capabilities kept reason=%s", error.strerror)
+    try:
+        if needs.only_reads:
+            seccomp.allow_only_reading()
+        else:
+            seccomp.refuse(needs.spared_calls)
+    except OSError as error:
+        log.warning("system calls kept reason=%s", error.strerror)
     return _rights(version)
 
 

@@ -5,6 +5,7 @@ I/O.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -18,11 +19,12 @@ from gdp.client.participant import Participant
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
+from gdp.errors import GdpError
 from gdp.host.single_instance import run_alone
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials
-from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog
 from gdp.nodes.revocation_upkeep import load_revocations
@@ -33,6 +35,8 @@ from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
 
 __all__ = ["SessionNode", "open_node"]
+
+log = logging.getLogger(__name__)
 
 _open_names: Final = set[Name]()  # identities in use by this process: record locks do not see its own
 _open_lock: Final = threading.Lock()
@@ -68,6 +72,13 @@ class SessionNode:
             LocalError: a file is malformed, or readable for others.
         """
         self.core.renew(DelegationStore(self.config.delegation_directory, self.identity))
+
+    def reload_for_epoch(self) -> None:
+        """Read the delegations again, because an epoch begins; an error is logged."""
+        try:
+            self.reload()
+        except GdpError as error:
+            log.error("delegations not reloaded, the old ones stay in use reason=%s", error)
 
     def close(self) -> None:
         """Close the device and release the identity."""
@@ -107,7 +118,7 @@ def open_node(config: SessionConfig) -> SessionNode:
         runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
         runtime.every(RECONCILE_PERIOD_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
         revocations.start(runtime)
-        return SessionNode(
+        node = SessionNode(
             config=config,
             identity=identity,
             member=member,
@@ -117,6 +128,8 @@ def open_node(config: SessionConfig) -> SessionNode:
             core=core,
             _stack=stack.pop_all(),
         )
+        runtime.every(RECONCILE_PERIOD_S, EpochTimer(node.reload_for_epoch).handle_timer)
+        return node
 
 
 def _own(name: Name) -> Callable[[], None]:

@@ -6,6 +6,7 @@ whose delivery fails is delivered at the next upkeep.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -13,25 +14,28 @@ from typing import Final
 from gdp.crypto.certificates import Root
 from gdp.errors import GdpError
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.sharing.exchange import Exchange, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.state import ExposedName, ShareState
 from gdp.stores.keyring import load_delegation, load_owner, save_delegation
+from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["GIVING", "TAKING", "Grants", "described"]
+__all__ = ["GIVING", "SALT", "TAKING", "Grants", "described"]
 
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+SALT: Final = "salt"  # its key in the metadata
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
 
 
 def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:
     """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
     own = {"kind": kind, "name": name, "type": type_name}
-    return Metadata({**own, "salt": salt} if salt else own)
+    return Metadata({**own, SALT: salt} if salt else own)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -113,19 +117,22 @@ class Grants:
         *,
         days: float,
     ) -> IssuedDelegation:
-        """Issue and deliver one delegation; its epochs are those of the proxy of this machine.
+        """Issue and deliver one delegation, with the epochs of its name.
 
         Raises:
             LocalError: the owner's keys are missing, or a record cannot be written.
         """
         is_own = node.name == self.own.name
         name = load_owner(store.owner).subject(metadata).name
-        epochs = {0}
+        epochs = store.epochs(name)
         file = self.files.delegations / f"{name.to_text()}.delegation"
         if file.exists():
             held = load_delegation(file)
             epochs |= set(held.grants)
             rights = frozenset(rights) | (held.rights if is_own and held.node == node.name else frozenset())
+        epochs = epochs or {0}
+        if self._has_daily_epochs(metadata):
+            epochs = daily_epochs(epochs, self.unix_s)
         issued = store.issue(node, label, metadata, rights, epochs, days=days, is_own=is_own, unix_s=self.unix_s)
         return self.deliver(store, issued)
 
@@ -150,31 +157,43 @@ class Grants:
         return issued
 
     def renew(self, owners: Iterable[IssuedStore]) -> None:
-        """Renew the delegations that have used two thirds of their life, and deliver what was not delivered.
+        """Renew delegations after two thirds of their life, grant tomorrow's epoch, and deliver what waits.
 
-        A node that has left the domain gets no renewal.
+        A node that has left the domain gets nothing.
         """
         for store in owners:
-            for issued in store:
+            issued_of, held = list(store), defaultdict[Name, set[int]](set)
+            for each in issued_of:
+                held[each.delegation.name] |= set() if each.is_revoked else set(each.delegation.grants)
+            for issued in issued_of:
                 try:
-                    self._renew(store, issued)
+                    self._renew(store, issued, held[issued.delegation.name])
                 except GdpError as error:
                     self.report.problems.append(
                         f"the delegation of {issued.metadata['name']} to {issued.label} is not renewed: {error}"
                     )
 
-    def _renew(self, store: IssuedStore, issued: IssuedDelegation) -> None:
+    def _renew(self, store: IssuedStore, issued: IssuedDelegation, held: Collection[int]) -> None:
         if issued.is_revoked:
             return
-        if issued.is_delivered and not issued.is_due(self.unix_s):
+        given = set(issued.delegation.grants)
+        epochs = daily_epochs(held, self.unix_s) if self._has_daily_epochs(issued.metadata) else given
+        lacks_epoch = not epochs <= given
+        if issued.is_delivered and not lacks_epoch and not issued.is_due(self.unix_s):
             return
         present = self.own if issued.is_own else self._present(issued)
         if present is None or present.name != issued.descriptor.name:
             return  # it has left the domain, or joined again as another node
         if issued.is_due(self.unix_s):
-            self.deliver(store, store.renew(issued, present, self.unix_s))
+            self.deliver(store, store.renew(issued, present, epochs, self.unix_s))
+        elif lacks_epoch:
+            self.deliver(store, store.rotate(issued, present, epochs))
         elif not issued.is_delivered:
             self.deliver(store, issued)
+
+    def _has_daily_epochs(self, metadata: Metadata) -> bool:
+        """Return whether a name gets them; holders of a plain one may have delegations that a person wrote."""
+        return self.files.has_daily_epochs and SALT in metadata
 
     def _present(self, issued: IssuedDelegation) -> NodeDescriptor | None:
         """Return the descriptor of a node, None if it has left; without an answer the one at the time of issue."""

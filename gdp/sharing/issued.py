@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -68,7 +69,7 @@ class IssuedDelegation(Section):
     @property
     def delegation(self) -> Delegation:
         """Return the delegation."""
-        return Delegation.from_wire(base64.b64decode(self.wire))
+        return _delegation(self.wire)
 
     @property
     def descriptor(self) -> NodeDescriptor:
@@ -86,6 +87,12 @@ class IssuedDelegation(Section):
     def is_due(self, unix_s: float) -> bool:
         """Return whether it is time to renew it."""
         return not self.is_revoked and unix_s >= self.issued_unix_s + RENEW_SHARE * self.days * DAY_S
+
+
+@lru_cache(maxsize=4_096)
+def _delegation(wire: str) -> Delegation:
+    """Return a delegation; the upkeep looks at each of them in every pass."""
+    return Delegation.from_wire(base64.b64decode(wire))
 
 
 class IssuedStore:
@@ -120,7 +127,7 @@ class IssuedStore:
         is_own: bool,
         unix_s: float,
     ) -> IssuedDelegation:
-        """Delegate a name to a node and record it; rights and epochs of a present delegation stay with it.
+        """Delegate a name to a node and record it; rights of a present delegation stay with it.
 
         Raises:
             LocalError: the owner's keys are missing, or the record cannot be written.
@@ -132,7 +139,7 @@ class IssuedStore:
             descriptor,
             metadata,
             frozenset(rights) | (frozenset() if held is None else held.rights),
-            {*epochs, *(() if held is None else held.grants)},
+            epochs,
             days=days,
             unix_s=unix_s,
         )
@@ -155,15 +162,30 @@ class IssuedStore:
         self.save(issued)
         return issued
 
-    def renew(self, issued: IssuedDelegation, descriptor: NodeDescriptor, unix_s: float) -> IssuedDelegation:
-        """Issue a delegation again, with the same rights, epochs and life. Raises ``LocalError``: as ``issue``."""
+    def epochs(self, name: Name) -> set[int]:
+        """Return the epochs of a name that any node got. Raises ``LocalError``: a file is invalid."""
+        records = map(self._load, self._folder.glob(f"{name.to_text()}.*.json"))
+        return {epoch for each in records if not each.is_revoked for epoch in each.delegation.grants}
+
+    def rotate(self, issued: IssuedDelegation, descriptor: NodeDescriptor, epochs: Iterable[int]) -> IssuedDelegation:
+        """Give a delegation other epochs; its rights and life stay. Raises ``LocalError``: as ``issue``."""
+        given = load_owner(self.owner).regrant(issued.delegation, descriptor, epochs)
+        wire = base64.b64encode(given.to_wire()).decode()
+        rotated = issued.model_copy(update={"wire": wire, "is_delivered": False})
+        self.save(rotated)
+        return rotated
+
+    def renew(
+        self, issued: IssuedDelegation, descriptor: NodeDescriptor, epochs: Iterable[int], unix_s: float
+    ) -> IssuedDelegation:
+        """Issue a delegation again, with the same rights and life. Raises ``LocalError``: as ``issue``."""
         given = issued.delegation
         return self.issue(
             descriptor,
             issued.label,
             issued.metadata,
             given.rights,
-            given.grants,
+            epochs,
             days=issued.days,
             is_own=issued.is_own,
             unix_s=unix_s,

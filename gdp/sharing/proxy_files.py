@@ -75,6 +75,7 @@ class ProxyFiles:
         control_socket: None: at the default place.
         rules: of ``proxy.yaml`` and of the drop-ins of other programs.
         prefix: namespace of this machine on the overlay; empty: none.
+        has_daily_epochs: whether names get a new epoch each day.
     """
 
     path: Path
@@ -84,6 +85,7 @@ class ProxyFiles:
     control_socket: Path | None
     rules: Sequence[StatedRule]
     prefix: str = ""
+    has_daily_epochs: bool = True
 
     @classmethod
     def read(cls, path: Path) -> ProxyFiles:
@@ -106,6 +108,7 @@ class ProxyFiles:
             control_socket=None if socket is None else _path(source, "control_socket", socket),
             rules=tuple(rule for file in files for rule in _rules(read_yaml(file), prefix)),
             prefix=prefix,
+            has_daily_epochs=data.get("epochs") != "manual",
         )
 
     @property

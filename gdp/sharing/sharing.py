@@ -17,7 +17,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
-from gdp.sharing.grants import GIVING, TAKING, Grants, described
+from gdp.sharing.grants import GIVING, SALT, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Side, StatedRule, fits
 from gdp.sharing.report import ShareReport
@@ -32,7 +32,6 @@ from gdp.trust.revocation import Revocation
 __all__ = ["GROUPS", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
-SALT: Final = "salt"  # its key in the metadata
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
@@ -342,7 +341,7 @@ class Sharing:
         _verify(delegation, at)
         offer = Offer(delegation=delegation, sender=mail.sender, received_unix_s=at.grants.unix_s)
         for each in at.offers:
-            if each.delegation.name == delegation.name and each.until_unix_s > offer.until_unix_s:
+            if each.delegation.name == delegation.name and each.age > offer.age:
                 return  # an earlier mail that was delayed
         at.state = self._folder.save_offer(at.state, delegation, mail.sender, at.grants.unix_s)
         at.offers = list(self._folder.offers(at.state))

@@ -147,6 +147,11 @@ class Offer:
         return min(link.validity.not_after_unix_s for link in links_of(self.delegation))
 
     @property
+    def age(self) -> tuple[int, int]:
+        """Return what rises with each offer of a name: when it expires, and its newest epoch."""
+        return self.until_unix_s, max(self.delegation.grants, default=-1)
+
+    @property
     def owner(self) -> PublicKey:
         """Return the public key of the name's owner."""
         return PublicKey.from_compressed(self.delegation.subject.owner_key)

@@ -20,6 +20,7 @@ from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.stores.audit_log import note_once
 from gdp.stores.files import private, public, read_private, read_public, refuse_existing, write_all
+from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import ROOT_CERTIFICATE, ROOT_KEY, load_domain, load_root, save_domain
 from gdp.trust.audit import Action
 
@@ -27,7 +28,6 @@ __all__ = ["NEXT", "RETIRED", "begin_rollover", "finish_rollover", "trust_succes
 
 NEXT: Final = "next"
 RETIRED: Final = "retired"
-_DAY_S: Final = 86_400
 
 
 def begin_rollover(
@@ -52,8 +52,8 @@ def begin_rollover(
     now = time.time() if unix_s is None else unix_s
     refuse_existing(domain / NEXT)
     authority = load_domain(domain)
-    retires_unix_s = int(now + overlap_days * _DAY_S)
-    successor = authority.succeed(key or SigningKey.generate(), Validity.lasting(now, days * _DAY_S), retires_unix_s)
+    retires_unix_s = int(now + overlap_days * DAY_S)
+    successor = authority.succeed(key or SigningKey.generate(), Validity.lasting(now, days * DAY_S), retires_unix_s)
     save_domain(domain / NEXT, successor, passphrase=passphrase)
     _note(domain, "root that succeeds", successor.root, now)
     return successor

@@ -5,11 +5,14 @@ the node's key, signed by the owner. The owner stores one master secret::
 
     secret(name, epoch) = HKDF-SHA256(master, salt "", info "gdp-topic-secret-1" || name || epoch (2)), 32 bytes
     HPKE info           = "gdp-grant-1" || name || epoch (2) || the node's name
+
+Epochs below ``DAILY_FROM`` are numbered by hand, and begin when a node has them. Any other is a day since 1970 (UTC),
+and begins with it. So grants arrive before their day, and all writers change together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
@@ -25,9 +28,22 @@ from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 
-__all__ = ["EPOCH_MAX", "SECRET_BYTES", "Grant", "make_grant", "open_grant", "topic_secret"]
+__all__ = [
+    "DAILY_FROM",
+    "EPOCH_MAX",
+    "EPOCH_S",
+    "SECRET_BYTES",
+    "Grant",
+    "begun_epochs",
+    "daily_epochs",
+    "make_grant",
+    "open_grant",
+    "topic_secret",
+]
 
 EPOCH_MAX: Final = (1 << 16) - 1  # two bytes of the frame header
+EPOCH_S: Final = 86_400
+DAILY_FROM: Final = 10_000
 SECRET_BYTES: Final = 32
 _SECRET_INFO: Final = b"gdp-topic-secret-1"
 _GRANT_INFO: Final = b"gdp-grant-1"
@@ -40,6 +56,24 @@ class Grant:
     name: Name
     epoch: int
     secret: bytes = field(repr=False)
+
+
+def begun_epochs(secrets: Mapping[int, bytes], unix_s: float) -> dict[int, bytes]:
+    """Return the secrets of the epochs that have begun; the first one if none has."""
+    begun = {epoch: secret for epoch, secret in secrets.items() if epoch < DAILY_FROM or epoch * EPOCH_S <= unix_s}
+    return begun or dict(sorted(secrets.items())[:1])
+
+
+def daily_epochs(held: Collection[int], unix_s: float) -> set[int]:
+    """Return the epochs that the members of a topic hold today: the present one, the one before, and tomorrow's.
+
+    The one before opens what its publishers repeat. A day whose eve brought no grant goes on with the present epoch.
+
+    Args:
+        held: epochs that any of the members holds.
+    """
+    today = int(unix_s // EPOCH_S)
+    return {*sorted(each for each in held if each <= today)[-2:], min(today + 1, EPOCH_MAX)}
 
 
 def topic_secret(owner_master: bytes, name: Name, epoch: int) -> bytes:

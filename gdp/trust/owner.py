@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -142,6 +142,19 @@ class Owner:
             grants=MappingProxyType(grants),
             metadata=metadata,
         )
+
+    def regrant(self, given: Delegation, recipient: Recipient, epochs: Iterable[int]) -> Delegation:
+        """Return a delegation with the secrets of other epochs, and with the same chain: no right changes.
+
+        Raises:
+            LocalError, StatementError: as ``delegate``.
+        """
+        grants = {
+            epoch: given.grants.get(epoch)
+            or make_grant(self.key, self.master, given.subject, epoch, given.node, recipient.kem)
+            for epoch in sorted(set(epochs))
+        }
+        return replace(given, grants=MappingProxyType(grants))
 
     def revoke(self, subject: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
         """Return the revocation of an AdCert on one of this owner's names; a successor may revoke what it issued.

@@ -134,6 +134,9 @@ class ProxyConfig(Section):
     status: StatusTopicConfig | None = Field(
         default=None, description="Latched local topic with who publishes, reads, serves and calls."
     )
+    epochs: Literal["daily", "manual"] = Field(
+        default="daily", description="New secrets of shared names each day (UTC), or only by hand."
+    )
     state: StateFolder = None
     metrics: ProxyMetrics | None = Field(default=None, description="Prometheus text and probes.")
     traces: Traces | None = Field(default=None, description="Spans of service calls; needs the extra `otel`.")

@@ -30,7 +30,7 @@ from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
@@ -119,7 +119,7 @@ class ProxyNode:
             self.on_reload()
 
     def reload_on_signal(self) -> None:
-        """Reload after a SIGHUP; an error is logged."""
+        """Reload after a SIGHUP, or when an epoch begins; an error is logged."""
         try:
             self.reload()
         except GdpError as error:
@@ -294,6 +294,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         log_decisions(runtime, plane.ports, node.sources().drops)
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload_on_signal))
+        runtime.every(RECONCILE_PERIOD_S, EpochTimer(node.reload_on_signal).handle_timer)
         notifier.follow(runtime.every)
         control = config.control_socket or control_path(identity.name)
         stack.enter_context(runtime.control(control, node.control_handlers()))

@@ -143,6 +143,9 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
             BridgeContext(node.member, node.traffic, node.faults), DoorRules((), [rule]), [probe], access.held
         )
         node.topics = lambda: flow_rows(bridge.flows, (), node.member)
+        node.on_reload = lambda: bridge.reload(
+            DoorRules((), [rule]), DelegationStore(access.held.directory, node.identity)
+        )
         node.runtime.watch(probe)
         attach_by_s = time.monotonic() + ATTACH_S
         tick_at_s: float | None = attach_by_s

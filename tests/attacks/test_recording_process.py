@@ -84,10 +84,29 @@ def ends(process: int) -> bool:
 
 # --- actions of an exploited decoder
 
-PROBE = """
-import ctypes, json, os, pathlib, resource, socket, sys
+# Numbers of calls that Python has no function for, and arguments that succeed, or fail otherwise than by EPERM.
+CALLS = [
+    ("shmget", {"x86_64": 29, "aarch64": 194}, 0, 4096, 0o1600),
+    ("shmat", {"x86_64": 30, "aarch64": 196}, 0, 0, 0),
+    ("semget", {"x86_64": 64, "aarch64": 190}, 0, 1, 0o1600),
+    ("msgget", {"x86_64": 68, "aarch64": 186}, 0, 0o1600),
+    ("msgrcv", {"x86_64": 70, "aarch64": 188}, 0, 0, 0, 0, 0o4000),
+    ("mq_open", {"x86_64": 240, "aarch64": 180}, b"x", 0, 0, 0),
+    ("mq_unlink", {"x86_64": 241, "aarch64": 181}, b"x"),
+    ("inotify_init1", {"x86_64": 294, "aarch64": 26}, 0),
+    ("ioprio_set", {"x86_64": 251, "aarch64": 30}, 1, 0, 0),
+    ("timer_create", {"x86_64": 222, "aarch64": 107}, 0, 0, 0),
+]
+PROBE = (
+    f"""
+CALLS = {CALLS}
+"""
+    + """
+import ctypes, fcntl, json, os, pathlib, platform, resource, socket, sys, threading
+from gdp.ports.confine import seccomp
 from proxy.recordings.child import confine_decoder
 path, scratch, port, parent = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+inside, outside = os.pipe()
 confine_decoder(path, scratch, 256 << 20, 20, 1 << 20)
 found = {}
 
@@ -95,7 +114,7 @@ def attempt(name, act):
     try:
         act()
         found[name] = "done"
-    except (OSError, MemoryError) as error:
+    except (OSError, MemoryError, RuntimeError) as error:
         found[name] = type(error).__name__
 
 attempt("recording", path.read_bytes)
@@ -116,8 +135,35 @@ attempt("hidden memory", lambda: os.memfd_create("x"))
 attempt("large file", lambda: (scratch / "y").write_bytes(bytes(2 << 20)))
 attempt("limits", lambda: resource.prlimit(parent, resource.RLIMIT_NOFILE))
 attempt("environment", lambda: pathlib.Path(f"/proc/{parent}/environ").read_bytes())
+libc = ctypes.CDLL(None, use_errno=True)
+
+def call(number, *words):
+    if libc.syscall(number, *words) < 0:
+        raise OSError(ctypes.get_errno(), "refused")
+
+for name, numbers, *words in CALLS:
+    attempt(name, lambda: call(numbers[platform.machine()], *words))
+attempt("affinity of another", lambda: os.sched_setaffinity(parent, {0}))
+attempt("priority of another", lambda: os.setpriority(os.PRIO_PROCESS, parent, 1))
+attempt("thread", lambda: threading.Thread(target=print).start())
+attempt("owner of a file", lambda: fcntl.fcntl(inside, fcntl.F_SETOWN, parent))
+attempt("signal of a file", lambda: fcntl.fcntl(inside, fcntl.F_SETSIG, 9))
+attempt("signals of a file", lambda: fcntl.fcntl(inside, fcntl.F_SETFL, os.O_ASYNC))
+attempt("notes of a folder", lambda: fcntl.fcntl(inside, fcntl.F_NOTIFY, fcntl.DN_CREATE))
+attempt("lease of a file", lambda: fcntl.fcntl(inside, fcntl.F_SETLEASE, fcntl.F_RDLCK))
+attempt("owner by ioctl", lambda: fcntl.ioctl(inside, 0x8901, parent))
+attempt("signals by ioctl", lambda: fcntl.ioctl(inside, 0x5452, 1))
+fcntl_number = {"x86_64": 72, "aarch64": 25}[platform.machine()]
+attempt("high half of a command", lambda: call(fcntl_number, inside, ctypes.c_long(1 << 32 | 8), 1))
+listed = set(seccomp.allowed(platform.machine()).values())
+if listed and "Seccomp:\t2" in open("/proc/self/status").read():
+    for number in {*range(335), *range(337, 500)} - listed:  # 335, 336: the kernel's own, of uprobes
+        ctypes.set_errno(0)
+        if libc.syscall(number, 0, 0, 0, 0, 0, 0) >= 0 or ctypes.get_errno() not in (1, 38):
+            found[f"call {number}"] = "done"
 print(json.dumps(found))
 """
+)
 
 
 @pytest.fixture(scope="module")
@@ -161,9 +207,42 @@ def test_b01_a_decoder_that_was_taken_over_reaches_no_other_file(found: dict[str
 
 @pytest.mark.parametrize("act", ["udp", "tcp", "unix", "fork", "mode", "signal", "hidden memory", "limits"])
 def test_b01_a_decoder_that_was_taken_over_has_no_network_process_or_signal(found: dict[str, str], act: str) -> None:
-    if not seccomp.denied(os.uname().machine):
-        pytest.skip("no list of system calls for this machine")
+    needs_list()
     assert found[act] == "PermissionError"
+
+
+@pytest.mark.parametrize("act", [name for name, *_ in CALLS])
+def test_b13_a_decoder_that_was_taken_over_shares_no_memory_queue_or_watch(found: dict[str, str], act: str) -> None:
+    needs_list()
+    assert found[act] == "PermissionError"
+
+
+@pytest.mark.parametrize("act", ["affinity of another", "priority of another", "thread"])
+def test_b13_a_decoder_that_was_taken_over_schedules_nothing(found: dict[str, str], act: str) -> None:
+    needs_list()
+    assert found[act] in ("PermissionError", "RuntimeError")
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        *("owner of a file", "signal of a file", "signals of a file", "notes of a folder", "lease of a file"),
+        *("owner by ioctl", "signals by ioctl", "high half of a command"),
+    ],
+)
+def test_b13_a_decoder_that_was_taken_over_has_no_signals_sent_for_it(found: dict[str, str], act: str) -> None:
+    needs_list()
+    assert found[act] == "PermissionError"
+
+
+def test_b13_every_other_system_call_is_refused(found: dict[str, str]) -> None:
+    needs_list()
+    assert [act for act in found if act.startswith("call ")] == []
+
+
+def needs_list() -> None:
+    if not seccomp.allowed(os.uname().machine):
+        pytest.skip("no list of system calls for this machine")
 
 
 def frames(*parts: tuple[int, bytes]) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -134,3 +135,27 @@ def test_a53_every_refused_call_has_its_number_on_both_machines() -> None:
     assert ours.keys() - theirs.keys() == {"ioperm", "iopl"}
     assert seccomp.denied("x86_64", ["bpf"]).keys() == ours.keys() - {"bpf"}
     assert seccomp.denied("riscv64") == {}
+
+
+HEADERS = {
+    "x86_64": (Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h"), "__NR_"),
+    "aarch64": (Path("/usr/include/asm-generic/unistd.h"), "__NR(?:3264)?_"),
+}
+
+
+@pytest.mark.parametrize("machine", HEADERS)
+def test_b13_the_system_calls_have_the_kernels_numbers(machine: str) -> None:
+    header, prefix = HEADERS[machine]
+    if not header.is_file():
+        pytest.skip("the kernel's headers are not here")
+    numbers = {each[1]: int(each[2]) for each in re.finditer(rf"#define {prefix}(\w+) (\d+)", header.read_text())}
+    numbers.setdefault("newfstatat", numbers.get("fstatat", 0))
+    ours = {**seccomp.denied(machine), **seccomp.allowed(machine)}
+    assert {name: numbers.get(name, number) for name, number in ours.items()} == ours
+    assert len(seccomp.allowed(machine)) <= 90
+
+
+def test_b13_no_call_is_allowed_and_refused() -> None:
+    for machine in HEADERS:
+        assert not seccomp.allowed(machine).keys() & seccomp.denied(machine).keys()
+    assert seccomp.allowed("riscv64") == {}

@@ -10,6 +10,7 @@ import pytest
 
 from gdp.crypto.control_seal import ControlSealer
 from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, Sealer
+from gdp.crypto.records import RecordKey
 from gdp.frame.codec import HEADER_BYTES
 from gdp.frame.kinds import Kind
 from gdp.names import NAME_BYTES
@@ -86,6 +87,18 @@ def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> 
     bodies = [note[HEADER_BYTES + NAME_BYTES : -16] for note in made]
     assert made[0][:HEADER_BYTES] == made[1][:HEADER_BYTES]
     assert xor(*bodies) != xor(ONE, OTHER)
+
+
+def test_a32_copies_of_a_channel_that_use_one_number_give_no_plaintext_and_no_key_away() -> None:
+    """Under GCM two records of one number give away the key of their tags; GCM-SIV is made for this (RFC 8452)."""
+    bodies = [RecordKey(b"k" * 32).seal(7, b"head", body)[:-16] for body in (ONE, OTHER)]
+    assert xor(*bodies) != xor(ONE, OTHER)
+
+
+def test_a32_the_records_of_a_channel_are_those_of_rfc_8452() -> None:
+    key = RecordKey(bytes.fromhex("01".ljust(64, "0")))  # appendix C.2, the second vector
+    sealed = "c2ef328e5c71c83b843122130f7364b761e0b97427e3df28"
+    assert key.seal(3 << 88, b"", bytes([1]).ljust(8, b"\0")).hex() == sealed
 
 
 def test_a32_fresh_bytes_differ_even_where_the_generator_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,12 @@ from gdp.cli import domain_machine
 from gdp.cli.gdp import main
 from gdp.config.config import RibConfig, SwitchConfig
 from gdp.config.relay_config import RelayConfig
+from gdp.enrolment import service_units
 from gdp.enrolment.addresses import default_directory, duration_s, is_private, server_text
+from gdp.enrolment.machine_programs import Machine
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.programs import MachineProgram, programs_of
-from gdp.enrolment.units import install_units, remove_units, unit_texts
+from gdp.enrolment.units import install_units, remove_units
 from gdp.errors import LocalError
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
@@ -180,15 +182,18 @@ def test_a_directory_without_a_domain_is_named(tmp_path: Path, capsys: pytest.Ca
     assert "run gdp join or gdp domain create" in capsys.readouterr().err
 
 
-def test_units_start_the_switch_first_and_quote_their_words(tmp_path: Path) -> None:
-    programs = [
+def test_units_start_the_switch_first_and_quote_their_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_units, "_PRIVATE_TMP", ())
+    programs = (
         MachineProgram(name="switch", title="A switch", argv=("/bin/true", "a b%$")),
         MachineProgram(name="proxy", title="A proxy", argv=("/bin/true",), environment=(("ROS_DISTRO", "jazzy"),)),
-    ]
-    units = unit_texts(tmp_path / "my lab", programs)
+    )
+    directory = tmp_path / "my lab"
+    directory.mkdir()
+    units = service_units.service_texts(Machine(directory=directory, programs=programs, is_member=True))
     assert list(units) == ["gdp-my-lab-switch.service", "gdp-my-lab-proxy.service"]
     assert 'ExecStart=/bin/true "a b%%$$"\n' in units["gdp-my-lab-switch.service"]
-    assert "After=gdp-my-lab-switch.service\n" in units["gdp-my-lab-proxy.service"]
+    assert "After=network-online.target gdp-my-lab-switch.service\n" in units["gdp-my-lab-proxy.service"]
     assert "Environment=ROS_DISTRO=jazzy\n" in units["gdp-my-lab-proxy.service"]
 
 

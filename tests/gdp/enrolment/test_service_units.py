@@ -11,6 +11,7 @@ import pytest
 
 from gdp.enrolment import service_units
 from gdp.enrolment.machine_programs import Machine, read_machine
+from gdp.enrolment.programs import MachineProgram
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import installed_units
 from gdp.errors import LocalError
@@ -53,6 +54,17 @@ def test_keys_below_the_state_folder_keep_the_dynamic_user(machine: Machine, mon
     lines = service_texts(machine)["gdp-robot-switch.service"].splitlines()
     assert {"DynamicUser=yes", "User=gdp", "StateDirectory=gdp-ros"} <= set(lines)
     assert any(line.startswith("ExecStart=") and sys.prefix in line for line in lines)
+
+
+@pytest.mark.parametrize(("workspace", "home"), [("/home/me/ws/install", "read-only"), ("/opt/ws/install", "yes")])
+def test_a_proxy_sees_a_workspace_of_ros_in_a_home(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, workspace: str, home: str
+) -> None:
+    monkeypatch.setattr(service_units, "_HOMES", (Path("/home/me"),))
+    environment = (("ROS_DISTRO", "jazzy"), ("PYTHONPATH", f"/opt/ros/jazzy:{workspace}"))
+    program = MachineProgram(name="proxy", title="A proxy", argv=("/bin/true",), environment=environment)
+    joined = Machine(directory=machine.directory, programs=(program,), is_member=True)
+    assert f"ProtectHome={home}" in service_texts(joined)["gdp-robot-proxy.service"].splitlines()
 
 
 def test_files_that_a_unit_cannot_see_are_refused(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,9 +12,11 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.delegation_store import DelegationStore, EpochTimer
+from gdp.sansio import Timestamps
 from gdp.stores.issue import delegate, make_domain, make_node, make_owner
 from gdp.stores.keyring import DELEGATIONS, load_owner, save_delegation
+from gdp.trust.grants import EPOCH_S
 from gdp.trust.right import Right
 
 CHATTER = Metadata({"kind": "topic", "name": "/chatter", "type": "std_msgs/msg/String"})
@@ -94,3 +96,30 @@ def test_a_file_that_others_can_read_is_refused(tmp_path: Path, robot: Identity)
     path.chmod(0o644)
     with pytest.raises(LocalError, match=path.name):
         held(tmp_path, robot)
+
+
+def test_a_writer_seals_under_tomorrows_epoch_from_tomorrow_on_and_a_reader_opens_it_an_hour_before(
+    tmp_path: Path, robot: Identity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    day = int(time.time() // EPOCH_S) + 1
+    card = tmp_path / "robot" / "node.card"
+    given = delegate(tmp_path / "owner", card, CHATTER, [Right.PUBLISH], [0, day], days=3)
+    save_delegation(tmp_path / "robot" / DELEGATIONS, given, force=True)
+
+    def at(unix_s: float) -> tuple[int, int]:
+        monkeypatch.setattr(time, "time", lambda: unix_s)
+        (topic,) = held(tmp_path, robot)
+        return max(topic.own_secrets), max(topic.secrets)
+
+    begin_s = day * EPOCH_S
+    assert [at(begin_s - 3_601), at(begin_s - 3_599), at(begin_s)] == [(0, 0), (0, day), (day, day)]
+
+
+def test_delegations_are_read_again_an_hour_before_midnight_and_at_midnight() -> None:
+    reloads = list[float]()
+    at_s = 20_000 * EPOCH_S - 7_200.0
+    timer = EpochTimer(lambda: reloads.append(at_s))
+    for _ in range(4 * 60):
+        timer.handle_timer(Timestamps(0.0, at_s))
+        at_s += 60.0
+    assert reloads == [20_000 * EPOCH_S - 3_600.0, 20_000 * EPOCH_S]

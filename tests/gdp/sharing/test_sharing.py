@@ -326,7 +326,8 @@ def test_delegations_are_renewed_at_two_thirds_of_their_life(site: Site, robot: 
     for _ in range(5):
         before = robot.held, server.held
         site.now_s += 19 * DAY_S
-        assert robot.sharing.work(site.now_s).granted == []
+        robot.sharing.work(site.now_s)
+        assert [links_of(each) for (each,) in (robot.held, server.held)] == [links_of(each) for (each,) in before]
         site.now_s += 1.5 * DAY_S
         assert site.upkeep() == []
         for machine, (old,) in zip((robot, server), before, strict=True):
@@ -334,6 +335,84 @@ def test_delegations_are_renewed_at_two_thirds_of_their_life(site: Site, robot: 
             assert (new.rights, new.metadata) == (old.rights, old.metadata)
             left_s = links_of(new)[0].validity.not_after_unix_s - site.now_s
             assert 29.9 * DAY_S < left_s <= 30 * DAY_S
+
+
+def epochs_of(machine: Machine) -> set[int]:
+    (held,) = machine.held
+    return set(held.grants)
+
+
+def test_a_name_gets_the_epoch_of_each_day_before_the_day(site: Site, robot: Machine, server: Machine) -> None:
+    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    first = int(site.now_s // DAY_S)
+    chains = [links_of(each) for (each,) in (robot.held, server.held)]
+    for day in range(first + 1, first + 10):
+        assert epochs_of(robot) == epochs_of(server)
+        assert day in epochs_of(server)
+        site.now_s = day * DAY_S + 5.0
+        reloads = robot.reloads
+        assert site.upkeep() == []
+        assert epochs_of(robot) == epochs_of(server) == {day - 1 if day > first + 1 else 0, day, day + 1}
+        assert site.upkeep() == []
+        assert robot.reloads == reloads + 1  # once a day, and nothing until the next
+    assert [links_of(each) for (each,) in (robot.held, server.held)] == chains
+
+
+def test_a_machine_that_was_off_for_days_gets_the_present_epoch_when_it_is_back(
+    site: Site, robot: Machine, server: Machine
+) -> None:
+    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    today = int(site.now_s // DAY_S)
+    for day in range(today, today + 5):
+        site.now_s = day * DAY_S + 5.0
+        robot.sharing.work(site.now_s)
+    server.sharing.work(site.now_s)
+    assert epochs_of(server) == epochs_of(robot) == {today + 3, today + 4, today + 5}
+
+
+def test_epochs_wait_for_an_owner_that_was_off_and_a_new_node_gets_those_in_use(
+    site: Site, robot: Machine, server: Machine, stack: ExitStack
+) -> None:
+    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    today = int(site.now_s // DAY_S)
+    site.now_s += 3 * DAY_S
+    site.upkeep()
+    assert epochs_of(robot) == epochs_of(server) == {0, today + 1, today + 4}  # today + 1 goes on until tomorrow
+    laptop = site.add("laptop")
+    laptop.start(stack)
+    robot.sharing.share(robot.owner, "/camera/image", ["laptop"], site.now_s, type_name=IMAGE, days=30)
+    laptop.sharing.accept(importing("/camera/image"), site.now_s)
+    assert epochs_of(laptop) == epochs_of(robot)
+
+
+def test_a_revoked_node_and_one_that_left_get_no_later_epoch(site: Site, robot: Machine, server: Machine) -> None:
+    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    site.add("laptop")
+    robot.sharing.share(robot.owner, "/camera/image", ["laptop"], site.now_s, type_name=IMAGE, days=30)
+    robot.sharing.revoke(robot.owner, "/camera/image", "server", kept_in([]), site.now_s)
+    del site.directory.cards["laptop"]
+    before = int(site.now_s // DAY_S) + 1
+    site.now_s += 2 * DAY_S
+    robot.sharing.work(site.now_s)
+    newest = {each.label: max(each.delegation.grants) for each in IssuedStore(robot.owner)}
+    assert newest == {"robot": before + 2, "server": before, "laptop": before}
+
+
+@pytest.mark.parametrize("is_plain", [False, True])
+def test_epochs_by_hand_and_those_of_plain_names_stay_as_they_are(
+    site: Site, stack: ExitStack, *, is_plain: bool
+) -> None:
+    robot, server = site.add("robot", "" if is_plain else "epochs: manual\n"), site.add("server")
+    robot.start(stack)
+    wanted = robot.exposing("/camera/image", "server", type_name=IMAGE)
+    robot.sharing.expose(wanted, site.now_s, is_plain=is_plain)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    site.now_s += 3 * DAY_S
+    robot.sharing.work(site.now_s)
+    assert epochs_of(robot) == epochs_of(server) == {0}
 
 
 def test_a_machine_that_has_left_the_domain_gets_no_renewal(site: Site, robot: Machine, server: Machine) -> None:

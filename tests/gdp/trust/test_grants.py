@@ -6,12 +6,24 @@ import hashlib
 import hmac
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
-from gdp.trust.grants import EPOCH_MAX, Grant, make_grant, open_grant, topic_secret
+from gdp.trust.grants import (
+    DAILY_FROM,
+    EPOCH_MAX,
+    EPOCH_S,
+    Grant,
+    begun_epochs,
+    daily_epochs,
+    make_grant,
+    open_grant,
+    topic_secret,
+)
 from tests.gdp.trust.world import CAMERA, GATEWAY, LAB, ROBOT
 
 WIRE = make_grant(LAB.key, LAB.master, CAMERA, 3, ROBOT.name, ROBOT.kem.public)
@@ -90,3 +102,27 @@ def test_a_master_of_another_length_is_our_own_mistake() -> None:
 def test_a_repr_shows_no_secret() -> None:
     grant = open_grant(ROBOT, WIRE)
     assert repr(grant.secret) not in repr(grant)
+
+
+@given(
+    days=st.lists(st.integers(DAILY_FROM + 1, DAILY_FROM + 40), min_size=1, max_size=20).map(sorted),
+    by_hand=st.sets(st.integers(0, 5), min_size=1),
+)
+def test_members_that_hold_the_epochs_of_a_day_open_what_is_sealed_until_the_next(
+    days: list[int], by_hand: set[int]
+) -> None:
+    """Whatever days the owner works on, what seals changes at a day's begin only, to what was held before."""
+    held, newest = by_hand, max(by_hand)
+    for day in days:
+        unix_s = day * EPOCH_S + 1.0
+        sealing = max(begun_epochs(dict.fromkeys(held, b""), unix_s))
+        assert sealing in (newest, max(held))
+        after = daily_epochs(held, unix_s)
+        assert max(begun_epochs(dict.fromkeys(after, b""), unix_s)) == sealing
+        assert day + 1 in after
+        assert len(after) <= 3
+        held, newest = after, sealing
+
+
+def test_a_clock_of_long_ago_still_has_a_secret() -> None:
+    assert begun_epochs({DAILY_FROM + 2: b"b", DAILY_FROM + 1: b"a"}, 0.0) == {DAILY_FROM + 1: b"a"}
