@@ -13,7 +13,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.fact_gathering import FactGathering, LocalDirectory, local_directory
-from gdp.cli.local_nodes import local_nodes, nearest
+from gdp.cli.local_nodes import local_nodes
 from gdp.diagnosis.answer import Answer, Verdict
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.errors import LocalError
@@ -74,7 +74,7 @@ def _nodes(given: list[str]) -> tuple[LocalDirectory, list[LocalDirectory]]:
             raise LocalError(f"--node {given[0]}: the first node is the proxy that asks; this is a {nodes[0].role}")
         return nodes[0], nodes[1:]
     running = local_nodes()
-    proxies = nearest([each for each in running if each.role == "proxy"])
+    proxies = [each for each in running if each.role == "proxy"]
     if len(proxies) > 1:
         listed = ", ".join(each.title for each in proxies)
         raise LocalError(f"several proxies run here ({listed}); say which asks: --node PROXY_DIR")

@@ -6,8 +6,8 @@ which works while the network is torn.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -59,17 +59,22 @@ class FactGathering:
         """
         survey, pid = Survey(self._asked), None
         with ExitStack() as stack:
-            near = self._connect(self._near, survey, stack)
+            near: NodeConnection | None = None
+            with _listed_if_silent(self._near, survey):
+                near = self._connect(self._near, survey, stack)
             if near is not None:
-                status = near.status()
-                pid = status.get("pid")
-                reply = near.ask(ASK, target=str(status.get("name")), body={"q": self._asked})
-                survey.add("proxy", _result(reply), is_near=True)
+                with _listed_if_silent(self._near, survey):
+                    status = near.status()
+                    pid = status.get("pid")
+                    reply = near.ask(ASK, target=str(status.get("name")), body={"q": self._asked})
+                    survey.add("proxy", _result(reply), is_near=True)
             for each in self._others:
-                self._ask_directly(each, survey, stack)
-            for round_, role in enumerate(ROLES if near is not None else ()):
-                assert near is not None
-                self._ask_round(near, role, survey.targets(round_), survey, is_near=round_ == 0)
+                with _listed_if_silent(each, survey):
+                    self._ask_directly(each, survey, stack)
+            if near is not None:
+                with _listed_if_silent(self._near, survey):
+                    for round_, role in enumerate(ROLES):
+                        self._ask_round(near, role, survey.targets(round_), survey, is_near=round_ == 0)
         facts = survey.facts()
         return self._with_host(facts, pid if isinstance(pid, int) else None) if with_host else facts
 
@@ -78,8 +83,6 @@ class FactGathering:
             return stack.enter_context(NodeConnection(node.socket))
         except NotRunningError:
             survey.add_silent(node.role or "node", node.place, "no process serves its control socket", is_down=True)
-        except LocalError as error:
-            survey.add_silent(node.role or "node", node.place, str(error))
         return None
 
     def _ask_directly(self, node: LocalDirectory, survey: Survey, stack: ExitStack) -> None:
@@ -130,6 +133,15 @@ def local_directory(place: str) -> LocalDirectory:
     socket = find_control_socket(path)
     role = load_card(path / CARD).stranger.role.value if (path / CARD).exists() else ""
     return LocalDirectory(place, socket, "switch" if role == "leaf" else role)
+
+
+@contextmanager
+def _listed_if_silent(node: LocalDirectory, survey: Survey) -> Iterator[None]:
+    """List a node that refuses a request, or ends, among those not asked."""
+    try:
+        yield
+    except LocalError as error:
+        survey.add_silent(node.role or "node", node.place, str(error))
 
 
 def _is_lacking(reply: Mapping[str, object], *, is_last: bool) -> bool:

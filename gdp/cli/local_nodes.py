@@ -5,7 +5,7 @@ I/O.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Optional
@@ -17,7 +17,7 @@ from gdp.management.control_client import NodeConnection, NotRunningError, find_
 from gdp.management.running_nodes import RunningNode, find_running_nodes
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Node", "connect", "find_name", "local_nodes", "names_of_machine", "nearest"]
+__all__ = ["Node", "connect", "find_name", "local_nodes", "names_of_machine"]
 
 Node = Annotated[
     Optional[str],  # noqa: UP045
@@ -31,17 +31,13 @@ Node = Annotated[
 _HEX_DIGITS = 2 * NAME_BYTES
 
 
-def local_nodes() -> list[RunningNode]:
-    """Return the running nodes of this host whose control socket has its usual name and is open to this user.
+def local_nodes(*, is_host: bool = False) -> list[RunningNode]:
+    """Return the running nodes of this machine whose control socket has its usual name and is open to this user.
 
-    What a dead process left, and what belongs to another user, cannot be asked.
+    What a dead process left, and what belongs to another user, cannot be asked. ``is_host``: those of all its network
+    namespaces; otherwise as ``find_running_nodes`` says.
     """
-    return sorted(find_running_nodes(is_host=True).nodes, key=lambda node: (node.role, node.title))
-
-
-def nearest(nodes: Sequence[RunningNode]) -> list[RunningNode]:
-    """Return the nodes of this network namespace; without any, all of them."""
-    return [each for each in nodes if each.is_near] or list(nodes)
+    return sorted(find_running_nodes(is_host=is_host).nodes, key=lambda node: (node.role, node.title))
 
 
 @contextmanager
@@ -62,7 +58,7 @@ def _socket_of(node: str | None) -> Path:
             return path
         if path.is_dir():
             return find_control_socket(path)
-        nodes = local_nodes()
+        nodes = local_nodes(is_host=True)
         named = [each for each in nodes if node in (each.title, each.name.to_text())]
         if len(named) == 1:
             return named[0].socket
@@ -70,7 +66,7 @@ def _socket_of(node: str | None) -> Path:
         raise LocalError(f"--node {node}: {word} this name; say --node DIR{_listed(nodes)}")
     nodes = local_nodes()
     for role in ("proxy", "switch", "leaf"):
-        fitting = nearest([each for each in nodes if each.role == role])
+        fitting = [each for each in nodes if each.role == role]
         if len(fitting) == 1:
             return fitting[0].socket
         if fitting:

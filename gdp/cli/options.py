@@ -18,6 +18,7 @@ __all__ = [
     "Description",
     "Directory",
     "Force",
+    "Host",
     "Json",
     "KeyUri",
     "Kind",
@@ -44,6 +45,7 @@ More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="fu
 _DAYS_MAX = CERTIFICATE_LIFE_MAX_S / 86_400
 Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
 Force = Annotated[bool, typer.Option("--force", help="replace what is there")]
+Host = Annotated[bool, typer.Option("--host", help="Nodes of other network namespaces of this host, too.")]
 Days = Annotated[float, typer.Option("--days", min=0.001, max=_DAYS_MAX, help="how long it is valid")]
 Label = Annotated[str, typer.Option("--label", help="its name for people")]
 Directory = Annotated[Path, typer.Argument(metavar="DIR", help="where its files are, or are made")]

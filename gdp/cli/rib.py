@@ -9,6 +9,7 @@ import typer
 
 from gdp.cli.completion import allow_completion
 from gdp.cli.node import (
+    AWAIT_IFACE_S,
     AwaitIface,
     Check,
     Config,
@@ -42,7 +43,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @app.command(context_settings=HELP, epilog="Example: gdp-rib --config rib.yaml")
 def rib(
     config: Config,
-    await_iface: AwaitIface = 0.0,
+    await_iface: AwaitIface = AWAIT_IFACE_S,
     data_plane: MemberPlane = None,
     check: Check = False,
     json: Json = False,

@@ -14,8 +14,9 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.completion import complete_node
+from gdp.cli.options import Host
 from gdp.cli.output import moment, show
-from gdp.cli.topic import Host, KnownName, Sockets, none_runs
+from gdp.cli.topic import KnownName, Sockets, none_runs
 from gdp.errors import LocalError
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.management.running_nodes import RunningNode, find_running_nodes, read_topics
@@ -90,7 +91,7 @@ def _nodes(node: Path | None, sockets: list[Path], *, is_host: bool) -> list[Run
     for role in ("switch", "leaf", "rib"):
         if chosen := [each for each in found.nodes if each.role == role]:
             return chosen
-    raise none_runs(found)
+    raise none_runs()
 
 
 def _overlay_name(text: str, type_name: str, *, is_host: bool) -> Name:

@@ -14,6 +14,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.local_nodes import connect, local_nodes
+from gdp.cli.options import Host
 from gdp.cli.tables import print_table, select_columns
 from gdp.errors import LocalError
 from gdp.management.control_client import NodeConnection, NotRunningError
@@ -53,7 +54,9 @@ Columns = Annotated[
 ]
 
 
-def show_table(what: What, node: OneNode = None, columns: Columns = None, as_json: options.Json = False) -> None:
+def show_table(
+    what: What, node: OneNode = None, host: Host = False, columns: Columns = None, as_json: options.Json = False
+) -> None:
     """Show a table of every node that runs on this machine, or of one.
 
     neighbors: the nodes at the other ends of our links. links: our devices. routes: the forwarding table of a switch.
@@ -69,7 +72,7 @@ def show_table(what: What, node: OneNode = None, columns: Columns = None, as_jso
       gdp show routes --json | jq '.rows[].destination'
       gdp show names --columns local,name
     """
-    rows = _of_one(what, node) if node is not None else _of_all(what)
+    rows = _of_one(what, node) if node is not None else _of_all(what, is_host=host)
     if as_json:
         echo(json.dumps({"table": what.value, "rows": rows}))
         return
@@ -85,8 +88,8 @@ def _of_one(what: Table, node: str) -> list[Mapping[str, object]]:
         return connection.show(what.value)
 
 
-def _of_all(what: Table) -> list[Mapping[str, object]]:
-    nodes = local_nodes()
+def _of_all(what: Table, *, is_host: bool) -> list[Mapping[str, object]]:
+    nodes = local_nodes(is_host=is_host)
     if not nodes:
         raise NotRunningError("no node of this user runs here, or its control_socket is elsewhere; say --node DIR")
     rows: list[Mapping[str, object]] = []

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from gdp.cli.options import Host
 from gdp.cli.output import show
-from gdp.cli.topic import Host, JsonLines, Sockets, answers_of
+from gdp.cli.topic import JsonLines, Sockets, answers_of
 from gdp.management.running_nodes import find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, rated_rows
 from gdp.printable import escaped

@@ -14,6 +14,7 @@ import typer
 
 from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
+from gdp.cli.options import Host
 from gdp.cli.output import show
 from gdp.crypto.certificates import Role
 from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
@@ -26,7 +27,7 @@ from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
 from gdp.terminal import echo
 
-__all__ = ["Host", "JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
+__all__ = ["JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
 
 _NOT_RUNNING: Final = 3
 _UNKNOWN: Final = 1
@@ -43,7 +44,6 @@ Sockets = Annotated[
     list[Path],
     typer.Option("--socket", metavar="FILE", help="A node's control_socket, where its configuration names one."),
 ]
-Host = Annotated[bool, typer.Option("--host", help="Nodes of other network namespaces of this host, too.")]
 Seconds = Annotated[float, typer.Option("--seconds", min=0.05, help="Time over which rates are measured.")]
 JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")]
 
@@ -144,18 +144,16 @@ def answers_of(sockets: Sequence[Path], *, is_host: bool, is_needed: bool = True
     for problem in found.problems:
         echo(f"gdp: left out: {problem}", err=True)
     if not answers and is_needed:
-        raise none_runs(found)
+        raise none_runs()
     for answer in answers:
         if answer.left_out:
             echo(f"gdp: {answer.node.label}: {answer.left_out} names with fewer messages left out", err=True)
     return found, answers
 
 
-def none_runs(found: Found) -> typer.Exit:
+def none_runs() -> typer.Exit:
     """Report that no node runs that could answer; return the end of the command, with exit code 3."""
-    more = f"; {found.elsewhere} run in other network namespaces: --host asks them" if found.elsewhere else ""
-    text = "no switch or proxy runs on this machine, as far as this user may see; start one, or use sudo"
-    echo(f"gdp: {text}{more}", err=True)
+    echo("gdp: no switch or proxy runs on this machine, as far as this user may see; start one, or use sudo", err=True)
     return typer.Exit(_NOT_RUNNING)
 
 

@@ -48,7 +48,8 @@ class Wait:
     Args:
         port: index of the port concerned, if any.
         domain: label of a stranger's domain; unproven, maybe empty.
-        name: of the neighbour, of the refused advertisement, of one switch that is cut off, or of the RIB above.
+        name: of the neighbour or the last one there, of the refused advertisement, of one switch that is cut off, or of
+            the RIB above.
         refused: why a hello or an advertisement was refused.
     """
 
@@ -88,7 +89,7 @@ def port_waits(port: HelloPort, wanted: Collection[Role]) -> Iterator[Wait]:
     elif neighbours:
         yield Wait(WaitReason.NO_SWITCH, port.index)
     else:
-        yield Wait(WaitReason.NO_NEIGHBOUR, port.index)
+        yield Wait(WaitReason.NO_NEIGHBOUR, port.index, name=next(reversed(port.qualities), None))
 
 
 def stranger_waits(hello_protocol: HelloProtocol, now_s: float) -> Iterator[Wait]:
@@ -101,7 +102,8 @@ def stranger_waits(hello_protocol: HelloProtocol, now_s: float) -> Iterator[Wait
 def wait_fact(wait: Wait, device: str) -> WaitFact:
     """Return a wait as a fact of a diagnosis; ``device``: of its port, empty without one."""
     refused = "" if wait.refused is None else wait.refused.label
-    return WaitFact(reason=wait.reason.value, device=device, domain=wait.domain, refused=refused)
+    neighbour = "" if wait.port is None or wait.name is None else wait.name.to_text()
+    return WaitFact(reason=wait.reason.value, device=device, domain=wait.domain, neighbour=neighbour, refused=refused)
 
 
 @dataclass(slots=True)

@@ -33,11 +33,13 @@ class WaitFact:
         reason: value of ``WaitReason``.
         device: network device concerned.
         domain: label of a refused neighbour's domain, unproven.
+        neighbour: name of the node that was heard there last.
         refused: label of the reason of a refusal.
     """
 
     reason: str
     device: str = ""
+    neighbour: str = ""
     domain: str = ""
     refused: str = ""
 

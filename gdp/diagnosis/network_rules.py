@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.diagnosis.facts import ProxyFacts, RibFacts
+from gdp.diagnosis.facts import SwitchFacts
 from gdp.diagnosis.view import Node, View, short
 from gdp.limits import CLOCK_SKEW_S
 
@@ -131,13 +131,13 @@ def switch_down(view: View) -> Found:
 
 
 def ethertype_filtered(view: View) -> Found:
-    """Two switches run, their link is up, and neither hears the other."""
-    if not view.is_torn:
-        return None
-    silent = [(node, wait) for node, wait in view.waits(*_SILENT) if not isinstance(node, RibFacts | ProxyFacts)]
-    names = {node.name for node, _ in silent}
-    if len(names) > 1 and not any(each.is_down for each in view.facts.unreachable):
-        node, wait = silent[0]
+    """Two switches run, were neighbours on a link that is up, and neither hears the other."""
+    waits = view.waits(*_SILENT) if view.is_torn else ()
+    silent = [(node, wait) for node, wait in waits if isinstance(node, SwitchFacts)]
+    missed = {(wait.neighbour, node.name) for node, wait in silent}
+    for node, wait in silent:
+        if (node.name, wait.neighbour) not in missed:
+            continue
         text = f"The link at {wait.device} of {view.place_of(node)} is up and both ends run, but no hello passes"
         return f"{text}: something in between filters EtherType 0x88B5.", (
             f"tcpdump -eni {wait.device or 'DEVICE'} ether proto 0x88b5"

@@ -30,7 +30,7 @@ from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.stores.files import read_public
 from gdp.switch.core import SwitchCore
-from gdp.switch.direct_tunnels import Close, Open, Retry
+from gdp.switch.direct_tunnels import Close, Open, Retry, Silence
 from gdp.trust.domain import Policy
 
 __all__ = ["LINKS_PERIOD_S", "TunnelLinks"]
@@ -78,6 +78,7 @@ class TunnelLinks:
         self._own = OwnEndpoints(config=config, identity=identity, switch=switch, tunnels=self._tunnels)
         self._files: dict[Path, tuple[int, int]] = {}  # size and time of what was read
         self._configured: dict[Path, _Peer] = {}
+        self._direct: dict[Name, str] = {}  # labels of the peers of direct tunnels
         self._dialers: dict[TunnelId, Dialer] = {}
         self._retry_s: dict[TunnelId, float] = {}
         self._reported: set[TunnelId] = set()
@@ -108,7 +109,7 @@ class TunnelLinks:
 
     def status(self, now: Timestamps) -> list[dict[str, object]]:
         """Return the JSON fields of each tunnel."""
-        labels = {each.record.name: each.member.label for each in self._configured.values()}
+        labels = self._direct | {each.record.name: each.member.label for each in self._configured.values()}
         return [self._row(tunnel, found, labels, now) for tunnel, found in self._tunnels.all.items()]
 
     def _row(self, tunnel: TunnelId, found: Tunnel, labels: Mapping[Name, str], now: Timestamps) -> dict[str, object]:
@@ -125,6 +126,7 @@ class TunnelLinks:
             "handshake_age_s": age_s,
             "mtu": found.mtu,
             "up": neighbour is not None,
+            "why": self._switch.tunnel_failure(tunnel.peer) if found.is_direct and neighbour is None else "",
         }
 
     # configured peers
@@ -234,6 +236,9 @@ class TunnelLinks:
             match action:
                 case Close(peer):
                     self._tunnels.close_peer(peer, now.mono_s)
+                    self._direct.pop(peer, None)
+                case Silence(record):
+                    self._tunnels.silence(record.name)
                 case Open(record, candidate, uplink, peer_uplink) | Retry(record, candidate, uplink, peer_uplink):
                     tunnel = TunnelId(record.name, uplink, peer_uplink)
                     endpoint = None if candidate is None else candidate.endpoint
@@ -251,8 +256,10 @@ class TunnelLinks:
 
     def _is_served(self, record: EndpointRecord, now: Timestamps) -> bool:
         try:
-            self._check_served(self._policy.verify_membership(record.membership, now.unix_s))
+            member = self._policy.verify_membership(record.membership, now.unix_s)
+            self._check_served(member)
         except GdpError as error:
             log.debug("no direct tunnel peer=%s reason=%s", record.name.short, error)
             return False
+        self._direct[record.name] = member.label
         return True

@@ -237,6 +237,17 @@ class Tunnels:
             at = "?" if endpoint is None else endpoint.to_text()
             log.warning("not dialled peer=%s endpoint=%s reason=%s", tunnel.peer.short, at, error)
 
+    def silence(self, peer: Name) -> None:
+        """Send nothing to a peer until it sends, or is dialled."""
+        for tunnel, found in self._tunnels.items():
+            if tunnel.peer == peer and found.is_direct:
+                device = self._underlays[tunnel.uplink]
+                try:
+                    device.remove_peer(found.key)
+                    device.set_peer(found.key, inner=found.inner, endpoint=None, keepalive_s=found.keepalive_s)
+                except LocalError as error:
+                    log.warning("not silenced peer=%s reason=%s", peer.short, error)
+
     def close(self, tunnel: TunnelId, now_s: float) -> None:
         """Remove a tunnel with its port; its neighbour is lost at once."""
         found = self._tunnels.pop(tunnel)

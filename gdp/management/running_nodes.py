@@ -1,7 +1,7 @@
 """Running nodes of this machine, as far as this user may ask them: found by their control sockets.
 
 I/O. Control sockets are host-wide. A machine of a simulated topology is a network namespace, so nodes of other
-namespaces count as other machines, unless the caller wants the whole host.
+namespaces count as other machines, unless the caller wants the whole host or no node runs in its own namespace.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
 from gdp.management.control_client import NotRunningError, ask_node, control_sockets
 from gdp.names import Name
@@ -20,6 +21,7 @@ from gdp.state.topic_rows import TopicRow, rows_from_fields
 __all__ = ["Found", "NodeTopics", "RunningNode", "find_running_nodes", "read_topics"]
 
 ANSWER_S: Final = 2.0
+_ROLES: Final = frozenset(each.value for each in Role)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,6 @@ class Found:
     """Nodes that answered, and the reasons of those that did not."""
 
     nodes: list[RunningNode] = field(default_factory=list)
-    elsewhere: int = 0  # in other network namespaces, left out
     problems: list[str] = field(default_factory=list)
 
 
@@ -78,7 +79,7 @@ def find_running_nodes(sockets: Sequence[Path] = (), *, is_host: bool = False) -
 
     Args:
         sockets: control sockets that configurations name, apart from those in the usual directories.
-        is_host: nodes of all network namespaces; otherwise those of this process's, and those of ``sockets``.
+        is_host: nodes of all network namespaces; else those of this process's and of ``sockets``, if any run.
     """
     found = Found()
     for path in [*control_sockets(), *sockets]:
@@ -94,10 +95,10 @@ def find_running_nodes(sockets: Sequence[Path] = (), *, is_host: bool = False) -
         node = _node(path, response)
         if node is None or node in found.nodes:
             continue
-        if is_host or path in sockets or node.is_near:
-            found.nodes.append(node)
-        else:
-            found.elsewhere += 1
+        found.nodes.append(node)
+    near = [each for each in found.nodes if each.is_near or each.socket in sockets]
+    if near and not is_host:
+        found.nodes = near
     found.nodes.sort(key=lambda node: (node.role, node.name))
     return found
 
@@ -131,9 +132,9 @@ def _is_near(pid: object) -> bool:
 
 
 def _node(path: Path, response: Response) -> RunningNode | None:
-    """Return the node of a status; None: it is no node with a name, such as a supervisor or a relay."""
+    """Return the node of a status; None: it keeps no names, such as a supervisor or a relay."""
     role, name, label = (response.result.get(key) for key in ("role", "name", "label"))
-    if not isinstance(role, str) or not isinstance(name, str):
+    if not isinstance(role, str) or not isinstance(name, str) or role not in _ROLES:
         return None
     try:
         is_near = _is_near(response.result.get("pid"))

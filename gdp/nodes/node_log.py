@@ -153,7 +153,11 @@ class NodeLog:
             case WaitReason.NO_SWITCH:
                 return f"no switch on {ifname}: its neighbours are RIBs or proxies"
             case WaitReason.NO_RIB:
-                return "no RIB of this domain can be reached" if self._rib is not None else "no RIB answers the switch"
+                return (
+                    "no RIB of this domain can be reached"
+                    if self._rib is not None
+                    else "no RIB answers the switch: start gdp-rib"
+                )
             case WaitReason.NO_UPPER_RIB:
                 return (
                     f"RIB {name} above does not answer: what it gave is kept, new names of other domains are not found"

@@ -440,6 +440,10 @@ class SwitchCore:
         """Record that WireGuard completed a handshake with a peer of ``poll_tunnel_actions``."""
         self._tunnels.answered(name, now.mono_s)
 
+    def tunnel_failure(self, name: Name) -> str:
+        """Return why the direct tunnel to a peer is not up; empty: it is up, or too young to say."""
+        return self._tunnels.failure(name)
+
     def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
         """Return our own endpoints as neighbours over tunnels see them, by port and neighbour."""
         return self.hello_protocol.observed_addresses()

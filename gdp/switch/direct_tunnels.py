@@ -5,6 +5,10 @@ candidates and their checks, with WireGuard's handshake as the check. Both ends 
 same list of pairs, try each pair for the same time, and draw the same pauses between rounds. They start when the newer
 of the two records arrives, which is nearly at once at both: each end's packets open its NAT for those of the other.
 
+A NAT that accepts packets itself (Linux with an open ``input`` chain) remembers those of a peer that came before the
+own ones left, and maps these to another port as long as it does: conntrack's 30 s after the last. So after some rounds
+both ends fall silent for longer, and then start by chance up to half a second apart.
+
 WireGuard sends replies to where a valid packet came from. So it suffices that one end reaches the other, and that the
 other has its peer configured: a peer stays configured in all pauses, until ``Close``.
 
@@ -32,7 +36,7 @@ from gdp.limits import DIRECT_TUNNELS_MAX
 from gdp.names import Name
 from gdp.token_bucket import TokenBuckets
 
-__all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Slot", "slots_between"]
+__all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Silence", "Slot", "slots_between"]
 
 SLOT_S: Final = 1.0  # each pair is tried for this time
 _PAIRS_MAX: Final = 4  # of one type
@@ -40,6 +44,9 @@ _ROUNDS_AT_ONCE: Final = 3  # before the first pause: the first packet of one en
 _PAUSE_FIRST_S: Final = 2.0  # it doubles with each round
 _PAUSE_MAX_S: Final = 60.0
 _JITTER: Final = 0.25  # of a pause, up or down
+_SILENT_FROM: Final = 3  # the fourth pause, and later ones, are silent
+_SILENCE_S: Final = 32.0  # longer than nf_conntrack_udp_timeout, 30 s
+_STAGGER_S: Final = 0.5  # between the two ends after a silence, at most; in half of the rounds there is none
 _RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
 _MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
@@ -79,13 +86,19 @@ class Retry(NamedTuple):
     peer_uplink: int = 0
 
 
+class Silence(NamedTuple):
+    """Send nothing to the peer of a record any more; it stays configured, and what it sends is answered."""
+
+    record: EndpointRecord
+
+
 class Close(NamedTuple):
     """Remove the peer of this name, and its port."""
 
     name: Name
 
 
-Action = Open | Retry | Close
+Action = Open | Retry | Silence | Close
 
 
 class _Class(IntEnum):
@@ -182,6 +195,8 @@ class _Attempt:
     record: EndpointRecord
     slots: list[Slot]
     due_s: float  # of the next action
+    silent_s: float = float("inf")  # when a silence begins
+    stagger_s: float = 0.0  # by how much the present round is late
     at: int = 0  # slot that is due
     round: int = 0
     configured: set[tuple[int, int]] = field(default_factory=set)  # pairs of uplinks
@@ -260,6 +275,16 @@ class DirectTunnels:
         attempt = self._attempts.get(name)
         if attempt is not None and not attempt.is_up:
             attempt.due_s = max(attempt.due_s, now_s + _HOLD_S)
+            attempt.silent_s = float("inf")
+
+    def failure(self, name: Name) -> str:
+        """Return why the tunnel to a peer is not up, as far as known; empty: it is up, or too young to say."""
+        attempt = self._attempts.get(name)
+        if attempt is None or attempt.is_up or attempt.round < _ROUNDS_AT_ONCE:
+            return ""
+        sent = any(each.candidate is not None for each in attempt.slots)
+        what = "no answer from its endpoints" if sent else "it has no endpoint that can be reached, and sends nothing"
+        return f"{what} in {attempt.round} rounds: a NAT or firewall on the way is closed, or maps to other ports"
 
     def _update(
         self,
@@ -286,13 +311,16 @@ class DirectTunnels:
             attempt.is_up = False
         if not attempt.is_up:
             attempt.due_s, attempt.at, attempt.round = now_s, 0, 0
+            attempt.silent_s, attempt.stagger_s = float("inf"), 0.0
 
     @staticmethod
     def _watch(attempt: _Attempt, now_s: float, *, is_up: bool, is_linked: bool) -> None:
         if attempt.is_up and not is_up:
             wait_s = 0.0 if now_s - attempt.changed_s <= _MOVED_S else _RECOVER_S
-            attempt.due_s, attempt.at, attempt.round = now_s + wait_s, 0, 0
+            attempt.due_s, attempt.at, attempt.round, attempt.stagger_s = now_s + wait_s, 0, 0, 0.0
         attempt.is_up = is_up and bool(attempt.configured)
+        if attempt.is_up:
+            attempt.silent_s = float("inf")
         if not is_linked:
             attempt.linked_s = None
         elif attempt.linked_s is None:
@@ -310,6 +338,9 @@ class DirectTunnels:
 
     def _attempt(self, attempt: _Attempt, now_s: float) -> list[Action]:
         """Return the action of the slot that is due now; slots that this node was too late for are left out."""
+        if now_s >= attempt.silent_s:
+            attempt.silent_s = float("inf")
+            return [Silence(attempt.record)]
         if attempt.is_up or now_s < attempt.due_s:
             return []
         slot = attempt.slots[attempt.at]
@@ -318,7 +349,12 @@ class DirectTunnels:
             attempt.due_s += SLOT_S
             attempt.at += 1
             if attempt.at == len(attempt.slots):
-                attempt.due_s += self._pause_s(attempt.record.name, attempt.round)
+                pause_s = self._pause_s(attempt.record.name, attempt.round)
+                if pause_s >= _SILENCE_S and any(each.candidate is not None for each in attempt.slots):
+                    attempt.silent_s = attempt.due_s
+                attempt.due_s += pause_s - attempt.stagger_s
+                attempt.stagger_s = self._stagger_s(attempt.record.name, pause_s)
+                attempt.due_s += attempt.stagger_s
                 attempt.at, attempt.round = 0, attempt.round + 1
         pair = slot.uplink, slot.peer_uplink
         make = Retry if attempt.configured else Open
@@ -336,7 +372,15 @@ class DirectTunnels:
             return 0.0
         draw = int.from_bytes(self._hash(peer, round_.to_bytes(4, "big"))[:4], "big") / (1 << 32)
         pause_s = min(_PAUSE_FIRST_S * 2.0 ** min(doublings, 16), _PAUSE_MAX_S)
-        return pause_s * (1 - _JITTER + 2 * _JITTER * draw)
+        pause_s *= 1 - _JITTER + 2 * _JITTER * draw
+        return max(pause_s, _SILENCE_S * (1 + _JITTER * draw)) if doublings >= _SILENT_FROM else pause_s
+
+    def _stagger_s(self, peer: Name, pause_s: float) -> float:
+        """Return by how much this end starts later after a silence, not the same at both ends."""
+        if pause_s < _SILENCE_S:
+            return 0.0
+        draw = hashlib.sha256(self._me + self._hash(peer, str(pause_s).encode())).digest()[0] / 256
+        return max(0.0, 2 * draw - 1) * _STAGGER_S
 
     def _rank(self, peer: Name) -> bytes:
         return self._ranks.get(peer) or self._hash(peer, b"rank")

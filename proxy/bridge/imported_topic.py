@@ -26,7 +26,7 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
 from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
@@ -195,7 +195,7 @@ class ImportedTopic:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
             return
-        self._output.publish(handle, raw)
+        self._output.publish(handle, raw, Origin(ros_message.stamp_ns, delivered.sequence))
         latency_ms = (time.time_ns() - ros_message.stamp_ns) / 1e6
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.stats.add(latency_ms, delivered.parts, delivered.hops, len(raw))

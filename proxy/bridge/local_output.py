@@ -17,8 +17,8 @@ from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.faults import Fault
-from proxy.endpoints.core.endpoint import GraphEntity
-from proxy.endpoints.core.qos import default, offer
+from proxy.endpoints.core.endpoint import GraphEntity, MessageRecorder, Origin
+from proxy.endpoints.core.qos import joint, offer
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import CHANNELS_MAX
@@ -52,7 +52,7 @@ class LocalOutput(Protocol):
             LocalError: the endpoint does not accept one of them.
         """
 
-    def publish(self, handle: int, raw: bytes) -> None:
+    def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Publish one message.
 
         Raises:
@@ -98,15 +98,15 @@ class MergedPublisher:
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Offer the QoS of a remote publisher; its channels share the virtual publisher."""
         source = sources[0]
-        self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
+        self._far[publisher] = joint(source)
         while len(self._far) > _FAR_MAX:
             del self._far[next(iter(self._far))]
         self._offer(targets[0])
         return [0] * len(targets)
 
-    def publish(self, handle: int, raw: bytes) -> None:
+    def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Publish one message by the virtual publisher, if it exists."""
-        del handle
+        del handle, origin
         if self._handle is not None:
             self._dispatcher.endpoint.publish(self._handle, raw)
             self._kept.append(raw)
@@ -180,9 +180,13 @@ class ChannelPublishers:
             known.add(handles[-1])
         return handles
 
-    def publish(self, handle: int, raw: bytes) -> None:
-        """Publish one message of a channel."""
-        self._dispatcher.endpoint.publish(handle, raw)
+    def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
+        """Record one message of a channel."""
+        endpoint = self._dispatcher.endpoint
+        if isinstance(endpoint, MessageRecorder):
+            endpoint.record(handle, raw, origin)
+        else:
+            endpoint.publish(handle, raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Ignore the readers: a recording reads everything."""

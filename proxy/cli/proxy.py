@@ -13,6 +13,7 @@ import typer
 from gdp.cli.completion import allow_completion
 from gdp.cli.console import Columns
 from gdp.cli.node import (
+    AWAIT_IFACE_S,
     AwaitIface,
     Check,
     Config,
@@ -61,7 +62,7 @@ Schema = Annotated[
 @app.command(context_settings=HELP, epilog="Example: gdp-proxy --config proxy.yaml --check")
 def proxy(
     config: Config,
-    await_iface: AwaitIface = 0.0,
+    await_iface: AwaitIface = AWAIT_IFACE_S,
     data_plane: MemberPlane = None,
     check: Check = False,
     columns: Columns = None,

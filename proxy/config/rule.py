@@ -485,10 +485,8 @@ class Rule(Section):
     @classmethod
     def _is_of_kind(cls, value: object, info: ValidationInfo) -> object:
         name = str(info.field_name)
-        if name in _OF_CALLS:
-            kinds = "services and actions"
-        else:
-            kinds = "services" if name in _OF_SERVICES else "topics"
+        of_services = "services" if name in _OF_SERVICES else "topics"
+        kinds = "services and actions" if name in _OF_CALLS else of_services
         if str(info.data.get("kind", kinds)) not in kinds:
             raise ValueError(f"only {kinds} have this")
         return value

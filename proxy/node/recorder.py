@@ -50,7 +50,7 @@ def record(settings: ProxyConfig, *, json: bool) -> bool:
         unfinished = _finish(writer)
     _report(stats, writer, json=json)
     if unfinished:
-        typer.echo(f"error: the recording ended early: {unfinished}", err=True)
+        echo(f"error: the recording ended early: {unfinished}", err=True)
     return not unfinished
 
 

@@ -14,7 +14,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple, NoReturn
 
 from gdp.errors import LocalError
-from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, GraphEntity, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import (
+    Event,
+    Graph,
+    GraphChanged,
+    GraphEntity,
+    MessageReceived,
+    Origin,
+    Role,
+    TypeResolved,
+)
 from proxy.recordings.reader import BagReader
 from proxy.recordings.split import SplitWriter
 from proxy.recordings.writer import BagWriter
@@ -223,9 +232,14 @@ class RecordingEndpoint(_TopicsEndpoint):
         return 0 if self._writer is None else self._writer.add(channel)
 
     def publish(self, handle: int, raw: bytes) -> None:
+        """Refuse a message without its origin; raises ``LocalError``."""
+        del raw
+        raise LocalError(f"{self.label}: handle {handle}: a recording takes messages of far publishers only")
+
+    def record(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Record one message with the present time as its stamp."""
         if self._writer is not None:
-            self._writer.write(handle, time.time_ns(), raw)
+            self._writer.write(handle, time.time_ns(), raw, origin)
 
     def close(self, handle: int) -> None:
         """Do nothing: recorded messages stay."""

@@ -15,6 +15,7 @@ from typing import BinaryIO, Final
 from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.channels import to_qos
 from proxy.recordings.salvage_mcap import MAGIC
 from proxy.serial.channel import Channel, DefinitionFormat
@@ -71,15 +72,16 @@ class McapWriter:
         self._counts[self._channels] = 0
         self._channels += 1
 
-    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
-        """Add a message to the chunk.
+    def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
+        """Add a message to the chunk; its log time is the stamp, its publish time and number are those of the origin.
 
         Raises:
             OSError: the chunk is full, and cannot be written.
         """
         self._index.setdefault(number, []).append((stamp_ns, self._chunk.tell()))
         self._chunk.write(_RECORD.pack(_MESSAGE, _MESSAGE_HEAD.size + len(raw)))
-        self._chunk.write(_MESSAGE_HEAD.pack(number, 0, stamp_ns, stamp_ns))
+        sequence = origin.sequence & 0xFFFFFFFF
+        self._chunk.write(_MESSAGE_HEAD.pack(number, sequence, stamp_ns, origin.published_ns))
         self._chunk.write(raw)
         if self._chunk.tell() > CHUNK_BYTES:
             self.flush()

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, RosVersion
 
@@ -66,7 +67,7 @@ class SplitWriter:
             self._channels.append(channel)
         return self._numbers[channel]
 
-    def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
         """Record one message.
 
         Raises:
@@ -82,7 +83,7 @@ class SplitWriter:
                 self._writer, self._written = self._begin(), self.written
             if handle not in self._handles:
                 self._handles[handle] = self._writer.add(self._channels[handle])
-            self._writer.write(self._handles[handle], stamp_ns, raw)
+            self._writer.write(self._handles[handle], stamp_ns, raw, origin)
         except LocalError as error:
             self.failure = self._writer.failure or (str(error) if self._writer.is_closed else "")
             raise

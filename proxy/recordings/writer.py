@@ -22,6 +22,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag1 import WriterError as WriterError1
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
@@ -53,7 +54,7 @@ class _Format(Protocol):
     def connect(self, channel: Channel) -> None:
         """Add a channel; the first has number 0."""
 
-    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
         """Add a message to the chunk."""
 
     def flush(self) -> None:
@@ -124,12 +125,13 @@ class BagWriter:
             self._handles[reporter] = len(self._handles)
         return self._handles[reporter]
 
-    def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
         """Record one message.
 
         Args:
             stamp_ns: Unix time; of ROS 1 at most 32 bits of seconds.
             raw: the message in its own wire form.
+            origin: time and number of its publisher, which a bag of ROS 1 cannot hold; None: the stamp, and 0.
 
         Raises:
             LocalError: closed, a stamp out of range, or the disk is full; ``failure`` has the reason.
@@ -141,7 +143,7 @@ class BagWriter:
             free = os.fstatvfs(self._format.file.fileno())
             if free.f_bavail * free.f_frsize < self._format.unwritten_bytes + 2 * len(raw) + _SPARE_BYTES:
                 self._fail(f"no space is left on the disk of {self.path.parent.absolute()}")
-            self._format.write(handle, stamp_ns, raw)
+            self._format.write(handle, stamp_ns, raw, origin or Origin(stamp_ns, 0))
         except OSError as error:
             self._fail(f"{self.path} cannot be written: {error.strerror}")
 
@@ -235,7 +237,8 @@ class _Ros1Format:
             )
         )
 
-    def write(self, number: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
+        del origin
         self._writer.write(self._connections[number], stamp_ns, raw)
         self._pending += 1
         if self._writer.chunks[-1].data.tell() > CHUNK_BYTES:

@@ -14,7 +14,7 @@ from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
-__all__ = ["EMPTY_MD5", "NEVER", "Channel", "DefinitionFormat", "Qos", "RosVersion", "ros1_format"]
+__all__ = ["EMPTY_MD5", "NEVER", "QOS_MAX", "Channel", "DefinitionFormat", "Qos", "RosVersion", "ros1_format"]
 
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
@@ -24,7 +24,7 @@ NEVER: Final = (9_223_372_036, 854_775_807)  # ROS 2's form of an infinite durat
 _ITEMS_MAX: Final = 4_096
 CHANNEL_MAX_BYTES: Final = 128 << 10
 _TEXT_MAX: Final = 1024
-_QOS_MAX: Final = 64
+QOS_MAX: Final = 64
 _TIME_MAX: Final = 1 << 63
 
 
@@ -115,7 +115,7 @@ class Channel:
         if ros not in (1, 2) or definition_format not in ("msg", "idl", ""):
             raise RemoteError(DropReason.MALFORMED, "a description of another ROS or form")
         profiles = fields.get("q", [])
-        if not isinstance(profiles, list) or len(profiles) > _QOS_MAX:
+        if not isinstance(profiles, list) or len(profiles) > QOS_MAX:
             raise RemoteError(DropReason.MALFORMED, "QoS profiles")
         callerid = fields.get("c")
         return cls(

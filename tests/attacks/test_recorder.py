@@ -21,6 +21,7 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.config import Rule
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
@@ -44,7 +45,7 @@ class Sink:
             self.channels.append(channel)
         return self.channels.index(channel)
 
-    def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
         self.written.append((self.channels[handle].topic, raw))
 
 

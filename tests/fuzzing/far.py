@@ -31,7 +31,7 @@ from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
 from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
-from proxy.endpoints.core.endpoint import RosEndpoint
+from proxy.endpoints.core.endpoint import Origin, RosEndpoint
 from proxy.recordings.mcap_writer import McapWriter
 from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
@@ -106,14 +106,16 @@ class _Endpoint:
 
     def publish(self, handle: int, raw: bytes) -> None:
         channel = self._channels[handle]
-        self._recorder.write(handle, 0, raw)
-        self._recorder.flush()
         if channel.ros == 2:
             _outcome(lambda: RosbridgeCodec(channel).to_json(raw))
             _outcome(lambda: cbor_raw("/t", 0, raw))
         text = MessageText(channel)
         _outcome(lambda: text.to_yaml(raw).encode())
         orjson.dumps(text.to_json(raw))
+
+    def record(self, handle: int, raw: bytes, origin: Origin) -> None:
+        self._recorder.write(handle, 0, raw, origin)
+        self._recorder.flush()
 
     def close(self, handle: int) -> None:
         """Keep it."""

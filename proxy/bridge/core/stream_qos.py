@@ -14,7 +14,7 @@ from gdp.client.send_options import SendOptions
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity
 from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, is_depth_unknown, kept, request
-from proxy.serial.channel import Channel, Qos
+from proxy.serial.channel import QOS_MAX, Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
 
@@ -124,15 +124,13 @@ class LiveQos:
         return Change.DESCRIPTION
 
     def describe(self, channels: Sequence[Channel], topic: str) -> tuple[Channel, ...]:
-        """Return the channel with one profile, which every local publisher fulfils."""
+        """Return the channel with the profiles as offered; the depth is that of the messages kept, if any."""
         channel = channels[0]
         self._is_latched = channel.latched
         latched = bool(self.depth)
-        offers = (request(self._offers),) if self._offers else channel.qos
-        if offers or latched:
-            profile = offers[0] if offers else default(latched=True)
-            offers = (replace(profile, depth=min(self.depth, DEPTH_MAX) or profile.depth),)
-        return (replace(channel, topic=topic, latched=latched, qos=offers),)
+        offers = self._offers or channel.qos or ((default(latched=True),) if latched else ())
+        known = dict.fromkeys(replace(each, depth=min(self.depth, DEPTH_MAX) or each.depth) for each in offers)
+        return (replace(channel, topic=topic, latched=latched, qos=tuple(known)[:QOS_MAX]),)
 
 
 class RecordedQos:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from enum import Enum
-from typing import Final, NamedTuple, Protocol, TypeAlias
+from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
@@ -26,6 +26,8 @@ __all__ = [
     "GraphChanged",
     "GraphEntity",
     "MessageReceived",
+    "MessageRecorder",
+    "Origin",
     "RequestReceived",
     "ResponseReceived",
     "Role",
@@ -105,6 +107,13 @@ class MessageReceived(NamedTuple):
     channel: int = 0  # 0: ``TypeResolved.channel``; n: number n - 1 of ``TypeResolved.others``
 
 
+class Origin(NamedTuple):
+    """What a far publisher says of one message."""
+
+    published_ns: int  # Unix time at which its proxy took the message
+    sequence: int  # which message of its publisher it is, from 1; skipped numbers are lost messages
+
+
 class RequestReceived(NamedTuple):
     """A local client's request to a virtual server, to be answered or refused by its ticket."""
 
@@ -140,6 +149,18 @@ class EndpointError(NamedTuple):
 Event: TypeAlias = (
     GraphChanged | TypeResolved | MessageReceived | RequestReceived | ResponseReceived | CallFailed | EndpointError
 )
+
+
+@runtime_checkable
+class MessageRecorder(Protocol):
+    """An endpoint that keeps what a far publisher says of each message."""
+
+    def record(self, handle: int, raw: bytes, origin: Origin) -> None:
+        """Record one message of a channel.
+
+        Raises:
+            LocalError: a recording cannot be written.
+        """
 
 
 class RosEndpoint(Protocol):

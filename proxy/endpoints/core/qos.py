@@ -7,9 +7,10 @@ Source: DDS 1.4, section 2.2.3: a reader and a writer match if what is offered i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
-from proxy.serial.channel import NEVER, Qos
+from proxy.serial.channel import NEVER, Channel, Qos
 
 __all__ = [
     "DEPTH_MAX",
@@ -17,6 +18,7 @@ __all__ = [
     "default",
     "depth_of",
     "is_depth_unknown",
+    "joint",
     "kept",
     "offer",
     "request",
@@ -67,6 +69,15 @@ def request(offers: Sequence[Qos]) -> Qos:
         latched=bool(offers) and all(each.durability == "transient_local" for each in offers),
         depth=_READER_DEPTH,
     )
+
+
+def joint(channel: Channel) -> Qos:
+    """Return one profile that all publishers which a channel describes fulfil."""
+    latched = [each for each in channel.qos if channel.latched and each.durability == "transient_local"]
+    if not channel.qos:
+        return default(latched=channel.latched)
+    profile = request(channel.qos)
+    return replace(profile, durability="transient_local", depth=max(map(depth_of, latched))) if latched else profile
 
 
 def kept(offers: Sequence[Qos], found: int | None = None) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from gdp.cli import tables
 from gdp.cli.gdp import main
+from gdp.cli.local_nodes import local_nodes
 from gdp.cli.path_view import path_lines
 from gdp.cli.ping_statistics import PingStatistics, quantile
 from gdp.management import running_nodes
@@ -32,11 +34,12 @@ class Node:
         self.is_silent = False
         self.asked: list[Mapping[str, object]] = []
         self.target_role = "proxy"
+        self.pid = 0
 
     def handlers(self) -> ControlHandlers:
         return ControlHandlers(
             reload=lambda: None,
-            status=lambda: {"role": self.role, "label": self.label, "name": OTHER},
+            status=lambda: {"role": self.role, "label": self.label, "name": OTHER, "pid": self.pid},
             drain=lambda: None,
             ask=self._ask,
             show=self._show,
@@ -47,10 +50,16 @@ class Node:
         rows += [{"local": "/twice", "name": digit * 64, "note": ""} for digit in "12"]
         return {"rows": rows if arguments["what"] == "names" else [], "next": None}
 
+    def facts(self) -> dict[str, object]:
+        """Return what it knows of a name: it is idle."""
+        return {"name": self.label.encode().hex().ljust(64, "0"), "is_attached": True, "uptime_s": 60.0}
+
     def _ask(self, arguments: Mapping[str, object], respond: Respond) -> None:
         fields: dict[str, object] = {"id": arguments["id"], "rtt_ms": 1.5}
         self.asked.append(arguments)
-        if arguments["ask"] == "resolve":
+        if arguments["ask"] == "state":
+            respond(Response({**fields, "state": "answered", "role": self.role, "result": self.facts()}))
+        elif arguments["ask"] == "resolve":
             respond(Response({**fields, "state": "answered", "result": {"places": self.places}}))
         elif self.is_silent:
             respond(Response({**fields, "state": "silent"}))
@@ -245,3 +254,73 @@ def test_branches_below_are_indented() -> None:
         "       tree -> q nuc2 0.25 ms",
         "           tree -> p robot",
     ]
+
+
+class Refusing(Node):
+    """A process that is no member, such as a relay: it refuses diagnostic requests and keeps no names."""
+
+    def handlers(self) -> ControlHandlers:
+        return ControlHandlers(
+            reload=lambda: None, status=lambda: {"role": self.role, "name": SCAN, "pid": self.pid}, drain=lambda: None
+        )
+
+
+@pytest.fixture
+def joined(folder: Path) -> Iterator[None]:
+    """Let the processes of a machine that joined run: switch, proxy, and the relay of the switch's keys."""
+    with ExitStack() as stack:
+        for each in (Node("robot-proxy"), Node("robot-switch", "switch"), Refusing("robot-relay", "relay")):
+            stack.enter_context(serve_control_in_thread(folder / f"{each.label}.sock", each.handlers()))
+        yield
+
+
+@pytest.mark.usefixtures("joined")
+def test_a_machine_that_joined_gets_an_explanation(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("explain", "/scan", "--seconds", "0.1") != 2
+    out, err = capsys.readouterr()
+    assert out
+    assert "relay" not in out + err
+
+
+@pytest.mark.usefixtures("joined")
+def test_a_relay_that_carries_no_names_is_not_reported_as_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    gdp("topic", "list", "--seconds", "0.05")
+    assert "relay" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("joined")
+def test_a_node_that_refuses_to_explain_is_listed_and_the_others_are_asked(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serve_control_in_thread(folder / "rib.sock", Refusing("robot-rib", "rib").handlers()):
+        assert gdp("explain", "/scan", "--seconds", "0.1") != 2
+    assert f"not asked: rib {SCAN}: " in capsys.readouterr().out
+
+
+@pytest.fixture
+def server_elsewhere(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let a proxy run in another network namespace of this host."""
+    server = Node("server-proxy")
+    server.pid = 7
+    monkeypatch.setattr(running_nodes, "_is_near", lambda pid: pid != server.pid)
+    with serve_control_in_thread(folder / "two.sock", server.handlers()):
+        yield
+
+
+@pytest.mark.usefixtures("node", "server_elsewhere")
+def test_every_command_asks_the_nodes_of_this_namespace(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names") == 0
+    assert "server-proxy" not in capsys.readouterr().out
+    assert gdp("show", "names", "--host") == 0
+    assert "server-proxy" in capsys.readouterr().out
+    assert gdp("explain", "/scan", "--seconds", "0.1") != 2
+    assert gdp("ping", "/scan", "-c", "1") == 0
+    assert gdp("ping", "/scan", "-c", "1", "--node", "server-proxy") == 0
+    assert len(local_nodes()) == len(running_nodes.find_running_nodes().nodes) == 1
+
+
+@pytest.mark.usefixtures("server_elsewhere")
+def test_where_no_node_runs_those_of_the_host_are_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names") == 0
+    assert "server-proxy" in capsys.readouterr().out
+    assert len(running_nodes.find_running_nodes().nodes) == 1

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
+
+from gdp.cli.rib import rib
+from proxy.cli.proxy import proxy
 
 LARGE = {"networkx", "prometheus_client", "pyroute2", "rich.console", "rosbags.rosbag1", "rosbags.rosbag2", "scapy"}
 
@@ -23,3 +28,8 @@ def test_a_node_starts_without_large_libraries_that_it_does_not_need(modules: st
     code = f"import sys, {modules}; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert LARGE & set(said.split()) == set()
+
+
+@pytest.mark.parametrize("command", [rib, proxy])
+def test_a_node_started_beside_its_switch_waits_for_the_device(command: Callable[..., None]) -> None:
+    assert inspect.signature(command).parameters["await_iface"].default >= 10

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.diagnosis.answer import Cause, Verdict
 from gdp.diagnosis.diagnosis import RULES, diagnose
-from gdp.diagnosis.facts import Facts, FlowFact, ProxyFacts, RibFacts, SwitchFacts, Unreachable
+from gdp.diagnosis.facts import Facts, FlowFact, ProxyFacts, RibFacts, SwitchFacts, Unreachable, WaitFact
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
 
@@ -50,6 +50,14 @@ def test_the_reader_that_governs_a_topic_is_named_with_its_path(side: str) -> No
     assert answer.cause is Cause.ARRIVES
     named = f"the slowest reader, proxy {Name.from_text(FAR).short}, governs (round trip 42 ms, 3.1 Mbit/s)"
     assert named in answer.sentence
+
+
+@pytest.mark.parametrize(("other", "cause"), [(SWITCH, Cause.ETHERTYPE_FILTERED), (RIB, Cause.LINK_SILENT)])
+def test_a_filter_is_named_only_between_two_that_had_each_other_as_neighbours(other: str, cause: Cause) -> None:
+    near = SwitchFacts(name=SWITCH, is_near=True, waits=(WaitFact(reason="no-neighbour", device="e0", neighbour=FAR),))
+    far = SwitchFacts(name=FAR, waits=(WaitFact(reason="no-neighbour", device="e1", neighbour=other),))
+    torn = replace(PROXY, is_attached=False)
+    assert diagnose(Facts(asked="/a", proxies=(torn,), switches=(near, far), window_s=1.0)).cause is cause
 
 
 def test_a_message_a_while_ago_is_idle() -> None:

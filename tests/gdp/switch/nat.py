@@ -17,7 +17,7 @@ from enum import Enum
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.names import Name
-from gdp.switch.direct_tunnels import Close, DirectTunnels
+from gdp.switch.direct_tunnels import Close, DirectTunnels, Silence
 
 BORDER = Endpoint("203.0.113.1", 51_820)
 MAPPING_S = 30.0
@@ -34,11 +34,12 @@ class Nat(Enum):
     ADDRESS = "address restricted"
     PORT = "port restricted"
     SYMMETRIC = "symmetric"
+    LINUX = "Linux with an open input chain"  # conntrack keeps what comes unasked, and maps around it
 
 
 def permits(one: Nat, other: Nat) -> bool:
     """Return whether a direct path is possible between two NATs."""
-    return {one, other} not in ({Nat.SYMMETRIC}, {Nat.SYMMETRIC, Nat.PORT})
+    return {one, other} not in ({Nat.SYMMETRIC}, {Nat.SYMMETRIC, Nat.PORT}, {Nat.SYMMETRIC, Nat.LINUX})
 
 
 @dataclass(slots=True)
@@ -61,8 +62,21 @@ class Gateway:
     ports: dict[tuple[int, Endpoint | None], int] = field(default_factory=dict)
     sent: dict[tuple[int, Endpoint], float] = field(default_factory=dict)  # port and destination: when
     next_port: int = 40_000
+    flows: dict[Endpoint, tuple[int, float]] = field(
+        default_factory=dict
+    )  # Linux: port and last packet, by destination
+    taken: dict[tuple[Endpoint, int], float] = field(default_factory=dict)  # Linux: flows of others to the NAT itself
 
     def outbound(self, to: Endpoint, now_s: float) -> Endpoint:
+        if self.nat is Nat.LINUX:
+            port, last_s = self.flows.get(to, (self.socket, float("-inf")))
+            if now_s - last_s >= MAPPING_S:
+                port = self.socket
+                if now_s - self.taken.get((to, port), float("-inf")) < MAPPING_S:
+                    self.next_port += 1
+                    port = self.next_port
+            self.flows[to] = port, now_s
+            return Endpoint(self.address, port)
         key = self.socket, to if self.nat is Nat.SYMMETRIC else None
         if key not in self.ports:
             self.ports[key] = self.next_port
@@ -71,6 +85,13 @@ class Gateway:
         return Endpoint(self.address, self.ports[key])
 
     def admits(self, source: Endpoint, port: int, now_s: float) -> bool:
+        if self.nat is Nat.LINUX:
+            known, last_s = self.flows.get(source, (0, float("-inf")))
+            if known == port and now_s - last_s < MAPPING_S:
+                self.flows[source] = port, now_s
+                return True
+            self.taken[source, port] = now_s
+            return False
         if not any(port == own and socket == self.socket for (socket, _), own in self.ports.items()):
             return False
         live = [to for (own, to), at_s in self.sent.items() if own == port and now_s - at_s < MAPPING_S]
@@ -123,6 +144,10 @@ class End:
         for action in self.tunnels.poll_actions(own=self.record, records=self.records, linked=(), up=up, now_s=now_s):
             if isinstance(action, Close):
                 self.is_configured, self.endpoint = False, None
+                self.sessions.clear()
+                continue
+            if isinstance(action, Silence):
+                self.endpoint = None
                 self.sessions.clear()
                 continue
             self.is_configured = True

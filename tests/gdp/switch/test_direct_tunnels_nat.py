@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from tests.gdp.switch.nat import Nat, World, permits
 
-PAIRS = list(product(Nat, Nat))
+NATS = [each for each in Nat if each is not Nat.LINUX]
+PAIRS = list(product(NATS, NATS))
 QUICK_S = 10.0
 LOSSY_S = 240.0
 
@@ -28,6 +29,13 @@ def test_nats_without_a_direct_path_stay_without_one(one: Nat, other: Nat) -> No
     assert not (world := World(one, other)).run(120, lambda: world.is_up)
 
 
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.sampled_from([Nat.FULL_CONE, Nat.ADDRESS, Nat.PORT]), st.integers(0, 1 << 32))
+def test_a_linux_router_that_keeps_the_peers_first_packet_is_passed_after_a_silence(other: Nat, seed: int) -> None:
+    world = World(Nat.LINUX, other, seed=seed)
+    assert world.run(60, lambda: world.is_up)
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.sampled_from([pair for pair in PAIRS if permits(*pair)]), st.integers(0, 1 << 32), st.floats(0.0, 0.25))
 def test_both_ends_come_up_despite_loss(pair: tuple[Nat, Nat], seed: int, loss: float) -> None:
@@ -36,7 +44,7 @@ def test_both_ends_come_up_despite_loss(pair: tuple[Nat, Nat], seed: int, loss: 
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(st.sampled_from([pair for pair in PAIRS if permits(*pair)]), st.sampled_from(Nat), st.integers(0, 1 << 32))
+@given(st.sampled_from([pair for pair in PAIRS if permits(*pair)]), st.sampled_from(NATS), st.integers(0, 1 << 32))
 def test_an_end_that_moves_behind_another_nat_is_reached_again(pair: tuple[Nat, Nat], nat: Nat, seed: int) -> None:
     world = World(*pair, seed=seed)
     assert world.run(QUICK_S, lambda: world.is_up)

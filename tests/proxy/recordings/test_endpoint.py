@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+from mcap.reader import make_reader
 
 from gdp.errors import LocalError
 from proxy.bridge.bridge import Bridge
@@ -16,11 +17,11 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.recorded import RecordedRules
-from proxy.endpoints.core.endpoint import GraphChanged, MessageReceived, TypeResolved
+from proxy.endpoints.core.endpoint import GraphChanged, MessageReceived, Origin, TypeResolved
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
-from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.channel import Channel, Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import IMAGE, STRING
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -39,7 +40,7 @@ class FullWriter:
     def add(self, channel: Channel) -> int:
         return 0
 
-    def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+    def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
         raise LocalError("full.mcap cannot be written: No space left on device")
 
 
@@ -180,6 +181,25 @@ def test_a_live_listener_gets_the_messages_of_every_recorded_publisher(sites: Si
     play(sites, replayed)
     assert sites.run(3, lambda: len(ear.heard) == 6)
     assert ear.texts == [f"{number} of {at}" for number in range(3) for at in range(2)]
+
+
+def test_a_recording_keeps_the_publishers_time_number_and_qos(sites: Sites, tmp_path: Path) -> None:
+    offered = Qos(depth=7, reliability="best_effort", durability="volatile", lifespan=(2, 0))
+    robot = sites.add(ROBOT, expose=[CHATTER])
+    talker = robot.graph.publish("/talker", "/chatter", STRING, offered)
+    with BagWriter(tmp_path / "heard.mcap", 2) as writer:
+        join(sites, SERVER, RecordingEndpoint(writer, [("/chatter", STRING)]), imports=[CHATTER])
+        assert sites.run(3, robot.is_read)
+        for text in (b"one", b"two"):
+            talker.publish(raw(2, text))
+            sites.run(0.2)
+    taken_ns = 0  # the fake graph's stamp of each message
+    with (tmp_path / "heard.mcap").open("rb") as file:
+        messages = [message for _, _, message in make_reader(file).iter_messages()]
+    assert [(each.sequence, each.publish_time) for each in messages] == [(1, taken_ns), (2, taken_ns)]
+    assert 0 < messages[0].log_time <= messages[1].log_time
+    with BagReader(tmp_path / "heard.mcap") as bag:
+        assert [each.qos for each in bag.channels] == [(offered,)]
 
 
 def test_messages_of_the_other_ros_are_refused_and_counted(
