@@ -1,6 +1,6 @@
 """Kinds of internet access, and which pairs of them allow a direct UDP path.
 
-Sans-I/O. Source: RFC 4787 for mapping, filtering and hairpinning; RFC 5128, section 3, for hole punching.
+Sans-I/O. Source: RFC 4787 for mapping and filtering; RFC 5128, section 3, for hole punching.
 """
 
 from __future__ import annotations

@@ -53,15 +53,14 @@ class Laboratory:
         for site in self.sites.values():
             site.close()
 
-    def add_site(self, label: str, access: Access, *, hairpin: bool = False, has_line: bool = False) -> Site:
+    def add_site(self, label: str, access: Access, *, has_line: bool = False) -> Site:
         """Attach a site.
 
         Args:
             label: at most 10 letters, unique among sites and hosts.
-            hairpin: whether its NAT forwards between its own hosts by their public endpoints.
             has_line: whether packets can be delayed, which costs a process.
         """
-        site = self.sites[label] = Site(self, label, access, hairpin=hairpin, has_line=has_line)
+        site = self.sites[label] = Site(self, label, access, has_line=has_line)
         return site
 
     def add_host(self, label: str, site: Site, device: str = ETHERNET) -> Host:
@@ -101,6 +100,6 @@ class Laboratory:
             for device in host.devices_at(site):
                 (host.plug if is_up else host.unplug)(device)
 
-    def apply_faults(self) -> None:
-        """Apply the faults that the sites' uplinks have now."""
-        self.core.nft(core_rules({site.uplink: site.fault for site in self.sites.values()}))
+    def apply_cuts(self) -> None:
+        """Cut the uplinks of the sites that are to be cut, and no other."""
+        self.core.nft(core_rules(site.uplink for site in self.sites.values() if site.is_cut))

@@ -2,24 +2,22 @@
 
 Sans-I/O. Source: nft(8). Linux keeps the source port of a masqueraded socket where it can, for all destinations: an
 endpoint-independent mapping with address and port-dependent filtering. With ``fully-random`` each destination gets a
-port of its own. A map of public ports that postrouting fills gives endpoint-independent filtering, and hairpinning.
+port of its own. A map of public ports that postrouting fills gives endpoint-independent filtering.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Final
 
 from internet.access import Access
 
-__all__ = ["FLUSH_MAPPINGS", "LAN", "WAN", "Fault", "core_rules", "router_rules"]
+__all__ = ["FLUSH_MAPPINGS", "LAN", "WAN", "core_rules", "router_rules"]
 
 WAN: Final = "wan"  # device of a router towards the internet
 LAN: Final = "lan"  # towards its hosts
 FLUSH_MAPPINGS: Final = "flush map inet site mapped"
 _TLS_PORT: Final = 443
-_SHARES: Final = 10_000  # resolution of a chance of loss
 
 # A datagram that finds no mapping is dropped in ``input``. Without that, its connection entry would take the port
 # that the local socket is about to get, and a hole could be opened from one side only.
@@ -51,30 +49,23 @@ table inet site {{
 """
 
 
-def router_rules(access: Access, wan_address: str, *, hairpin: bool) -> str:
+def router_rules(access: Access, wan_address: str) -> str:
     """Return the rules of a router, which replace those it has; empty for public access.
 
     Args:
         access: kind of the site.
         wan_address: IPv4 address of the router's device ``wan``; empty: it has none.
-        hairpin: whether a host reaches another one of its site by that one's public endpoint (RFC 4787, section 6).
-            A symmetric NAT never allows it here.
     """
     if access is Access.PUBLIC:
         return ""
     prerouting, record, postrouting = [], [], []
     forward = f'iifname "{LAN}" oifname "{WAN}" accept'
-    lookup = "dnat ip to udp dport map @mapped"
-    has_map = access is not Access.SYMMETRIC and bool(wan_address)
     if wan_address:
         postrouting.append(f'oifname "{WAN}" meta nfproto ipv4 masquerade{_randomness(access)}')
-    if has_map:
+    if wan_address and access is not Access.SYMMETRIC:
         record.append(f'oifname "{WAN}" meta nfproto ipv4 update @mapped {{ udp sport : ip saddr . udp sport }}')
     if access is Access.FULL_CONE:
-        prerouting.append(f'iifname "{WAN}" meta nfproto ipv4 {lookup}')
-    if hairpin and has_map:
-        prerouting.append(f'iifname "{LAN}" ip daddr {wan_address} {lookup}')
-        postrouting.append(f'iifname "{LAN}" oifname "{LAN}" ct status dnat snat ip to {wan_address}')
+        prerouting.append(f'iifname "{WAN}" meta nfproto ipv4 dnat ip to udp dport map @mapped')
     if access is Access.UDP_BLOCKED:
         forward = f'iifname "{LAN}" oifname "{WAN}" tcp dport {_TLS_PORT} accept'
     return _TABLE.format(
@@ -89,22 +80,9 @@ def _randomness(access: Access) -> str:
     return " random,fully-random" if access is Access.SYMMETRIC else ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
-    """Fault of a site's uplink; ``loss``: chance of each packet, 0 to 1, in either direction."""
-
-    is_cut: bool = False
-    loss: float = 0.0
-
-
-def core_rules(faults: Mapping[str, Fault]) -> str:
-    """Return the rules of the core, which replace those it has: silent drops by device towards a site."""
-    drops = []
-    for device, fault in faults.items():
-        is_certain = fault.is_cut or fault.loss >= 1
-        chance = "" if is_certain else f" numgen random mod {_SHARES} < {round(fault.loss * _SHARES)}"
-        if fault.is_cut or fault.loss:
-            drops += [f'{way} "{device}"{chance} drop' for way in ("iifname", "oifname")]
+def core_rules(cut: Iterable[str]) -> str:
+    """Return the rules of the core, which replace those it has: silent drops at the devices towards cut sites."""
+    drops = [f'{way} "{device}" drop' for device in cut for way in ("iifname", "oifname")]
     lines = "\n    ".join(drops)
     return f"""
 table inet core

@@ -17,7 +17,7 @@ from lab.namespace import Namespace, wait_for_carrier
 
 __all__ = ["TOOLS", "Space"]
 
-TOOLS: Final = ("ip", "nft", "conntrack", "tc")
+TOOLS: Final = ("ip", "nft", "conntrack")
 
 _NET: Final = Path("/proc/sys/net")
 _SETTINGS: Final = {  # no address waits for duplicate detection, and none is lost with the carrier
@@ -66,14 +66,6 @@ class Space(Namespace):
     def flush_connections(self) -> None:
         """Forget the connections that the namespace tracks, and with them their NAT mappings."""
         self._run(["conntrack", "-F"])
-
-    def shape(self, device: str, mbit: float) -> None:
-        """Limit what leaves by a device, in Mbit/s; 0: unlimited."""
-        if mbit:
-            limit = f"rate {mbit}mbit burst 64k latency 50ms"
-            self._run(["tc", "qdisc", "replace", "dev", device, "root", "tbf", *limit.split()])
-        elif "tbf" in self._run(["tc", "qdisc", "show", "dev", device]):
-            self._run(["tc", "qdisc", "del", "dev", device, "root"])
 
     def set(self, settings: dict[str, int]) -> None:
         """Set values below ``/proc/sys/net``."""

@@ -58,7 +58,7 @@ def _page(machines: Iterable[Machine], links: Mapping[str, Sequence[Link]], coun
             address = (lease.address or lease.address6).partition("/")[0]
             first = machine.label if number == 0 else ""
             public = site.address or address
-            state = " (cut)" if site.fault.is_cut else ""
+            state = " (cut)" if site.is_cut else ""
             table.add_row(first, device, f"{site.label}, {site.access.value}{state}", address, public, tunnels)
             tunnels = ""
     return Group(table, Text(counts))
