@@ -45,8 +45,6 @@ from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
 from tests.script_packages import PYTHON_PATH
 
-__all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of"]
-
 PATIENCE_S: Final = 30.0
 _MASTER: Final = "http://127.0.0.1:11311"
 _DOMAINS: Final = {"a": DOMAIN, "b": DOMAIN + 1, "twin": DOMAIN + 1, "dds": DOMAIN + 2}

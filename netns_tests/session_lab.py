@@ -23,8 +23,6 @@ from lab.rights import grant
 from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
 
-__all__ = ["EXAMPLES", "PATIENCE_S", "SessionLab", "lines_of", "session_lab"]
-
 PATIENCE_S: Final = 30.0
 _MACHINE: Final = "lab"
 Rights = Mapping[str, Mapping[str, Collection[Right]]]  # by node and name

@@ -14,8 +14,6 @@ from topologies import make_topology
 from gdp.host.run_registry import RunRegistry
 from lab.namespaces import Namespaces
 
-__all__: list[str] = []
-
 
 def main() -> None:
     """Create both, print the id, and wait for the end of standard input."""

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend
     from moto.ec2.models.instances import Instance, Reservation
 
-__all__ = ["UBUNTU", "DataCenter", "serving_ec2"]
-
 UBUNTU: Final = "099720109477"  # owner of images of moto's account, which has none of Debian's
 
 

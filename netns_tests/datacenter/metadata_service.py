@@ -21,8 +21,6 @@ from typing import Final
 from lab.namespace import Namespace
 from netns_tests.datacenter.router import METADATA
 
-__all__ = ["InstanceDocument", "MetadataService"]
-
 _PORT: Final = 80
 _PATH: Final = re.compile(r"/(?:latest|\d{4}-\d\d-\d\d)/(.*)")
 _TOKEN: Final = "X-aws-ec2-metadata-token"

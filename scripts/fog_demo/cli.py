@@ -24,8 +24,6 @@ from gdp.host.interruption import Interrupted, interruptible, let_nothing_interr
 from gdp.host.run_registry import Run
 from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 
-__all__ = ["main"]
-
 _PACE: Final = Pace()
 
 _EXAMPLES: Final = """\b

@@ -19,8 +19,6 @@ from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Entry
 from lab.command import StepDisplay
 
-__all__ = ["Counts", "Display"]
-
 _EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
 

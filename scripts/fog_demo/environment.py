@@ -30,8 +30,6 @@ from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5
 from ring.credentials import OverlayCredentials
 
-__all__ = ["ENVIRONMENT", "SITE", "STATE", "Environment", "end_all_of", "fog_command", "standing_runs", "sweep"]
-
 ROBOT: Final = "nuc1"
 FAR: Final = "nuc5"
 _RIB_AT: Final = "nuc3"

@@ -27,8 +27,6 @@ from lab.child import Child
 from lab.children import cancel
 from lab.events import Event
 
-__all__ = ["Outcome", "Pace", "run_scenario"]
-
 _LOOK_S: Final = 0.2
 _BOOT_S: Final = 90.0
 _END_S: Final = 20.0  # longer than the caller's timeout of a response

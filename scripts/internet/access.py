@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-__all__ = ["TRAITS", "Access", "Traits", "allows_direct"]
-
 
 class Access(str, Enum):
     """What lies between a host and the internet."""

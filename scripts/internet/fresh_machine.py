@@ -20,8 +20,6 @@ from gdp.errors import LocalError
 from internet.host import Host
 from lab.process import LabProcess
 
-__all__ = ["HIDDEN", "FreshMachine", "Shell", "TypedCommand", "typed_commands"]
-
 HIDDEN: Final = ("/var/lib", "/run", "/dev/shm")
 _HOME: Final = "/run/root"
 _ROOT: Final = Path(__file__).resolve().parents[2]

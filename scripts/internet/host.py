@@ -17,8 +17,6 @@ from internet.space import Space
 if TYPE_CHECKING:
     from internet.laboratory import Laboratory
 
-__all__ = ["ETHERNET", "Host"]
-
 ETHERNET: Final = "eth0"
 _FIRST_METRIC: Final = 100
 

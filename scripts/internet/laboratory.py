@@ -19,8 +19,6 @@ from internet.rules import core_rules
 from internet.site import Site
 from internet.space import Space
 
-__all__ = ["Laboratory"]
-
 _PUBLIC: Final = (IPv4Network("198.51.100.0/24"), IPv4Network("203.0.113.0/24"), IPv4Network("192.0.2.0/24"))
 _PUBLIC6: Final = IPv6Network("2001:db8::/32")
 _BLOCK_BITS, _PREFIX_BITS = 29, 48

@@ -15,8 +15,6 @@ from pyroute2.netlink.exceptions import NetlinkError
 from gdp.errors import LocalError
 from internet.site import Lease
 
-__all__ = ["change_lease"]
-
 _IFA_F_NODAD: Final = 0x02
 _PERMANENT: Final = 0x80  # NUD_PERMANENT: of a state that no flush removes
 _NOARP: Final = 0x40

@@ -25,8 +25,6 @@ from gdp.host.run_registry import Run
 from internet.space import Space
 from lab.process import FailedError, LabProcess
 
-__all__ = ["LineProcess", "main"]
-
 log = logging.getLogger(__name__)
 
 _ALL: Final = 3  # ETH_P_ALL

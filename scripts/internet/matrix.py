@@ -22,8 +22,6 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 
-__all__ = ["Outcome", "Pair", "batches", "measure"]
-
 _LOOK_S: Final = 0.25
 _GROUP: Final = 3
 _CALL_S: Final = 5.0

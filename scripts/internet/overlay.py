@@ -28,8 +28,6 @@ from internet.laboratory import Laboratory
 from lab.process import LabProcess, end_processes
 from lab.rights import grant
 
-__all__ = ["LISTEN", "Overlay"]
-
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0
 _START_S: Final = 60.0

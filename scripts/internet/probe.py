@@ -16,8 +16,6 @@ from gdp.control.endpoints import Endpoint
 from gdp.ports.sockets import large_buffers
 from internet.host import Host
 
-__all__ = ["SILENCE_S", "UdpProbe", "observe"]
-
 _PATIENCE_S: Final = 5.0
 SILENCE_S: Final = 0.3  # after which a datagram that is expected to be lost counts as lost
 _TOKEN_BYTES: Final = 8

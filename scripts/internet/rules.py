@@ -12,8 +12,6 @@ from typing import Final
 
 from internet.access import Access
 
-__all__ = ["FLUSH_MAPPINGS", "LAN", "WAN", "core_rules", "router_rules"]
-
 WAN: Final = "wan"  # device of a router towards the internet
 LAN: Final = "lan"  # towards its hosts
 FLUSH_MAPPINGS: Final = "flush map inet site mapped"

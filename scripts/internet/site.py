@@ -28,8 +28,6 @@ from internet.space import Space
 if TYPE_CHECKING:
     from internet.laboratory import Laboratory
 
-__all__ = ["Lease", "Site"]
-
 _CORE_END, _ROUTER_END = "169.254.0.1", "169.254.0.2"  # RFC 3927, on every link towards the core
 _CORE_END6, _ROUTER_END6 = "fe80::1", "fe80::2"
 _CORE_ENDS, _ROUTER_ENDS = (_CORE_END, _CORE_END6), (_ROUTER_END, _ROUTER_END6)

@@ -15,8 +15,6 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.namespace import Namespace, wait_for_carrier
 
-__all__ = ["TOOLS", "Space"]
-
 TOOLS: Final = ("ip", "nft", "conntrack")
 
 _NET: Final = Path("/proc/sys/net")

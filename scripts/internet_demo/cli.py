@@ -31,8 +31,6 @@ from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Outcome, Pace, run_scenario
 from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 
-__all__ = ["app", "main"]
-
 _PACE: Final = Pace()
 
 _EXAMPLES: Final = """\b

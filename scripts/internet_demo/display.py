@@ -16,8 +16,6 @@ from internet_demo.stage import Link, Machine
 from internet_demo.traffic import Traffic
 from lab.command import StepDisplay
 
-__all__ = ["Display"]
-
 _PLAIN_EVERY_S: Final = 2.5
 _WAYS: Final = (("direct", True), ("border", False))
 

@@ -29,8 +29,6 @@ from internet_demo.stage import Stage
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph
 
-__all__ = ["run_figure1"]
-
 _PATIENCE_S: Final = 60.0
 _DOMAIN: Final = 42
 _ROW_BYTES: Final = 1_920  # of a picture

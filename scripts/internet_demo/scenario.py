@@ -19,8 +19,6 @@ from internet_demo.display import Display
 from internet_demo.stage import WIFI, WWAN, Stage
 from internet_demo.traffic import CAMERA, PLAN, Traffic
 
-__all__ = ["Event", "Outcome", "Pace", "run_scenario"]
-
 _LOOK_S: Final = 0.25
 _READERS: Final = ("cloud-a", "edge")
 

@@ -40,8 +40,6 @@ from internet.site import Site
 from lab.process import LabProcess, end_processes, python_environment, until
 from lab.rights import grant
 
-__all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
-
 WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"
 _DOMAIN: Final = "lab"

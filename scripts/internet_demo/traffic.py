@@ -15,8 +15,6 @@ from typing import Final
 
 import gdp
 
-__all__ = ["CAMERA", "PLAN", "Calls", "Camera", "Reader", "Traffic"]
-
 CAMERA: Final = "/camera/image"
 PLAN: Final = "/plan"
 _NUMBER_BYTES: Final = 8

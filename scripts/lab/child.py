@@ -18,8 +18,6 @@ from gdp.host.run_registry import Run
 from lab.events import Event
 from lab.process import FailedError, LabProcess
 
-__all__ = ["Child"]
-
 _LINE_MAX_BYTES: Final = 16 << 20  # the report on a recording of many topics
 _TAIL_LINES: Final = 12
 

@@ -16,8 +16,6 @@ from lab.child import Child
 from lab.events import Event
 from lab.namespaces import Namespaces
 
-__all__ = ["READY_S", "Children", "cancel", "gathered"]
-
 READY_S: Final = 60.0
 
 T = TypeVar("T")

@@ -18,8 +18,6 @@ from rich.text import Text
 from gdp.errors import GdpError
 from lab.process import FailedError
 
-__all__ = ["FAILED", "PASSED", "StepDisplay", "console_of", "exit_with", "new_app"]
-
 PASSED: Final = 0
 FAILED: Final = 1
 _WRONG_INPUT: Final = 2

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 from gdp.errors import LocalError
 
-__all__ = ["Event"]
-
 
 @dataclass(frozen=True, slots=True)
 class Event:

@@ -15,8 +15,6 @@ from gdp.host import netns_files
 from gdp.host.run_registry import Run, in_first_user_namespace
 from gdp.ports.rtnetlink import LinkMonitor
 
-__all__ = ["Namespace", "wait_for_carrier"]
-
 _PATIENCE_S: Final = 10.0
 
 T = TypeVar("T")

@@ -20,8 +20,6 @@ from gdp.host.run_registry import Run
 from lab.namespace import Namespace
 from lab.topology import Link, Topology
 
-__all__ = ["Namespaces"]
-
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _INDEX_FROM: Final = 100

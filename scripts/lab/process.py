@@ -22,8 +22,6 @@ from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 from gdp.ports.readiness import readable
 
-__all__ = ["FailedError", "LabProcess", "end_processes", "figures_of", "floats_of", "python_environment", "until"]
-
 _SCRIPTS: Final = Path(__file__).resolve().parents[1]
 _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0

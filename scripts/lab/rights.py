@@ -10,8 +10,6 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD
 from gdp.trust.right import Right
 
-__all__ = ["grant"]
-
 
 def grant(
     owner: Path, node: Path, rights: Mapping[str, Collection[Right]], types: Mapping[str, str] | None = None

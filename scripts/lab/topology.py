@@ -13,8 +13,6 @@ from typing import Final, Literal
 from gdp.errors import LocalError
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
 
-__all__ = ["Attachment", "DomainPlan", "Link", "Topology", "chain", "ring5"]
-
 Role = Literal["rib", "proxy"]
 
 COST: Final = 10

@@ -36,8 +36,6 @@ from ring.result import Result
 from ring.run import DEMO_S, Ring, make_demo
 from ring.table import summary, table
 
-__all__ = ["main", "spelled_out"]
-
 ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
 PLANES: Final[tuple[RingPlane, ...]] = get_args(RingPlane)
 LIVES: Final[tuple[Live, ...]] = get_args(Live)

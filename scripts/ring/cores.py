@@ -13,8 +13,6 @@ from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import Run
 from lab.topology import Topology
 
-__all__ = ["CORES_HELP", "EDGE_CORES", "ROBOT_CORES", "MachineCores", "cores_of"]
-
 ROBOT_CORES: Final = 2
 EDGE_CORES: Final = 4
 CORES_HELP: Final = "Two cores' worth for the robot, four for each edge server, by cgroups."

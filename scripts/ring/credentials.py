@@ -30,8 +30,6 @@ from proxy.serial.channel import RosVersion
 from ring.live_plan import Carried, Side
 from ring.plan import Credentials, Topic, Yaml, proxy_yaml, rib_yaml, rule_yaml, switch_yaml, upper_rib
 
-__all__ = ["OverlayCredentials"]
-
 _SIDES: Final[dict[Side, Right]] = {"expose": Right.PUBLISH, "import": Right.READ}
 
 

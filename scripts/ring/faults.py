@@ -14,8 +14,6 @@ from typing import Final, Literal, TypeAlias, cast, get_args
 from gdp.errors import LocalError
 from lab.topology import Attachment, Topology
 
-__all__ = ["Cut", "Fault", "Kill", "KillRole", "Roam", "check_faults", "roamers"]
-
 KillRole = Literal["rib", "switch"]
 
 _SECONDS: Final = r"\d+(?:\.\d+)?"

@@ -15,8 +15,6 @@ from ring.overlay import Overlay
 from ring.plan import METRICS_PORTS
 from ring.run import Ring
 
-__all__ = ["common", "hints", "inside", "live_hints"]
-
 
 def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
     """Return pairs of (effect, command line) in the recommended order; ``again``: the file of its new receiver."""

@@ -13,8 +13,6 @@ from lab.children import cancel
 from ring.faults import Cut, Fault, Kill, Roam
 from ring.progress import ProgressReporter
 
-__all__ = ["Injection", "Injector"]
-
 
 class Injector(Protocol):
     """Fault operations of a run's overlay."""

@@ -18,18 +18,6 @@ from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
 from ring.options import Live
 from ring.plan import AUTHOR, Yaml
 
-__all__ = [
-    "CARRIED",
-    "FAST_DDS_PROFILES",
-    "MASTER_PORT",
-    "Carried",
-    "Graph",
-    "Side",
-    "calls_in",
-    "graphs_of",
-    "messages_in",
-]
-
 Side = Literal["expose", "import"]
 
 MASTER_PORT: Final = 11_311

@@ -14,8 +14,6 @@ from proxy.recordings.compare import TopicComparison, compare_digests
 from ring.nodes.content import LAMP, LAMP_TYPE
 from ring.result import Journey, TopicResult, put_together
 
-__all__ = ["Heard", "rows"]
-
 
 @dataclass(frozen=True, slots=True)
 class Heard:

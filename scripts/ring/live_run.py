@@ -28,8 +28,6 @@ from ring.overlay import Overlay
 from ring.progress import ProgressReporter
 from ring.result import Result
 
-__all__ = ["LiveRing"]
-
 _ROS2: Final = ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs")
 _SIDES: Final[tuple[Side, Side]] = ("expose", "import")
 

@@ -21,8 +21,6 @@ from ring.nodes.content import LAMP
 from ring.progress import ProgressReporter, Traffic
 from ring.silence import Silence
 
-__all__ = ["LiveNodes", "LiveSession"]
-
 MEET_S: Final = 60.0
 ENDING_S: Final = 30.0
 QUIET_S: Final = 5.0

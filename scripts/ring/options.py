@@ -17,8 +17,6 @@ from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
 from ring.nodes.content import CAMERA_HZ
 
-__all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
-
 RingPlane = Literal["auto", "kernel", "raw", "scapy"]
 Live = Literal["ros2", "ros1", "mixed"]
 

@@ -22,8 +22,6 @@ from ring.faults import Cut, Kill, Roam, roamers
 from ring.options import Options
 from ring.progress import ProgressReporter
 
-__all__ = ["Overlay"]
-
 _MIDDLE: Final = "nuc3"
 
 

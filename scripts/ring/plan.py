@@ -17,20 +17,6 @@ from lab.topology import Attachment, DomainPlan, Topology
 from proxy.config.config import Encoding
 from proxy.serial.channel import Channel
 
-__all__ = [
-    "AUTHOR",
-    "METRICS_PORTS",
-    "Credentials",
-    "Topic",
-    "Yaml",
-    "proxy_yaml",
-    "rib_yaml",
-    "rule_yaml",
-    "switch_yaml",
-    "topics_of",
-    "upper_rib",
-]
-
 Yaml: TypeAlias = "dict[str, object]"
 
 METRICS_PORTS: Final = {"switch": 9_101, "rib": 9_102, "proxy": 9_103}  # on the loopback of each namespace

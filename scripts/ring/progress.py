@@ -13,8 +13,6 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-__all__ = ["ProgressReporter", "Traffic"]
-
 _PLAIN_EVERY_S: Final = 2.0
 
 

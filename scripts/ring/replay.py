@@ -20,8 +20,6 @@ from ring.injection import Injection
 from ring.progress import ProgressReporter, Traffic
 from ring.silence import Silence
 
-__all__ = ["Replay", "Report"]
-
 ENDING_S: Final = 30.0  # to close a recording, or to get the last acknowledgements
 STALL_S: Final = 30.0
 _ALL: Final = "recording"  # its topics are counted together

@@ -11,8 +11,6 @@ from dataclasses import KW_ONLY, dataclass
 from lab.events import Event
 from proxy.recordings.compare import TopicComparison
 
-__all__ = ["Journey", "Result", "TopicResult", "put_together"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Journey:

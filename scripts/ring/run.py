@@ -25,8 +25,6 @@ from ring.progress import ProgressReporter
 from ring.replay import Replay
 from ring.result import Result, put_together
 
-__all__ = ["DEMO_S", "Ring", "make_demo"]
-
 DEMO_S: Final = 10.0
 _MAKING_S: Final = 240.0  # timeout for the generation of the demonstration recording
 _DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"

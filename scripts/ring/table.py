@@ -12,8 +12,6 @@ from rich.table import Table
 
 from ring.result import Journey, Result, TopicResult
 
-__all__ = ["hops_in_words", "summary", "table"]
-
 _EDGE_SWITCHES: Final = 2
 _TEXTS: Final = ("topic", "type", "identical", "hops")
 _WIDE: Final = ("bytes", "delivered", "duplicated", "p99 ms", "max ms", "silent ms", "parts")

@@ -14,8 +14,6 @@ from typing import Any
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
-__all__ = ["AdvisoryError", "is_affected", "read_advisories"]
-
 _FILE_MAX_BYTES = 256 << 20
 _KINDS = ("introduced", "last_affected", "fixed")
 

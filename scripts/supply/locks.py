@@ -12,8 +12,6 @@ from pathlib import Path
 from packaging.markers import Marker
 from packaging.utils import canonicalize_name
 
-__all__ = ["LockError", "Pin", "pins_here", "read_lock"]
-
 _PIN = re.compile(r"(?P<name>[\w.\-]+)(?:\[[\w,.\- ]+\])?==(?P<version>[\w.!+\-]+)(?: *; *(?P<marker>[^\\]+?))?\Z")
 _HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\Z")
 

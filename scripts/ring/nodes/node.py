@@ -10,8 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-__all__ = ["Call", "Caller", "Lamp", "Node", "Publisher"]
-
 
 @dataclass(frozen=True, slots=True)
 class Call:

@@ -12,8 +12,6 @@ import time
 from enum import Enum
 from typing import Final, NoReturn
 
-__all__ = ["Order", "Orders", "say"]
-
 _STDOUT: Final = 1
 _LONG_S: Final = 3_600.0
 

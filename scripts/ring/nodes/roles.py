@@ -14,8 +14,6 @@ from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lam
 from ring.nodes.node import Call, Node
 from ring.nodes.orders import Order, Orders, say
 
-__all__ = ["call", "listen", "serve", "talk"]
-
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25
 _CALL_S: Final = 8.0  # longer than the proxies' timeout for a client

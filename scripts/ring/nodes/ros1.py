@@ -15,8 +15,6 @@ import rospy
 
 from ring.nodes.node import Call, Caller, Lamp, Publisher
 
-__all__ = ["Ros1Node"]
-
 _QUEUE: Final = 100
 
 

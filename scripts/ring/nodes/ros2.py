@@ -19,8 +19,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from ring.nodes.node import Call, Caller, Lamp, Publisher
 
-__all__ = ["Ros2Node"]
-
 _DEPTH: Final = 50  # some seconds of pictures: Fast DDS may need three to request a lost sample
 
 
