@@ -13,19 +13,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
 
-import yaml
 from shared_memory import SharedMemory
 
+from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
+from lab.credentials import Carried, OverlayCredentials, Side
 from lab.namespaces import Namespaces
 from lab.process import FailedError, LabProcess
-from lab.topology import Topology
+from lab.topology import Attachment, Topology
 from ring.cores import MachineCores
-from ring.credentials import OverlayCredentials
 
 _BENCH: Final = Path(__file__).resolve().parent
 
@@ -119,7 +117,7 @@ class OverlayNodes:
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        self._credentials = credentials = OverlayCredentials(self._topology, self.files, metrics=False)
+        self.credentials = credentials = OverlayCredentials(self._topology, self.files)
         self._switch_nodes = tuple(switches)
         self.planes: set[str] = set()
         self.undo = ExitStack()
@@ -144,40 +142,21 @@ class OverlayNodes:
         """End all processes, the last one first."""
         self.undo.close()
 
-    def admit(self, node: str, metadata: Metadata, right: Right) -> None:
-        """Give a member's node a delegation."""
-        identity = self._identity(node)
-        install_delegation(identity, delegate(self.files / "owner", identity / CARD, metadata, [right]))
-
     def admit_member(self, node: str, topics: Mapping[Right, Iterable[str]]) -> Path:
         """Delegate topics to a member without ROS; return its configuration file."""
         for right, names in topics.items():
             for name in names:
-                self.admit(node, Metadata({"kind": "topic", "name": name}), right)
-        return self._write(f"end-{node}.yaml", self._member(node))
+                self.credentials.delegate(node, Metadata({"kind": "topic", "name": name}), right)
+        content = {**self.credentials.node_yaml(Role.PROXY, node), "iface": self._iface(node)}
+        return self.credentials.write(f"end-{node}.yaml", content)
 
-    def admit_proxy(self, node: str, ros_domain: int, rules: Mapping[str, Sequence[Mapping[str, object]]]) -> Path:
-        """Write a proxy's configuration with its rules by side; return the file."""
-        identity = self._identity(node)
-        own = {"delegations": str(identity / DELEGATIONS), "ros": {"endpoint": "ros2", "domain": ros_domain}}
-        return self._write(f"proxy-{node}.yaml", {**self._member(node), **own, **rules})
+    def admit_proxy(self, node: str, ros_domain: int, carried: Mapping[Side, Sequence[Carried]]) -> str:
+        """Give a proxy the delegations of its sides, and write its configuration; return the file."""
+        at = Attachment(node, "proxy", self._iface(node))
+        return str(self.credentials.proxy(at, carried, ros={"endpoint": "ros2", "domain": ros_domain}))
 
-    @property
-    def owner_key(self) -> Path:
-        """The public key of the owner of all names."""
-        return self.files / "owner" / OWNER_PUBLIC
-
-    def _identity(self, node: str) -> Path:
-        return self.files / "nodes" / f"proxy-{node}"
-
-    def _member(self, node: str) -> dict[str, object]:
+    def _iface(self, node: str) -> str:
         if node in self._switch_nodes:
             (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
-        else:
-            iface = next(self._topology.links_of(node)).other(node)
-        return {**self._credentials.of_proxy(node).to_yaml(), "iface": iface}
-
-    def _write(self, name: str, content: Mapping[str, object]) -> Path:
-        path = self.files / name
-        path.write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
-        return path
+            return iface
+        return next(self._topology.links_of(node)).other(node)

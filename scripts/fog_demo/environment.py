@@ -15,20 +15,17 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import yaml
-
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from gdp.stores.keyring import DELEGATIONS
 from lab.child import Child
 from lab.children import Children
+from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5
-from ring.credentials import OverlayCredentials
 
 ROBOT: Final = "nuc1"
 FAR: Final = "nuc5"
@@ -62,7 +59,7 @@ class Environment:
         self._topology = Topology(ring.links, (DomainPlan("ring", ring.nodes),), attached)
         self._run = run
         self._namespaces = Namespaces(self._topology, run)
-        self._materials = OverlayCredentials(self._topology, run.directory, metrics=False)
+        self._credentials = OverlayCredentials(self._topology, run.directory)
         self.children = Children(run, kept=False)
         self.state = run.directory / STATE
         self.site_file = run.directory / SITE
@@ -74,11 +71,11 @@ class Environment:
         self._write_site(uplink, proxy, far_switch)
         switches = []
         for node in self._topology.nodes:
-            config = far_switch if node == FAR else self._materials.switch(node, "auto")
+            config = far_switch if node == FAR else self._credentials.switch(node, "auto")
             switches.append(self._start(node, "switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"]))
         planes = {each.text("data_plane") for each in await self.children.ready(switches)}
         (at,) = self._topology.attached("rib")
-        rib = ["-m", "gdp.cli.rib", "--config", str(self._materials.rib(at)), "--json"]
+        rib = ["-m", "gdp.cli.rib", "--config", str(self._credentials.rib(at)), "--json"]
         await self.children.ready([self._start(at.switch, "rib", rib)])
         await self.children.ready(
             [self._start(ROBOT, "proxy", ["-m", "proxy.cli.proxy", "--config", str(proxy), "--json"])]
@@ -105,27 +102,16 @@ class Environment:
         return self.children.start_in(self._namespaces, node, role, arguments, heard=heard, environment=ENVIRONMENT)
 
     def _write_proxy(self) -> Path:
-        """Write the robot's ``proxy.yaml``, without a rule: ``fog`` adds them."""
-        credentials = self._materials.of_proxy(ROBOT)
-        delegations = credentials.identity / DELEGATIONS
-        delegations.mkdir(mode=0o700, exist_ok=True)
+        """Write the robot's configuration, without a rule: ``fog`` adds them."""
         (at,) = (each for each in self._topology.attached("proxy") if each.switch == ROBOT)
-        content = {
-            **credentials.to_yaml(),
-            "iface": at.ifname,
-            "delegations": str(delegations),
-            "ros": {"endpoint": "ros2", "domain": _DOMAIN},
-        }
-        return self._write("proxy.yaml", content)
+        return self._credentials.proxy(at, {}, ros={"endpoint": "ros2", "domain": _DOMAIN})
 
     def _write_far_switch(self, uplink: str) -> Path:
         """Write ``switch.yaml`` of the far switch, with an additional port and the folder of revocations."""
-        path = self._materials.switch(FAR, "auto")
         revocations = self._run.directory / "revocations"
         revocations.mkdir(mode=0o700)
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        content["ports"].append({"iface": uplink, "optional": True})
-        return self._write(path.name, {**content, "revocations": str(revocations)})
+        ports = [*self._credentials.ports(FAR), {"iface": uplink, "optional": True}]
+        return self._credentials.switch(FAR, "auto", ports=ports, revocations=str(revocations))
 
     def _write_site(self, uplink: str, proxy: Path, switch: Path) -> None:
         folder = self._run.directory
@@ -137,12 +123,7 @@ class Environment:
             "watch": _WATCH,
             "uplink": uplink,
         }
-        self._write(SITE, content)
-
-    def _write(self, name: str, content: Mapping[str, object]) -> Path:
-        path = self._run.directory / name
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        return path
+        self._credentials.write(SITE, content)
 
 
 def standing_runs(what: str) -> RunRegistry:

@@ -10,16 +10,17 @@ import sys
 from pathlib import Path
 
 from gdp.host.run_registry import in_first_user_namespace
+from lab.credentials import METRICS_PORTS
 from ring.live_run import LiveRing
 from ring.overlay import Overlay
-from ring.plan import METRICS_PORTS
 from ring.run import Ring
 
 
 def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
     """Return pairs of (effect, command line) in the recommended order; ``again``: the file of its new receiver."""
     replay = Path(sys.executable).with_name("gdp-replay")
-    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.overlay.materials.proxy_file(ring.overlay.robot)}"
+    config = ring.overlay.credentials.file("proxy", ring.overlay.robot.switch)
+    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {config}"
     return [(f"send the recording again, into {again}", inside(ring.overlay, "nuc1", sender)), *common(ring.overlay)]
 
 

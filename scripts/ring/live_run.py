@@ -16,11 +16,12 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.child import Child
+from lab.credentials import Side
 from lab.events import Event
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.injection import Injection
-from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in, paces
+from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
 from ring.live_result import Heard, rows
 from ring.live_session import ENDING_S, LiveNodes, LiveSession
 from ring.options import Live, Options
@@ -130,7 +131,8 @@ class LiveRing:
         return self._start(at, graph, "master", ["-m", "ring.nodes.master", str(MASTER_PORT)])
 
     def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> Child:
-        config = self.overlay.materials.live(at, side, CARRIED, self._options.encoding, graph.to_yaml())
+        carried = {side: carried_in(self._options.encoding)}
+        config = self.overlay.credentials.proxy(at, carried, ros=graph.to_yaml())
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self._start(at, graph, "proxy", argv, heard=heard)
 

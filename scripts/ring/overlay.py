@@ -15,9 +15,9 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.child import Child
 from lab.children import READY_S, Children
+from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
 from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
-from ring.credentials import OverlayCredentials
 from ring.faults import Cut, Kill, Roam, roamers
 from ring.options import Options
 from ring.progress import ProgressReporter
@@ -47,13 +47,13 @@ class Overlay:
         roaming = roamers(options.faults, self.topology)
         for at in roaming:
             self.namespaces.connect_device(at.switch, at.ifname, at.switch)
-        self.materials = OverlayCredentials(
+        self.credentials = OverlayCredentials(
             self.topology,
             run.directory,
             metrics=options.keep,
             roamers=roaming,
             lease_s=options.lease_s,
-            data_plane="scapy" if options.data_plane == "scapy" else "raw",
+            uplink={"data_plane": "scapy"} if options.data_plane == "scapy" else None,
         )
         self._cores = self._make_cores(run) if options.cores else None
         self.children = Children(run, kept=options.keep, started=None if self._cores is None else self._cores.add)
@@ -77,14 +77,14 @@ class Overlay:
             await self.children.ready([capture])
         self.reporter.step("starting a switch in each")
         for node in self.topology.nodes:
-            config = self.materials.switch(node, self.options.data_plane)
+            config = self.credentials.switch(node, self.options.data_plane)
             self.switches[node] = self._start_switch(node, config)
         said = await self.children.ready(list(self.switches.values()))
         self._planes = sorted({each.text("data_plane") for each in said})
         for reason in sorted({each.text("reason") for each in said} - {""}):
             self.reporter.step(f"data plane {', '.join(self._planes)}: {reason}")
         self.reporter.step("starting the RIB of each domain")
-        configs = {at.switch: self.materials.rib(at) for at in self.topology.attached("rib")}
+        configs = {at.switch: self.credentials.rib(at) for at in self.topology.attached("rib")}
         self._ribs = {node: self._start_rib(node, config) for node, config in configs.items()}
         await self.children.ready(list(self._ribs.values()))
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
@@ -108,7 +108,7 @@ class Overlay:
         self._restarts += 1
         running, start = (self.switches, self._start_switch) if kill.role == "switch" else (self._ribs, self._start_rib)
         for node in kill.victims(self.topology):
-            child = running[node] = start(node, self.materials.file(kill.role, node), f"restart-{self._restarts}-")
+            child = running[node] = start(node, self.credentials.file(kill.role, node), f"restart-{self._restarts}-")
             await self.children.ready([child])
 
     async def roam(self, roam: Roam) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -14,13 +15,15 @@ from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
 from lab.child import Child
 from lab.children import READY_S, Children
+from lab.credentials import Carried
+from proxy.config.config import Encoding
 from proxy.recordings.compare import compare
 from proxy.recordings.reader import BagReader
-from proxy.serial.channel import RosVersion
+from proxy.serial.channel import Channel, RosVersion
 from ring.injection import Injection
+from ring.live_plan import AUTHOR
 from ring.options import Options
 from ring.overlay import Overlay
-from ring.plan import Topic, topics_of
 from ring.progress import ProgressReporter
 from ring.replay import Replay
 from ring.result import Result, put_together
@@ -52,7 +55,7 @@ class Ring:
         self._run = run
         self._reporter = reporter
         self._ros: RosVersion = channels[0].ros
-        self._topics: tuple[Topic, ...] = topics_of(channels)
+        self._topics = topics_of(channels, options.encoding)
         if self.recording.exists():
             raise ConfigError(str(self.recording), "", "exists already; choose another --out")
         self.overlay = Overlay(options, run, reporter)
@@ -94,16 +97,26 @@ class Ring:
         return path
 
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
-        at, encoding = self.overlay.server, self.options.encoding
-        config = self.overlay.materials.receiver(at, self._topics, encoding, self._ros, record)
+        at, recorded = self.overlay.server, {"path": str(record), "format": "ros1" if self._ros == 1 else "mcap"}
+        config = self.overlay.credentials.proxy(at, {"import": self._topics}, record=recorded)
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self.overlay.start(at.switch, "proxy", argv, heard=heard)
 
     def _start_sender(self) -> Child:
-        at, encoding = self.overlay.robot, self.options.encoding
-        config = self.overlay.materials.sender(at, self._topics, encoding, self._ros)
+        at = self.overlay.robot
+        config = self.overlay.credentials.proxy(at, {"expose": self._topics})
         argv = ["-m", "proxy.cli.replay", str(self.bag), "--config", str(config), "--json"]
         return self.overlay.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
+
+
+def topics_of(channels: Iterable[Channel], encoding: Encoding) -> tuple[Carried, ...]:
+    """Return each topic once, even if several nodes published it; latched if any of them latched."""
+    latched: dict[tuple[str, str], bool] = {}
+    for channel in channels:
+        key = (channel.topic, channel.type_name)
+        latched[key] = latched.get(key, False) or channel.latched
+    same = {"encoding": encoding, "reliable": True, "global": True}
+    return tuple(Carried(*key, options={**same, "latched": latch}, author=AUTHOR) for key, latch in latched.items())
 
 
 def _recorded_s(reader: BagReader) -> float:
