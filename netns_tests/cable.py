@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.machines import Machines
 

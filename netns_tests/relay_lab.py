@@ -21,7 +21,7 @@ from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from lab.process import LabProcess, end_processes
 from netns_tests.spaces import Space
 from tests.waiting import until

@@ -18,8 +18,8 @@ from gdp.host.run_registry import Run, RunRegistry
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.credentials import grant
 from lab.namespaces import Namespaces
-from lab.rights import grant
 from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
 

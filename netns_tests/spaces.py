@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pyroute2 import netns
 
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 
 _LIBRARY = ctypes.CDLL(None, use_errno=True)
 

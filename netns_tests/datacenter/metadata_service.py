@@ -18,7 +18,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import IPv4Address
 from typing import Final
 
-from lab.namespace import Namespace
+from lab.namespaces import Namespace
 from netns_tests.datacenter.router import METADATA
 
 _PORT: Final = 80

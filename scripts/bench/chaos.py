@@ -1,7 +1,7 @@
 """Chaos bench: faults of every kind in a network of real processes, drawn from a seed; afterwards all flows must work.
 
 A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable and
-best-effort topics (``faults/network.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
+best-effort topics (``faults/plan.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
 policy leave connected (``faults/oracle.py``) must continue. Promises:
 
     after the last fault    every flow that must be connected delivers again within a second, and stays so; with
@@ -35,14 +35,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from faults.accounts import Books, Silence
-from faults.continuity import Continuity
+from faults.accounts import Books, Continuity, Silence
 from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
-from faults.network import VICTIM, random_network
 from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.plan import Plan
+from faults.plan import VICTIM, Plan, random_network
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
 from report import percentile, print_table, progress

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from report import progress
-from ros_environment import ros_environment
-from testbed import Lab
+from testbed import Lab, ros_environment
 from topologies import single
 
 from fog.providers.local import fault_injection

@@ -32,8 +32,7 @@ from typing import Final, Literal
 
 from devices import add_address, add_bridge
 from machine import processor_s
-from ros_environment import BUFFER_BYTES, ros_environment
-from testbed import Lab, OverlayNodes
+from testbed import BUFFER_BYTES, Lab, OverlayNodes, ros_environment
 from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
 from gdp.host.run_registry import Run

@@ -1,7 +1,8 @@
 """Test bed of the benches and experiments: machines in namespaces, and the overlay's nodes on them.
 
 I/O. ``topologies.py`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
-lab. ``run.end()`` removes namespaces and processes of a lab.
+lab. ``run.end()`` removes namespaces and processes of a lab, and the file systems of its machines' shared memory.
+Source: shm_overview(7), mount_namespaces(7), unshare(1).
 """
 
 from __future__ import annotations
@@ -13,9 +14,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
 
-from shared_memory import SharedMemory
-
 from gdp.crypto.certificates import Role
+from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
@@ -24,6 +24,27 @@ from lab.namespaces import Namespaces
 from lab.process import FailedError, LabProcess
 from lab.topology import Attachment, Topology
 from ring.cores import MachineCores
+
+_SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
+_ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
+
+
+class SharedMemory:
+    """The ``/dev/shm`` of a machine.
+
+    Raises:
+        LocalError: the kernel refuses.
+    """
+
+    def __init__(self, run: Run, node: str) -> None:
+        self.folder = run.directory / f"shm-{node}"
+        run.plan_mount(self.folder)
+        mount_tmpfs(self.folder, _SIZE_BYTES)
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """Return the command line that runs ``argv`` with this ``/dev/shm``, under the same process id."""
+        return ["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", _ENTER, str(self.folder), *argv]
+
 
 _BENCH: Final = Path(__file__).resolve().parent
 
@@ -160,3 +181,46 @@ class OverlayNodes:
             (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
             return iface
         return next(self._topology.links_of(node)).other(node)
+
+
+BUFFER_BYTES: Final = 4 << 20  # of a socket, and of a segment of shared memory: both hold a camera image
+_UDP: Final = f"""<transport_descriptor>
+  <transport_id>udp</transport_id><type>UDPv4</type>
+  <sendBufferSize>{BUFFER_BYTES}</sendBufferSize><receiveBufferSize>{BUFFER_BYTES}</receiveBufferSize>
+ </transport_descriptor>"""
+_SHM: Final = f"""<transport_descriptor>
+  <transport_id>shm</transport_id><type>SHM</type><segment_size>{BUFFER_BYTES}</segment_size>
+ </transport_descriptor>"""
+_PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+ <transport_descriptors>{descriptors}</transport_descriptors>
+ <participant profile_name="participant" is_default_profile="true"><rtps>
+  <userTransports>{transports}</userTransports><useBuiltinTransports>false</useBuiltinTransports>
+ </rtps></participant>
+</profiles></dds>
+"""
+
+
+def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -> list[str]:
+    """Return the environment of a ROS process, as ``KEY=value``.
+
+    The discovery range is ``SUBNET``, and the namespaces confine: ``LOCALHOST`` would change the transports.
+
+    Args:
+        folder: where the profile is written.
+        shared_memory: whether processes of one machine use it; they use UDP otherwise.
+    """
+    profile = folder / f"dds-{'shm' if shared_memory else 'udp'}.xml"
+    transports = ("shm", "udp") if shared_memory else ("udp",)
+    text = _PROFILE.format(
+        descriptors=_SHM + _UDP if shared_memory else _UDP,
+        transports="".join(f"<transport_id>{each}</transport_id>" for each in transports),
+    )
+    profile.write_text(text, encoding="utf-8")
+    return [
+        f"ROS_DOMAIN_ID={domain}",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
+        f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
+        f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
+    ]

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from ros_environment import ros_environment
-from testbed import Lab, OverlayNodes
+from testbed import Lab, OverlayNodes, ros_environment
 from topologies import flat_topology
 
 from gdp.host.run_registry import Run

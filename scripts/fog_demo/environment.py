@@ -21,8 +21,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from lab.child import Child
-from lab.children import Children
+from lab.children import Child, Children
 from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5

@@ -13,9 +13,8 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from internet.access import Access
+from internet.access import Access, core_rules
 from internet.host import ETHERNET, Host
-from internet.rules import core_rules
 from internet.site import Site
 from internet.space import Space
 

@@ -25,8 +25,8 @@ from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from internet.host import Host
 from internet.laboratory import Laboratory
+from lab.credentials import grant
 from lab.process import LabProcess, end_processes
-from lab.rights import grant
 
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0

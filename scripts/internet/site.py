@@ -20,9 +20,8 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError
-from internet.access import TRAITS, Access
+from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
 from internet.line import LineProcess
-from internet.rules import FLUSH_MAPPINGS, LAN, WAN, router_rules
 from internet.space import Space
 
 if TYPE_CHECKING:

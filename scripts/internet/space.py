@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from lab.namespace import Namespace, wait_for_carrier
+from lab.namespaces import Namespace, wait_for_carrier
 
 TOOLS: Final = ("ip", "nft", "conntrack")
 

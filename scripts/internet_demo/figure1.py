@@ -23,8 +23,7 @@ from gdp.state.control_protocol import Command
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
-from internet_demo.display import Display
-from internet_demo.scenario import Event, Outcome, Pace
+from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph

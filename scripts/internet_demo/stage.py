@@ -37,8 +37,8 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
+from lab.credentials import grant
 from lab.process import LabProcess, end_processes, python_environment, until
-from lab.rights import grant
 
 WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"

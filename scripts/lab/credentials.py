@@ -193,3 +193,14 @@ class OverlayCredentials:
     def _write(self, role: Literal["switch", "rib", "proxy"], label: str, content: Yaml) -> Path:
         metrics: Yaml = {"metrics": {"port": METRICS_PORTS[role]}} if self._has_metrics else {}
         return self.write(self.file(role, label).name, {**metrics, **content})
+
+
+def grant(
+    owner: Path, node: Path, rights: Mapping[str, Collection[Right]], types: Mapping[str, str] | None = None
+) -> None:
+    """Let a node act on names; ``types``: ROS types of names."""
+    for name, given in rights.items():
+        kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
+        typed = {"type": types[name]} if types and name in types else {}
+        metadata = Metadata({"kind": kind, "name": name, **typed})
+        install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))

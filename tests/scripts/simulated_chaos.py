@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from faults.accounts import Books
-from faults.continuity import Continuity
+from faults.accounts import Books, Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
 from faults.schedule import Fault, FaultKind, broken_by

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from faults.accounts import Books, Timeline
 from faults.disk import snapshot_faults
-from faults.network import VICTIM, random_network
 from faults.oracle import Broken, Oracle
-from faults.plan import Flow, Plan, Service
+from faults.plan import VICTIM, Flow, Plan, Service, random_network
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
 from faults.store import critical_lines

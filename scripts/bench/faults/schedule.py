@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from faults.network import VICTIM
 from faults.oracle import Broken, Oracle
-from faults.plan import Plan
+from faults.plan import VICTIM, Plan
 
 
 class FaultKind(Enum):

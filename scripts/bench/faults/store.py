@@ -25,8 +25,7 @@ from redis.exceptions import RedisError
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
-from lab.namespace import Namespace
-from lab.namespaces import Namespaces
+from lab.namespaces import Namespace, Namespaces
 from lab.process import FailedError, until
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
