@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import sys
 
-from faults.disk import Disk
-from faults.store import StoreCluster
-from topologies import make_topology
+from faults.store import Disk, StoreCluster
 
 from gdp.host.run_registry import RunRegistry
 from lab.namespaces import Namespaces
+from lab.topology import make_topology
 
 
 def main() -> None:

@@ -18,9 +18,9 @@ from socket import AF_INET
 from typing import Final
 
 from chains import Chain
-from devices import add_bridge
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
 from pyroute2 import IPRoute
+from testbed import add_bridge
 
 from gdp.frame.kinds import ETHERTYPE
 from lab.process import LabProcess

@@ -15,11 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import mac_addresses, set_link
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from rate_search import Try
-from testbed import Lab
+from testbed import Lab, mac_addresses, set_link
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import LabProcess, figures_of, floats_of

@@ -2,7 +2,7 @@
 
 A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable and
 best-effort topics (``faults/plan.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
-policy leave connected (``faults/oracle.py``) must continue. Promises:
+policy leave connected (``faults/plan.py``) must continue. Promises:
 
     after the last fault    every flow that must be connected delivers again within a second, and stays so; with
                             --thin within two, if a queue holds 200 ms
@@ -36,20 +36,18 @@ from pathlib import Path
 from typing import Final
 
 from faults.accounts import Books, Continuity, Silence
-from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
-from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.plan import VICTIM, Plan, random_network
+from faults.plan import VICTIM, Oracle, Plan, random_network
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
-from faults.store import StoreCluster, has_server
+from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
-from topologies import ends_of
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError, until
+from lab.topology import ends_of
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # observation after the last fault

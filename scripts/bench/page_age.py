@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import yaml
-from machine import ROOT, git
-from preconditions import RefusedError
+from machine import ROOT, RefusedError, git
 
 LISTS: Final = Path(__file__).with_name("pages.yaml")
 COMMITS_MAX: Final = 300

@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from machine import DATA, RefusedError, data_folder
 from plot import Panel, panel_of
-from preconditions import DATA, RefusedError, data_folder
 from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench

@@ -30,15 +30,13 @@ from functools import partial
 from itertools import pairwise
 from typing import Final, Literal
 
-from devices import add_address, add_bridge
 from machine import processor_s
-from testbed import BUFFER_BYTES, Lab, OverlayNodes, ros_environment
-from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
+from testbed import BUFFER_BYTES, Lab, OverlayNodes, add_address, add_bridge, ros_environment
 
 from gdp.host.run_registry import Run
 from lab import credentials
 from lab.process import LabProcess
-from lab.topology import DomainPlan, Link, Topology
+from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 from proxy.config.config import Encoding
 
 READY_S: Final = 30.0

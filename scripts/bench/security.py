@@ -23,13 +23,13 @@ from faults.plan import Flow, Plan
 from faults.records import Kind
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
-from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
 from lab.process import FailedError, until
+from lab.topology import make_topology
 
 TARGET_MS: Final = 1_000.0
 CASE: Final = "until the last message of the closed flow"

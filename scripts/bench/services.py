@@ -21,8 +21,8 @@ from report import Rounds, Target
 from ros_row import READY_S, Carried, Row
 from ros_stage import DIRECT, MEDIAN, Bench, Measured, Turn, main
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
+from lab.topology import LEFT, RIGHT
 from proxy.config.config import Encoding
 
 MODULE: Final = "ros_calls"

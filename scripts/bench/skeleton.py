@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from machine import ROOT, MachineState, machine_state
+from machine import ROOT, MachineState, RefusedError, machine_state, require_trust, require_writable
 from plot import Panel, require_plot, save_bars
-from preconditions import RefusedError, require_trust, require_writable
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError

@@ -1,6 +1,6 @@
 """Test bed of the benches and experiments: machines in namespaces, and the overlay's nodes on them.
 
-I/O. ``topologies.py`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
+I/O. ``lab.topology`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
 lab. ``run.end()`` removes namespaces and processes of a lab, and the file systems of its machines' shared memory.
 Source: shm_overview(7), mount_namespaces(7), unshare(1).
 """
@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
+
+from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
 from gdp.host.mounts import mount_tmpfs
@@ -224,3 +226,47 @@ def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -
         f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
         f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
     ]
+
+
+def add_address(device: str, address: str) -> None:
+    """Give a device an IPv4 address of a network of 24 bits."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.addr("add", index=index, address=address, prefixlen=24)
+
+
+def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
+    """Join devices by a new bridge without spanning tree."""
+    with IPRoute() as here:
+        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
+        (bridge,) = here.link_lookup(ifname=name)
+        for device in devices:
+            here.link("set", index=here.link_lookup(ifname=device)[0], master=bridge)
+        here.link("set", index=bridge, state="up")
+
+
+def add_neighbour(device: str, address: str, mac: bytes) -> None:
+    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=index, state="permanent")
+
+
+def set_link(device: str, **change: str | int) -> None:
+    """Change a device: ``state``, ``mtu`` in bytes, or ``net_ns_fd``, the namespace of a descriptor to move it to."""
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], **change)
+
+
+def received(devices: Sequence[str]) -> dict[str, int]:
+    """Return how many frames have come in, by device."""
+    with IPRoute() as here:
+        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
+    return {device: links[device]["rx_packets"] for device in devices}
+
+
+def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
+    """Return the MAC addresses, by device."""
+    with IPRoute() as here:
+        links = {link.get("ifname"): link.get("address") for link in here.get_links()}
+    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}

@@ -27,8 +27,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from machine import DATA, RefusedError
 from plot import Panel, panel_of
-from preconditions import DATA, RefusedError
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import Lab

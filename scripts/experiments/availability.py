@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 from experiment import Computed, command_line, run_experiment
-from preconditions import data_folder
+from machine import data_folder
 from report import markdown_table, print_table
 from skeleton import Options
 

@@ -21,8 +21,7 @@ from typing import Final
 
 from bench_path import ROOT
 from field import Field, Served, Work
-from machine import MachineState, machine_state
-from preconditions import require_trust, require_writable
+from machine import MachineState, machine_state, require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit, new_run

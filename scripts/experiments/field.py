@@ -24,12 +24,11 @@ from typing import Final
 
 from bench_path import ROOT
 from testbed import Lab, OverlayNodes, ros_environment
-from topologies import flat_topology
 
 from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.process import LabProcess
-from lab.topology import Topology
+from lab.topology import Topology, flat_topology
 
 ROBOT: Final = "robot"
 READY_S: Final = 40.0

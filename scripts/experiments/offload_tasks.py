@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from machine import data_folder
 from numpy.typing import NDArray
-from preconditions import data_folder
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 

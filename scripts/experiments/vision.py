@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Final, TypeAlias
 
-import bench_path  # noqa: F401 - finds ``preconditions``
+import bench_path  # noqa: F401 - finds ``machine``
 import numpy as np
+from machine import RefusedError
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from preconditions import RefusedError
 from scipy import ndimage
 
 Grey: TypeAlias = "NDArray[np.uint8]"

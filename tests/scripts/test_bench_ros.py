@@ -15,11 +15,11 @@ from report import Rounds
 from ros_row import Carried
 from ros_stage import DIRECT, Bench, parse
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
 from gdp.metadata import Metadata
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import OWNER_PUBLIC
+from lab.topology import LEFT, RIGHT
 from proxy.config.rule import Rule
 
 

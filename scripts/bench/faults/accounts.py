@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from faults.oracle import Broken, Oracle
-from faults.plan import Plan
+from faults.plan import Broken, Oracle, Plan
 from faults.records import Kind, Record
 from gdp.message.loss import LossReason
 

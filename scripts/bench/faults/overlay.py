@@ -17,16 +17,14 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import received, set_link
 from pyroute2 import IPRoute
-from testbed import Lab
+from testbed import Lab, received, set_link
 
 from faults.clock import Clock
-from faults.disk import Disk
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
-from faults.store import StoreCluster
+from faults.store import Disk, StoreCluster
 from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata

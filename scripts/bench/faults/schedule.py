@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from faults.oracle import Broken, Oracle
-from faults.plan import VICTIM, Plan
+from faults.plan import VICTIM, Broken, Oracle, Plan
 
 
 class FaultKind(Enum):

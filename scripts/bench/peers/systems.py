@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from testbed import Lab, OverlayNodes
-from topologies import LEFT, MIDDLE, RIGHT
 
 from gdp.trust.right import Right
 from lab.process import FailedError, LabProcess
+from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
 from peers.chain import NODES, Chain, address
 from peers.exchange import Load

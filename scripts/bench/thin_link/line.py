@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from devices import add_address, add_neighbour, mac_addresses
 from machine import set_offloads
-from testbed import Lab
-from topologies import flat_topology
+from testbed import Lab, add_address, add_neighbour, mac_addresses
 
 from gdp.host.run_registry import Run
 from lab.process import FailedError, LabProcess
+from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions
 
 ROBOT: Final = "s1"
