@@ -58,8 +58,7 @@ def wheelhouse(folder: Path) -> Path:
 class CloudSite:
     """Site in the folder of a run; the caller's namespace has no other switch.
 
-    Args:
-        latency: region -> ``HOST:PORT`` that stands for its public endpoint.
+    ``latency``: region -> ``HOST:PORT`` that stands for its public endpoint.
     """
 
     def __init__(self, run: Run, wheel_folder: Path, latency: Mapping[str, str]) -> None:

@@ -103,8 +103,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 def session_lab(rights: Rights, types: Mapping[str, str] | None = None) -> Iterator[SessionLab]:
     """Run a lab whose nodes have these rights, without rights only an empty machine; end it on leaving.
 
-    Args:
-        types: ROS types of names.
+    ``types``: ROS types of names.
     """
     run = RunRegistry().start()
     with ExitStack() as undo:

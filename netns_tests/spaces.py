@@ -17,8 +17,7 @@ _LIBRARY = ctypes.CDLL(None, use_errno=True)
 class Space:
     """Entering moves the thread (and the processes it starts) into a new namespace; leaving moves it back.
 
-    Raises:
-        OSError: not allowed here.
+    Raises ``OSError``: not allowed here.
     """
 
     def __enter__(self) -> Space:

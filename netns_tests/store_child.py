@@ -1,7 +1,4 @@
-"""Child process with a run, a disk and a store of six servers; it prints the run's id and waits to be killed.
-
-I/O.
-"""
+"""Child process with a run, a disk and a store of six servers; it prints the run's id and waits to be killed. I/O."""
 
 from __future__ import annotations
 

@@ -106,14 +106,8 @@ class Chain(Lab):
     ) -> Try:
         """Send for a while, at ``rate`` frames/s or flat out, and count.
 
-        Args:
-            wire: what to send.
-            switches: the processes whose time counts.
-            rate: None for flat out.
-            seconds: for how long.
-
-        Raises:
-            FailedError: a process of the bench ended.
+        ``wire``: what to send. ``switches``: the processes whose time counts. ``rate``: None for flat out. ``seconds``:
+        for how long. Raises ``FailedError``: a process of the bench ended.
         """
         self._sink.ask(do="count", ethertype=wire.ethertype)
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches)
@@ -133,8 +127,7 @@ class Chain(Lab):
     def round_trips(self, wire: Wire, pings: int, *, poll: bool) -> list[float]:
         """Return round-trip times in microseconds; fewer than ``pings`` when some were lost.
 
-        Raises:
-            FailedError: a process of the bench ended.
+        Raises ``FailedError``: a process of the bench ended.
         """
         same = {"ethertype": wire.ethertype, "pings": pings, "poll": poll}
         self._sink.ask(do="answer", frame=wire.back.hex(), **same)

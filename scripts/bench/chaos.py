@@ -76,9 +76,7 @@ SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
 class Chaos:
     """One run: a network, its faults, and the records.
 
-    Args:
-        overlay: of the plan, started.
-        faults: in the order of their starts.
+    ``overlay``: of the plan, started. ``faults``: in the order of their starts.
     """
 
     def __init__(self, overlay: Overlay, faults: list[Fault]) -> None:
@@ -96,11 +94,7 @@ class Chaos:
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
-        """Return when every flow is delivered and every service responds.
-
-        Raises:
-            FailedError: not in time.
-        """
+        """Return when every flow is delivered and every service responds. Raises ``FailedError``: not in time."""
         until(
             lambda: not self._unreachable(),
             lambda: f"before any fault: {', '.join(self._unreachable())}",
@@ -135,9 +129,8 @@ class Chaos:
     def broken_promises(self, limit_s: float, full_s: float = 0.0) -> list[str]:
         """Return what broke, in words.
 
-        Args:
-            limit_s: longest silence of connected ends during faults.
-            full_s: longest wait in a link's queue, if links are kept full.
+        ``limit_s``: longest silence of connected ends during faults. ``full_s``: longest wait in a link's queue, if
+        links are kept full.
         """
         last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
         found = [f"{who} ended by itself" for who in self._overlay.died()]
@@ -303,9 +296,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
 def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     """Run one seed; print its table; return what broke.
 
-    Raises:
-        FailedError: the network did not come up.
-        GdpError: the kernel refuses.
+    Raises ``FailedError``: the network did not come up. Raises ``GdpError``: the kernel refuses.
     """
     thin_bits_s = 1e6 * (options.thin or 0.0)
     plan = random_network(
@@ -358,11 +349,8 @@ def _waited_s() -> float:
 def _in_store(plan: Plan, seed: int, *, is_wanted: bool | None) -> list[str]:
     """Return the switches whose RIBs share a cluster: those of the top domain, or none.
 
-    Args:
-        is_wanted: None: for every third seed, where a server is installed.
-
-    Raises:
-        FailedError: it is wanted, and no server is installed.
+    ``is_wanted``: None: for every third seed, where a server is installed. Raises ``FailedError``: it is wanted, and no
+    server is installed.
     """
     if is_wanted and not has_server():
         raise FailedError("neither valkey-server nor redis-server is installed")

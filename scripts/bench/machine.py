@@ -117,19 +117,14 @@ def _processor() -> str:
 
 
 def offloads(ifname: str) -> dict[str, bool]:
-    """Return which of tso, gso, gro and tx-checksum a device has on.
-
-    Raises:
-        OSError: no such device.
-    """
+    """Return which of tso, gso, gro and tx-checksum a device has on. Raises ``OSError``: no such device."""
     return {name: bool(_ask(ifname, get, 0)) for name, (get, _) in _GET_SET.items()}
 
 
 def set_offloads(ifname: str, *, on: bool) -> None:
     """Switch all four on or off; AF_PACKET frames never use them, IP does.
 
-    Raises:
-        OSError: no such device, or not allowed.
+    Raises ``OSError``: no such device, or not allowed.
     """
     first = _NEEDS if on else _NEEDS[::-1]
     for name in (*first, *(name for name in _GET_SET if name not in first)):
@@ -164,8 +159,7 @@ def processor_s(pid: int) -> float:
 def thread_s(pid: int) -> float:
     """Return the processor time of a process of one thread, including its soft interrupts (schedstat).
 
-    Raises:
-        OSError: no such process.
+    Raises ``OSError``: no such process.
     """
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
@@ -195,8 +189,7 @@ class RefusedError(Exception):
 def data_folder(name: str, patterns: Iterable[str], within: Path = DATA) -> Path:
     """Return a folder of recorded data, such as ``spot``; at least one file matches each pattern.
 
-    Raises:
-        RefusedError: none does.
+    Raises ``RefusedError``: none does.
     """
     folder = within / name
     for pattern in patterns:
@@ -209,11 +202,7 @@ def data_folder(name: str, patterns: Iterable[str], within: Path = DATA) -> Path
 def require_trust(state: MachineState, *, allow_load: bool) -> None:
     """Refuse to measure for a page that could not name its commit, or whose machine does other work.
 
-    Args:
-        allow_load: the rows are marked instead.
-
-    Raises:
-        RefusedError: such a page.
+    ``allow_load``: the rows are marked instead. Raises ``RefusedError``: such a page.
     """
     if not state.commit:
         raise RefusedError(f"a page names its commit, and {ROOT} is no git repository: clone it by git, or use --quick")
@@ -225,11 +214,7 @@ def require_trust(state: MachineState, *, allow_load: bool) -> None:
 
 
 def require_writable(folder: Path) -> None:
-    """Make a folder, and write a file into it for a moment.
-
-    Raises:
-        RefusedError: it cannot be made or written.
-    """
+    """Make a folder, and write a file into it for a moment. Raises ``RefusedError``: it cannot be made or written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -46,11 +46,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, lists: Path = LI
 
 
 def old_pages(root: Path, lists: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str]]:
-    """Yield each old page with the reason.
-
-    Raises:
-        RefusedError: there is no history.
-    """
+    """Yield each old page with the reason. Raises ``RefusedError``: there is no history."""
     try:
         if git("rev-parse", "--is-shallow-repository", root=root) == "true":
             raise RefusedError(f"{root} is a shallow clone: run git fetch --unshallow")

@@ -78,8 +78,7 @@ _SLOW: Final = {"slow_in": 100, "slow_s": 0.2, "threads": 8}
 class Kills:
     """Kills of all replicas but one at random moments, and their restart; then another one stays. A context manager.
 
-    Attributes:
-        count: deaths.
+    ``count``: deaths.
     """
 
     def __init__(self, here: Field, draw: random.Random) -> None:
@@ -136,11 +135,7 @@ class Kills:
 
 
 class Bench:
-    """Rounds in progress.
-
-    Attributes:
-        over: the figures.
-    """
+    """Rounds in progress. ``over``: the figures."""
 
     def __init__(self, runs: RunRegistry, rate: float, draw: random.Random) -> None:
         self._runs = runs

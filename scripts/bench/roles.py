@@ -68,11 +68,8 @@ class Counted(NamedTuple):
 def open_end(ifname: str, ethertype: int, *, cut_bytes: int = 0) -> socket.socket:
     """Open a socket that does not block; EtherType 0 only sends.
 
-    Args:
-        cut_bytes: keep so much of each frame (0: all), so that long ones are not copied.
-
-    Raises:
-        OSError: no such device, or not allowed.
+    ``cut_bytes``: keep so much of each frame (0: all), so that long ones are not copied. Raises ``OSError``: no such
+    device, or not allowed.
     """
     opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     try:
@@ -121,11 +118,8 @@ def _paced(sock: socket.socket, batch: MmsgPool, head: bytes, drops: list[int], 
 def count_frames(ifname: str, ethertype: int, ready: Callable[[], None], asked: Callable[[], int | None]) -> Counted:
     """Count frames until all expected ones have arrived or no more come.
 
-    Args:
-        ifname: the device.
-        ethertype: of the frames.
-        ready: called when counting begins.
-        asked: returns the expected number once the source is done, None before that; only called when nothing came.
+    ``ifname``: the device. ``ethertype``: of the frames. ``ready``: called when counting begins. ``asked``: returns the
+    expected number once the source is done, None before that; only called when nothing came.
     """
     silence_s, expected, got, last_s = 0.2, None, 0, 0.0
     batch = make_batch(_SLOT_BYTES)
@@ -214,8 +208,7 @@ _LEASE_S: Final = 1e9
 def make_plane(kind: str, ifnames: list[str], table: Table) -> NetdevPlane:
     """Return a plane by its name in the benches.
 
-    Raises:
-        LocalError: it is not available here; the text gives the reason.
+    Raises ``LocalError``: it is not available here; the text gives the reason.
     """
     if kind == "scapy":
         from gdp.ports.scapy_plane import ScapyPlane
@@ -233,9 +226,8 @@ def make_plane(kind: str, ifnames: list[str], table: Table) -> NetdevPlane:
 def switch(plane: str, ways: dict[str, str], **_: Any) -> None:
     """Forward by a static table until stdin closes.
 
-    Args:
-        plane: which one.
-        ways: the devices towards the source ("left") and the sink ("right"), each "device neighbour's-MAC" in hex.
+    ``plane``: which one. ``ways``: the devices towards the source ("left") and the sink ("right"), each "device
+    neighbour's-MAC" in hex.
     """
     left, right = (ways[side].split() for side in ("left", "right"))
     table = Table(_ENTRIES_MAX)

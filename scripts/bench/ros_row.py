@@ -51,9 +51,7 @@ _BRIDGE: Final = "bridge"
 class Carried:
     """Topic or service that the proxies carry.
 
-    Attributes:
-        source: location of its publishers, or its server.
-        sign: of a service, as in its rules.
+    ``source``: location of its publishers, or its server. ``sign``: of a service, as in its rules.
     """
 
     name: str

@@ -65,8 +65,7 @@ class Turn:
     def measure(self, row: Row, number: int) -> dict[str, float]:
         """Return the figures of one trial, by column.
 
-        Raises:
-            FailedError: a node did not come up, or nothing was received.
+        Raises ``FailedError``: a node did not come up, or nothing was received.
         """
         said, cores = self.report(row, self.encoding, number)
         figures = figures_of(said)

@@ -85,11 +85,7 @@ class _Closing:
         self._last_ns: dict[int, int] = {}  # by channel: when R got the last message
 
     def measure(self, over: Rounds) -> None:
-        """Add the measurements.
-
-        Raises:
-            FailedError: the flows did not come up, or a process ended by itself.
-        """
+        """Add the measurements. Raises ``FailedError``: the flows did not come up, or a process ended by itself."""
         flows = self._overlay.plan.flows
         until(
             lambda: len(self._last_ns) == len(flows),

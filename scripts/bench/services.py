@@ -46,8 +46,7 @@ def measure(
 ) -> Measured:
     """Return the client's report, and the cores that the proxies used.
 
-    Raises:
-        FailedError: a node did not come up.
+    Raises ``FailedError``: a node did not come up.
     """
     del number
     service, role, is_direct = (

@@ -201,11 +201,7 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
 
 
 def _require_page(options: Options, state: MachineState) -> None:
-    """Refuse to measure for files that could not be written, or not be trusted.
-
-    Raises:
-        RefusedError: such files.
-    """
+    """Refuse to measure for files that could not be written, or not be trusted. Raises ``RefusedError``: such files."""
     is_quick = getattr(options, "quick", False)
     chosen = [path for path in (getattr(options, "json", None), getattr(options, "plot", None)) if path]
     is_whole = getattr(options, "is_whole", None)

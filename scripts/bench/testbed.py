@@ -32,11 +32,7 @@ _ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
 
 
 class SharedMemory:
-    """The ``/dev/shm`` of a machine.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """The ``/dev/shm`` of a machine. Raises ``LocalError``: the kernel refuses."""
 
     def __init__(self, run: Run, node: str) -> None:
         self.folder = run.directory / f"shm-{node}"
@@ -56,12 +52,8 @@ T = TypeVar("T")
 class Lab:
     """Machines of a topology, each in a namespace.
 
-    Args:
-        own_shared_memory: these machines have a ``/dev/shm`` each; the others see the one of the host.
-        cores: bound of processor time by machine; None: the machines share all cores.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. ``cores``: bound
+    of processor time by machine; None: the machines share all cores. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(

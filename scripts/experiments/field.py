@@ -42,10 +42,8 @@ _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 class Served:
     """Service of the field.
 
-    Args:
-        machines: the machines that expose it.
-        expose: further keys of their rules.
-        imports: further keys of the robot's rule.
+    ``machines``: the machines that expose it. ``expose``: further keys of their rules. ``imports``: further keys of the
+    robot's rule.
     """
 
     name: str
@@ -90,8 +88,7 @@ class Server:
     def wait(self) -> None:
         """Wait until both are ready. They report it before the robot's proxy knows of them.
 
-        Raises:
-            FailedError: one did not come up.
+        Raises ``FailedError``: one did not come up.
         """
         for each in self._running:
             each.read_line(READY_S)

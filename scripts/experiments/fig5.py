@@ -110,11 +110,7 @@ def _named(what: str, found: Mapping[str, list[Sample]]) -> dict[str, list[Sampl
 
 
 def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
-    """Refuse a planner or a problem that is not available.
-
-    Raises:
-        RefusedError: one is not.
-    """
+    """Refuse a planner or a problem that is not available. Raises ``RefusedError``: one is not."""
     try:
         from planning import PROBLEMS, planners
     except ImportError as error:

@@ -233,11 +233,7 @@ _KINDS: Final = {"rgb8": (np.uint8, 3), "16UC1": (np.uint16, 1), "32FC1": (np.fl
 
 
 def _read(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
-    """Return the pixels of an image file.
-
-    Raises:
-        FileNotFoundError: it is missing, or no image.
-    """
+    """Return the pixels of an image file. Raises ``FileNotFoundError``: it is missing, or no image."""
     image = cv2.imread(str(path), flags)
     if image is None:
         raise FileNotFoundError(path)

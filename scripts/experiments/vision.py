@@ -99,8 +99,7 @@ class Networks:
 def require_networks(instead: str) -> None:
     """Refuse to compute without the networks; ``instead`` is what else to do.
 
-    Raises:
-        RefusedError: they are not installed.
+    Raises ``RefusedError``: they are not installed.
     """
     if find_spec(_WHEEL) is None:
         what = f"{_WHEEL} is not installed: pip install 'gdp-ros[experiments]' (Python 3.10 to 3.12)"

@@ -44,8 +44,7 @@ ENVIRONMENT: Final = {
 class Environment:
     """Ring of one run and its site.
 
-    Args:
-        run: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
+    ``run``: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
     """
 
     def __init__(self, run: Run) -> None:
@@ -84,8 +83,7 @@ class Environment:
     async def fog(self, *words: str, patience_s: float) -> None:
         """Run a command of ``fog`` on the host of the far switch until it ends.
 
-        Raises:
-            FailedError: it failed; the text has its last output.
+        Raises ``FailedError``: it failed; the text has its last output.
         """
         argv = fog_command(self._run, words)
         child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)
@@ -128,8 +126,7 @@ class Environment:
 def standing_runs(what: str) -> RunRegistry:
     """Return the records of runs of one kind, such as ``demo``, with machines of ``fog``.
 
-    Raises:
-        LocalError: the folder belongs to another user.
+    Raises ``LocalError``: the folder belongs to another user.
     """
     return RunRegistry(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
 
@@ -145,8 +142,7 @@ def sweep(runs: RunRegistry) -> list[str]:
 def end_all_of(run: Run) -> None:
     """Release the machines of a run, and take down the rest.
 
-    Raises:
-        LocalError: machines remain; the text has the output of ``fog down``.
+    Raises ``LocalError``: machines remain; the text has the output of ``fog down``.
     """
     if (run.directory / STATE).exists():
         argv = [sys.executable, *fog_command(run, ["down", "--all"])]

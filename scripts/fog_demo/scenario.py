@@ -39,8 +39,7 @@ _PLAIN_EVERY_S: Final = 4.0
 class Counts:
     """Request statistics of the robot's node.
 
-    Args:
-        failed: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
+    ``failed``: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
     """
 
     requests: int = 0
@@ -107,9 +106,8 @@ class Pace:
 class Outcome:
     """Result of the scenario.
 
-    Args:
-        steps_s: seconds from the notice, or the kill, until its detection, and until a replacement served.
-        complaints: lines of the robot's node about failed requests.
+    ``steps_s``: seconds from the notice, or the kill, until its detection, and until a replacement served.
+    ``complaints``: lines of the robot's node about failed requests.
     """
 
     counts: Counts

@@ -106,9 +106,7 @@ table inet site {{
 def router_rules(access: Access, wan_address: str) -> str:
     """Return the rules of a router, which replace those it has; empty for public access.
 
-    Args:
-        access: kind of the site.
-        wan_address: IPv4 address of the router's device ``wan``; empty: it has none.
+    ``access``: kind of the site. ``wan_address``: IPv4 address of the router's device ``wan``; empty: it has none.
     """
     if access is Access.PUBLIC:
         return ""

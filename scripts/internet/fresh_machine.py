@@ -93,11 +93,7 @@ class Shell(LabProcess):
 class FreshMachine:
     """A machine with empty folders; a context manager that ends its commands.
 
-    Args:
-        host: of a laboratory.
-
-    Raises:
-        LocalError: the kernel refuses the mounts.
+    ``host``: of a laboratory. Raises ``LocalError``: the kernel refuses the mounts.
     """
 
     def __init__(self, host: Host, folder: Path) -> None:

@@ -27,11 +27,7 @@ _NOARP: Final = 0x40
 def change_lease(device: str, old: Lease, new: Lease, metric: int) -> None:
     """Replace the addresses and default routes of a device, and forget its neighbours.
 
-    Args:
-        metric: of the default routes.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``metric``: of the default routes. Raises ``LocalError``: the kernel refuses.
     """
     try:
         with IPRoute() as netlink:

@@ -27,8 +27,7 @@ _FIRST_INDEX: Final = 1_000  # ends of a pair differ in index; see ``lab.namespa
 class Laboratory:
     """The core and what is attached to it; a context manager that ends the processes of delay lines.
 
-    Raises:
-        LocalError: the kernel refuses; the run's record names what was made before.
+    Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, run: Run) -> None:
@@ -53,9 +52,8 @@ class Laboratory:
     def add_site(self, label: str, access: Access, *, has_line: bool = False) -> Site:
         """Attach a site.
 
-        Args:
-            label: at most 10 letters, unique among sites and hosts.
-            has_line: whether packets can be delayed, which costs a process.
+        ``label``: at most 10 letters, unique among sites and hosts. ``has_line``: whether packets can be delayed, which
+        costs a process.
         """
         site = self.sites[label] = Site(self, label, access, has_line=has_line)
         return site

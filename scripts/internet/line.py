@@ -39,8 +39,7 @@ _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
 class LineProcess(LabProcess):
     """A running delay line between two devices of a namespace; it starts without delay.
 
-    Raises:
-        FailedError: it does not start.
+    Raises ``FailedError``: it does not start.
     """
 
     def __init__(self, run: Run, space: Space, one: str, other: str) -> None:

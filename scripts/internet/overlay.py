@@ -40,11 +40,7 @@ Yaml = Mapping[str, object]
 
 
 class Overlay:
-    """Processes of a domain; a context manager that ends them.
-
-    Attributes:
-        folder: of all keys and configuration files.
-    """
+    """Processes of a domain; a context manager that ends them. ``folder``: of all keys and configuration files."""
 
     def __init__(self, laboratory: Laboratory) -> None:
         self.folder = laboratory.run.directory
@@ -114,8 +110,7 @@ class Overlay:
     def start(self, *hosts: Host) -> None:
         """Start the switches and relays of these hosts; return when all are ready.
 
-        Raises:
-            FailedError: one does not start.
+        Raises ``FailedError``: one does not start.
         """
         self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
         relays = {f"{host.label}-{_RELAY}": host for host in hosts}

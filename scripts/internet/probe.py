@@ -92,8 +92,7 @@ def observe(
 ) -> Endpoint | None:
     """Send a datagram and return the source that the receiver sees; None: it does not arrive in time.
 
-    Args:
-        to: destination; by default the receiver's own address.
+    ``to``: destination; by default the receiver's own address.
     """
     token = secrets.token_bytes(_TOKEN_BYTES)
     sender.send(to or receiver.local, token)

@@ -53,9 +53,7 @@ class Lease:
 class Site:
     """Access of some hosts to the core; ``Laboratory.add_site`` makes it.
 
-    Attributes:
-        access: its kind.
-        routers: from its hosts outwards.
+    ``access``: its kind. ``routers``: from its hosts outwards.
     """
 
     def __init__(self, laboratory: Laboratory, label: str, access: Access, *, has_line: bool) -> None:
@@ -171,8 +169,7 @@ class Site:
     def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
         """Delay packets by ``ms``, and up to ``jitter_ms`` more, in each direction; their order stays.
 
-        Raises:
-            LocalError: the site was made without a delay line.
+        Raises ``LocalError``: the site was made without a delay line.
         """
         if self._line is None:
             raise LocalError(f"site {self.label} has no delay line")

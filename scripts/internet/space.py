@@ -1,7 +1,4 @@
-"""Network namespace of a laboratory: commands of ip(8), nft(8) and conntrack(8) inside it.
-
-I/O; needs CAP_NET_ADMIN.
-"""
+"""Network namespace of a laboratory: commands of ip(8), nft(8) and conntrack(8) inside it. I/O; needs CAP_NET_ADMIN."""
 
 from __future__ import annotations
 
@@ -34,12 +31,8 @@ _NO_BRIDGE_RULES: Final = {"bridge/bridge-nf-call-iptables": 0, "bridge/bridge-n
 class Space(Namespace):
     """A namespace of a run, whose loopback is up.
 
-    Args:
-        label: part of its name; unique in the run.
-        forwards: whether it is a router.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``label``: part of its name; unique in the run. ``forwards``: whether it is a router. Raises ``LocalError``: the
+    kernel refuses.
     """
 
     def __init__(self, run: Run, label: str, *, forwards: bool = False) -> None:

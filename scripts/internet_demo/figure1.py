@@ -104,8 +104,7 @@ class _Node:
 def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
     """Play the figure, with ``pace.calm_s`` seconds of traffic before the flight and after it.
 
-    Raises:
-        LocalError: ROS is missing, a machine does not join, or a program does not start.
+    Raises ``LocalError``: ROS is missing, a machine does not join, or a program does not start.
     """
     rospy_folder()  # raises
     outcome = Outcome()

@@ -75,12 +75,7 @@ _READERS: Final = ("cloud-a", "edge")
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Pace of the demonstration.
-
-    Args:
-        calm_s: after each event.
-        delay_ms: of each uplink, in each direction.
-    """
+    """Pace of the demonstration. ``calm_s``: after each event. ``delay_ms``: of each uplink, in each direction."""
 
     rate_hz: float = 20.0
     image_bytes: int = 20_000
@@ -112,11 +107,7 @@ class Outcome:
 
 
 def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
-    """Play the demonstration.
-
-    Raises:
-        LocalError: a machine does not join, or a program does not start.
-    """
+    """Play the demonstration. Raises ``LocalError``: a machine does not join, or a program does not start."""
     outcome = Outcome()
     display.step("networks: home and 5G for the robot, a provider's NAT, a public cloud, an office on IPv6 only")
     with Stage(laboratory, pace.delay_ms) as stage, ExitStack() as stack:

@@ -51,11 +51,7 @@ _StageT = TypeVar("_StageT", bound="Stage")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """A machine of the domain.
-
-    Args:
-        directory: of its keys and configuration.
-    """
+    """A machine of the domain. ``directory``: of its keys and configuration."""
 
     label: str
     host: Host

@@ -89,10 +89,7 @@ class Camera:
 class Traffic:
     """All traffic; a context manager that closes what it opened.
 
-    Args:
-        robot: publishes and calls.
-        server: serves the calls, and reads.
-        readers: sessions that read, by label.
+    ``robot``: publishes and calls. ``server``: serves the calls, and reads. ``readers``: sessions that read, by label.
     """
 
     def __init__(

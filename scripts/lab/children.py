@@ -41,8 +41,7 @@ class Child(LabProcess):
     async def events(self) -> AsyncGenerator[Event, None]:
         """Yield the events of the process, until it closes its output.
 
-        Raises:
-            LocalError: its output is not an event.
+        Raises ``LocalError``: its output is not an event.
         """
         lines = await self._open()
         while line := await lines.readline():

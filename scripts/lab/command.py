@@ -54,9 +54,8 @@ def exit_with(work: Callable[[], int]) -> None:
 class StepDisplay:
     """Display of steps and of the present state; a context manager.
 
-    Args:
-        is_kept: whether the last state stays in the terminal.
-        plain_every_s: time between two plain lines where there is no terminal.
+    ``is_kept``: whether the last state stays in the terminal. ``plain_every_s``: time between two plain lines where
+    there is no terminal.
     """
 
     def __init__(self, console: Console, *, is_kept: bool, plain_every_s: float) -> None:

@@ -66,9 +66,8 @@ class Carried:
 class OverlayCredentials:
     """The files of one overlay. Its creation creates the domains and admits all nodes of the topology.
 
-    Args:
-        roamers: proxies that will also be attached to other switches; their cables are created elsewhere.
-        uplink: further keys of every RIB and proxy.
+    ``roamers``: proxies that will also be attached to other switches; their cables are created elsewhere. ``uplink``:
+    further keys of every RIB and proxy.
     """
 
     def __init__(

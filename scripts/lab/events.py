@@ -20,11 +20,7 @@ class Event:
 
     @classmethod
     def from_line(cls, line: str) -> Event:
-        """Read a line.
-
-        Raises:
-            LocalError: it is not a JSON object.
-        """
+        """Read a line. Raises ``LocalError``: it is not a JSON object."""
         try:
             fields: object = json.loads(line)
         except ValueError as error:

@@ -30,14 +30,8 @@ T = TypeVar("T")
 class Namespace:
     """A network namespace.
 
-    Args:
-        label: part of its name; unique in the run.
-
-    Attributes:
-        path: the file that holds it.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``label``: part of its name; unique in the run. ``path``: the file that holds it. Raises ``LocalError``: the kernel
+    refuses.
     """
 
     def __init__(self, run: Run, label: str) -> None:
@@ -53,8 +47,7 @@ class Namespace:
     def command(self, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
         """Return the command line that runs ``argv`` inside, under the same process id.
 
-        Args:
-            dies_with_us: whether the kernel kills it when the thread that starts it ends in any way.
+        ``dies_with_us``: whether the kernel kills it when the thread that starts it ends in any way.
         """
         leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
         return ["nsenter", f"--net={self.path}", "--", *leash, *argv]
@@ -78,8 +71,7 @@ _PLUG_FROM: Final = 10_000
 class Namespaces:
     """The namespaces of one run. ``run.end()`` removes exactly these, and with them every device inside.
 
-    Raises:
-        LocalError: the kernel refuses; the run's record names what was made before.
+    Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, topology: Topology, run: Run) -> None:

@@ -95,12 +95,8 @@ class _Node:
 class SimNetwork:
     """Nodes, links, and the events between them.
 
-    Args:
-        seed: of all random choices.
-
-    Attributes:
-        taps: called for each frame that enters a link, with (second, from node, to node, frame with Ethernet header).
-        drops: frames that the simulated data planes dropped, by reason.
+    ``seed``: of all random choices. ``taps``: called for each frame that enters a link, with (second, from node, to
+    node, frame with Ethernet header). ``drops``: frames that the simulated data planes dropped, by reason.
     """
 
     def __init__(self, seed: int = 1) -> None:

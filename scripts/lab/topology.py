@@ -68,9 +68,8 @@ class DomainPlan:
 class Topology:
     """Switches, links, domains and attached nodes, validated on construction.
 
-    Raises:
-        LocalError: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU or
-            device name out of bounds. Methods raise it for switches that are unknown or not joined.
+    Raises ``LocalError``: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU
+    or device name out of bounds. Methods raise it for switches that are unknown or not joined.
     """
 
     links: tuple[Link, ...]
@@ -168,8 +167,7 @@ def ring5(mtu: int = MTU_BYTES) -> Topology:
 def chain(length: int, mtu: int = MTU_BYTES) -> Topology:
     """Return ``length`` switches ``s1 .. sN`` in a row in one domain: its RIB in the middle, a proxy at either end.
 
-    Raises:
-        LocalError: no switch at all.
+    Raises ``LocalError``: no switch at all.
     """
     _require(length >= 1, "a chain has at least one switch")
     nodes = tuple(f"s{number}" for number in range(1, length + 1))
@@ -231,12 +229,8 @@ def flat_topology(
 ) -> Topology:
     """Return the topology of one trust domain; ``rib`` is the switch with the RIB.
 
-    Args:
-        mtu: bytes after the Ethernet header, of every link.
-        switches: nodes that come first in the topology's order.
-
-    Raises:
-        LocalError: they do not fit together.
+    ``mtu``: bytes after the Ethernet header, of every link. ``switches``: nodes that come first in the topology's
+    order. Raises ``LocalError``: they do not fit together.
     """
     pairs = list(links)
     nodes = tuple(dict.fromkeys((*switches, *(end for pair in pairs for end in pair))))
@@ -245,11 +239,7 @@ def flat_topology(
 
 
 def row(mtu: int) -> Topology:
-    """Return A - s1 - s2 - s3 - B with the RIB at s2.
-
-    Raises:
-        LocalError: the MTU is out of bounds.
-    """
+    """Return A - s1 - s2 - s3 - B with the RIB at s2. Raises ``LocalError``: the MTU is out of bounds."""
     return flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
 
 

@@ -27,11 +27,7 @@ def cores_of(topology: Topology) -> dict[str, int]:
 class MachineCores:
     """Control groups of the machines of one run.
 
-    Args:
-        cores: by machine.
-
-    Raises:
-        LocalError: this system permits no such groups; none is left.
+    ``cores``: by machine. Raises ``LocalError``: this system permits no such groups; none is left.
     """
 
     def __init__(self, run: Run, cores: dict[str, int]) -> None:

@@ -1,7 +1,4 @@
-"""Plan of a live run, as data: the graphs of both sides, the names that cross, and the amount of traffic.
-
-Sans-I/O.
-"""
+"""Plan of a live run, as data: the graphs of both sides, the names that cross, and the amount of traffic. Sans-I/O."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Live run: real ROS nodes on both sides of the ring, and a proxy in the graph of each.
-
-I/O.
-"""
+"""Live run: real ROS nodes on both sides of the ring, and a proxy in the graph of each. I/O."""
 
 from __future__ import annotations
 
@@ -159,11 +156,7 @@ _SIDES: Final[tuple[Side, Side]] = ("expose", "import")
 class LiveRing:
     """The ring of one live run, from its creation.
 
-    Args:
-        run: removes what is created here.
-
-    Raises:
-        LocalError: a ROS is missing, or the kernel refuses namespaces.
+    ``run``: removes what is created here. Raises ``LocalError``: a ROS is missing, or the kernel refuses namespaces.
     """
 
     def __init__(self, options: Options, live: Live, run: Run, reporter: ProgressReporter) -> None:

@@ -1,7 +1,4 @@
-"""Options of a run of the ring.
-
-Sans-I/O.
-"""
+"""Options of a run of the ring. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -101,11 +98,7 @@ class Options:
         return LIVE_S if self.seconds is None else self.seconds
 
     def topology(self) -> Topology:
-        """Return the ring with the requested MTU.
-
-        Raises:
-            LocalError: no link can have that MTU.
-        """
+        """Return the ring with the requested MTU. Raises ``LocalError``: no link can have that MTU."""
         return ring5(self.mtu)
 
     def settings(self) -> dict[str, object]:

@@ -28,13 +28,8 @@ _MIDDLE: Final = "nuc3"
 class Overlay:
     """The overlay of one run, from its creation; other modules start the proxies.
 
-    A fault that the kernel refuses raises ``LocalError``.
-
-    Args:
-        run: removes what is created here.
-
-    Raises:
-        LocalError: the kernel refuses namespaces.
+    A fault that the kernel refuses raises ``LocalError``. ``run``: removes what is created here. Raises ``LocalError``:
+    the kernel refuses namespaces.
     """
 
     def __init__(self, options: Options, run: Run, reporter: ProgressReporter) -> None:

@@ -1,7 +1,4 @@
-"""Progress of a run on standard error: a moving bar in a terminal, plain lines elsewhere.
-
-I/O.
-"""
+"""Progress of a run on standard error: a moving bar in a terminal, plain lines elsewhere. I/O."""
 
 from __future__ import annotations
 

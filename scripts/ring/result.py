@@ -1,7 +1,4 @@
-"""Result of a run, topic by topic, and whether it passed.
-
-Sans-I/O.
-"""
+"""Result of a run, topic by topic, and whether it passed. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -165,8 +162,7 @@ class Heard:
 def rows(heard: Heard, carried: Sequence[Event]) -> tuple[TopicResult, ...]:
     """Return the rows of the table.
 
-    Args:
-        carried: measurements of the server's proxy, one event a topic; latencies are the listener's.
+    ``carried``: measurements of the server's proxy, one event a topic; latencies are the listener's.
     """
     reports = [_with_latency(each, _of(each.text("topic"), heard.listener.parts("topics"))) for each in carried]
     return (*put_together(_compared(heard), sorted(reports, key=lambda each: each.count("received"))), _lamp(heard))

@@ -1,7 +1,4 @@
-"""Run of the ring, from the recording to the result.
-
-I/O.
-"""
+"""Run of the ring, from the recording to the result. I/O."""
 
 from __future__ import annotations
 
@@ -60,8 +57,7 @@ class Report:
 class Replay:
     """One replay in progress.
 
-    Args:
-        children: supervised throughout; the receiver is released when it is requested to finish.
+    ``children``: supervised throughout; the receiver is released when it is requested to finish.
     """
 
     def __init__(
@@ -170,12 +166,8 @@ _DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"
 class Ring:
     """The ring of one run, from its creation.
 
-    Args:
-        run: removes what is created here.
-
-    Raises:
-        ConfigError: the recording cannot be read or is empty.
-        LocalError: the kernel refuses namespaces.
+    ``run``: removes what is created here. Raises ``ConfigError``: the recording cannot be read or is empty. Raises
+    ``LocalError``: the kernel refuses namespaces.
     """
 
     def __init__(self, options: Options, run: Run, reporter: ProgressReporter, bag: Path) -> None:

@@ -1,7 +1,4 @@
-"""Table at the end of a run.
-
-I/O layer; it builds rich renderables, and prints nothing.
-"""
+"""Table at the end of a run. I/O layer; it builds rich renderables, and prints nothing."""
 
 from __future__ import annotations
 

@@ -84,11 +84,7 @@ class Timeline:
 
 
 class Books:
-    """Accounts of all readers, callers and publishers of a run.
-
-    Args:
-        plan: the network.
-    """
+    """Accounts of all readers, callers and publishers of a run. ``plan``: the network."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -153,9 +149,8 @@ class Books:
     def incomplete(self, is_last_life: Callable[[str, int], bool], until_ns: int) -> list[str]:
         """Return unreported losses of reliable flows, in words, and duplicates of any flow.
 
-        Args:
-            is_last_life: whether an incarnation of a member continues to the end of the run.
-            until_ns: messages that were published later may still be in flight.
+        ``is_last_life``: whether an incarnation of a member continues to the end of the run. ``until_ns``: messages
+        that were published later may still be in flight.
         """
         found = []
         of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
@@ -230,9 +225,8 @@ class Books:
     def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without a result, or with more than one.
 
-        Args:
-            until_ns: calls that began later may still be in progress.
-            is_over: whether an incarnation of a member ended before its calls did.
+        ``until_ns``: calls that began later may still be in progress. ``is_over``: whether an incarnation of a member
+        ended before its calls did.
         """
         found = []
         for (channel, client, incarnation_id, number), (since_ns, ends) in self._calls.items():
@@ -252,9 +246,7 @@ class Books:
 class Continuity:
     """Pairs of publisher and reader, with the times in which graph and policy connect them.
 
-    Args:
-        plan: the network.
-        books: with the arrivals at each reader.
+    ``plan``: the network. ``books``: with the arrivals at each reader.
     """
 
     def __init__(self, plan: Plan, books: Books) -> None:
@@ -285,10 +277,8 @@ class Continuity:
     def broken_promises(self, begin_ns: int, last_ns: int, end_ns: int, limit_s: float, well_s: float) -> list[str]:
         """Return in words the silences that are too long.
 
-        Args:
-            last_ns: end of the last fault.
-            limit_s: longest silence before that.
-            well_s: longest silence after it.
+        ``last_ns``: end of the last fault. ``limit_s``: longest silence before that. ``well_s``: longest silence after
+        it.
         """
         kinds = ("after the last fault", last_ns, end_ns, well_s), ("black hole", begin_ns, last_ns, limit_s)
         return [

@@ -134,8 +134,7 @@ class Overlay:
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
 
-        Raises:
-            FailedError: it ended, or reported nothing in time.
+        Raises ``FailedError``: it ended, or reported nothing in time.
         """
         self._processes[who].read(READY_S)
 
@@ -192,8 +191,7 @@ class Overlay:
     def new_records(self, member: str) -> Iterator[Record]:
         """Yield what all incarnations of a member recorded since the last call.
 
-        Raises:
-            FailedError: a process ended by itself.
+        Raises ``FailedError``: a process ended by itself.
         """
         for who in self.died():
             raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")

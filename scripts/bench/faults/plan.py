@@ -106,11 +106,8 @@ def random_network(
 ) -> Plan:
     """Return a network with so many switches, and its members, flows and services.
 
-    Args:
-        switches: at least 12.
-        rate: factor on every rate of messages and calls.
-        one_rib: one in each domain.
-        image_bits_s: what a best-effort flow of images offers in addition; 0: there is none.
+    ``switches``: at least 12. ``rate``: factor on every rate of messages and calls. ``one_rib``: one in each domain.
+    ``image_bits_s``: what a best-effort flow of images offers in addition; 0: there is none.
     """
     chance = random.Random(f"network {seed}")
     sizes = _sizes(switches, chance)
@@ -183,11 +180,7 @@ class Broken:
 
 
 class Oracle:
-    """Oracle of the pairs that must be connected.
-
-    Args:
-        plan: the network without faults.
-    """
+    """Oracle of the pairs that must be connected. ``plan``: the network without faults."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan

@@ -50,13 +50,8 @@ def has_server() -> bool:
 class StoreCluster:
     """Cluster of six servers.
 
-    Args:
-        run: run whose folder holds the data.
-        spaces: of the network.
-        ribs: switches in whose namespaces the RIBs run that use the cluster.
-
-    Raises:
-        LocalError: the kernel refuses, or the servers do not start.
+    ``run``: run whose folder holds the data. ``spaces``: of the network. ``ribs``: switches in whose namespaces the
+    RIBs run that use the cluster. Raises ``LocalError``: the kernel refuses, or the servers do not start.
     """
 
     def __init__(self, run: Run, spaces: Namespaces, ribs: Sequence[str]) -> None:
@@ -99,11 +94,7 @@ class StoreCluster:
         return self._take(fault, signal.SIGSTOP, is_primary=True, choice=choice)
 
     def restart(self, fault: str) -> None:
-        """Restart a killed server.
-
-        Raises:
-            FailedError: it does not start.
-        """
+        """Restart a killed server. Raises ``FailedError``: it does not start."""
         number = self._away.pop(fault)
         folder = self._folder / str(number)
         (folder / "server.pid").unlink(missing_ok=True)
@@ -217,11 +208,7 @@ _BLOCKS_BYTES: Final = (1 << 20, 1 << 12)
 class Disk:
     """Small file system.
 
-    Args:
-        run: run whose folder holds the mount, and whose end unmounts it.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``run``: run whose folder holds the mount, and whose end unmounts it. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(self, run: Run) -> None:
@@ -260,9 +247,7 @@ class Disk:
 def snapshot_faults(who: str, log: str, *, is_alive: bool) -> Iterator[str]:
     """Yield, in words, what an incarnation of a RIB logged wrongly about its snapshot.
 
-    Args:
-        log: its whole log.
-        is_alive: it runs, the disk has free space, and it had enough time to write.
+    ``log``: its whole log. ``is_alive``: it runs, the disk has free space, and it had enough time to write.
     """
     is_failing = has_started = False
     for line in log.splitlines():

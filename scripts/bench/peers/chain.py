@@ -42,11 +42,7 @@ def routes(node: str) -> dict[str, str]:
 
 
 class Chain(Lab):
-    """The five machines, addressed and routed.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """The five machines, addressed and routed. Raises ``LocalError``: the kernel refuses."""
 
     def __init__(self, mtu: int, run: Run) -> None:
         super().__init__(run, row(mtu))

@@ -25,8 +25,7 @@ def zenoh_config(
 ) -> zenoh.Config:
     """Return the configuration of a router, client or peer.
 
-    Args:
-        certificate: path without its ending, of a host of ``make_certificates``; None: no TLS.
+    ``certificate``: path without its ending, of a host of ``make_certificates``; None: no TLS.
     """
     config: zenoh.Config = zenoh.Config()
     values: dict[str, object] = {

@@ -1,7 +1,4 @@
-"""Node interface that the roles of a live ring need, for either ROS, and the orders that they take by signals.
-
-I/O.
-"""
+"""Node interface that the roles of a live ring need, for either ROS, and the orders that they take by signals. I/O."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Node of ROS 1 for the roles of a live ring.
-
-I/O; imports rospy.
-"""
+"""Node of ROS 1 for the roles of a live ring. I/O; imports rospy."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Node of ROS 2 for the roles of a live ring.
-
-I/O; imports rclpy.
-"""
+"""Node of ROS 2 for the roles of a live ring. I/O; imports rclpy."""
 
 from __future__ import annotations
 
