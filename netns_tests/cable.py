@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.machines import Machines
 
@@ -81,7 +81,7 @@ def _line_of(process: subprocess.Popen[bytes]) -> str:
 
 @contextlib.contextmanager
 def sim_link(space: Space) -> Iterator[list[str]]:
-    """Join this namespace to another by ``eth0``; yield a function that runs a command in the other one."""
+    """Join this namespace to another by ``eth0``; yield the words that run a command in the other one."""
     with Space() as other:
         other.ip("set", "lo", "up")
         anchor = subprocess.Popen(["cat"], stdin=subprocess.PIPE)

@@ -35,8 +35,6 @@ from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
 from tests.waiting import until
 
-__all__ = ["CloudSite", "launch_file", "start_echo", "wheelhouse"]
-
 _COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
 _STATUS_S: Final = 5.0
 _ROS: Final = ("ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-std-msgs")
@@ -60,8 +58,7 @@ def wheelhouse(folder: Path) -> Path:
 class CloudSite:
     """Site in the folder of a run; the caller's namespace has no other switch.
 
-    Args:
-        latency: region -> ``HOST:PORT`` that stands for its public endpoint.
+    ``latency``: region -> ``HOST:PORT`` that stands for its public endpoint.
     """
 
     def __init__(self, run: Run, wheel_folder: Path, latency: Mapping[str, str]) -> None:

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import pytest
 
-__all__ = ["LEASES", "LEASE_S", "Lifetime", "noted", "too_short"]
-
 LEASES = 3
 LEASE_S = 2.0  # requested by tests with real processes, so that three leases pass quickly
 

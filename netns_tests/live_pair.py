@@ -26,26 +26,19 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Final
 
-import yaml
-
 from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run, RunRegistry
-from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
-from gdp.trust.right import Right
+from gdp.stores.keyring import load_identity
+from lab.credentials import Carried, Kind, OverlayCredentials, Side
 from lab.namespaces import Namespaces
 from lab.process import LabProcess, end_processes
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
-from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.proxy.endpoints.dds_peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
 from tests.script_packages import PYTHON_PATH
-
-__all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of"]
 
 PATIENCE_S: Final = 30.0
 _MASTER: Final = "http://127.0.0.1:11311"
@@ -57,7 +50,6 @@ _GRAPHS: Final[dict[str, dict[str, object]]] = {
     "dds": {"endpoint": "dds", "domain": _DOMAINS["dds"]},
     "one": {"endpoint": "ros1", "master": _MASTER},
 }
-_RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
 _ENVIRONMENT: Final = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",  # LOCALHOST would bring shared memory back
     "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
@@ -84,23 +76,13 @@ class Crossing:
     type_name: str
     sources: str
     readers: str
-    kind: str = "topic"
+    kind: Kind = "topic"
     options: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def metadata(self) -> Metadata:
-        """Return the text whose digest is its name in the overlay."""
-        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name})
-
-    def rights(self) -> Iterator[tuple[str, Right, str]]:
-        """Yield proxy, right and side of the file."""
-        give, take = _RIGHTS.get(self.kind, (Right.SERVE, Right.CALL))
-        yield from ((label, give, "expose") for label in self.sources.split())
-        yield from ((label, take, "import") for label in self.readers.split())
-
-    def rule(self, owner: Path) -> dict[str, object]:
-        """Return its rule."""
-        return {"name": self.name, "kind": self.kind, "type": self.type_name, "owner": str(owner), **self.options}
+    def carried(self) -> Carried:
+        """Return it as proxies carry it."""
+        return Carried(self.name, self.type_name, self.kind, self.options)
 
 
 class Ros1Node(Peer):
@@ -204,15 +186,11 @@ class Pair:
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
         self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
-        make_domain(self.folder / "pair", "pair")
-        make_owner(self.folder / "owner")
+        self._credentials = OverlayCredentials(_TOPOLOGY, self.folder, lease_s=LEASE_S)
         for machine in _TOPOLOGY.nodes:
-            credentials = self._credentials(Role.SWITCH, machine)
-            content = switch_yaml(_TOPOLOGY, machine, credentials, "auto", metrics=False, lease_s=LEASE_S)
-            self._start_node(machine, Role.SWITCH, content)
+            self._start_node(machine, "switch", self._credentials.switch(machine, "auto"))
         (rib,) = _TOPOLOGY.attached("rib")
-        content = rib_yaml(rib, self._credentials(Role.RIB, rib.switch), None, metrics=False, lease_s=LEASE_S)
-        self._start_node(rib.switch, Role.RIB, content)
+        self._start_node(rib.switch, "rib", self._credentials.rib(rib))
 
     def proxy(self, label: str) -> Proxy:
         """Return a running proxy."""
@@ -272,53 +250,28 @@ class Pair:
 
     def write_proxy(self, label: str, port: int) -> Path:
         """Make a proxy's keys, delegations and file; return the file."""
-        title = f"proxy-{label}"
-        if (path := self.folder / f"{title}.yaml").exists():
+        if (path := self._credentials.file("proxy", label)).exists():
             return path
-        credentials = self._credentials(Role.PROXY, label)
-        owner = self.folder / "owner"
-        sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
-        for crossing in self._crossings:
-            for proxy, right, side in crossing.rights():
-                if proxy == label:
-                    given = delegate(owner, credentials.identity / CARD, crossing.metadata, [right])
-                    install_delegation(credentials.identity, given)
-                    sides[side].append(crossing.rule(owner / OWNER_PUBLIC))
-        content: dict[str, object] = {
-            **credentials.to_yaml(),
-            "iface": f"to_{label}",
-            "delegations": str(credentials.identity / DELEGATIONS),
-            "lease_s": LEASE_S,
-            "ros": _GRAPHS[label],
-            "metrics": {"port": port},
-            **sides,
+        (at,) = (each for each in _TOPOLOGY.attached("proxy") if each.ifname == f"to_{label}")
+        self._credentials.admit(Role.PROXY, label, at.switch)
+        rules: dict[Side, list[Carried]] = {
+            "expose": [each.carried for each in self._crossings if label in each.sources.split()],
+            "import": [each.carried for each in self._crossings if label in each.readers.split()],
         }
-        (credentials.identity / DELEGATIONS).mkdir(exist_ok=True)
-        return self._write(title, content)
+        return self._credentials.proxy(at, rules, label=label, ros=_GRAPHS[label], metrics={"port": port})
 
     def identity(self, label: str, role: Role = Role.PROXY) -> Path:
         """Return the directory of a node's keys."""
-        return self.folder / "nodes" / f"{role.value}-{label}"
+        return self._credentials.identity(role, label)
 
-    def _start_node(self, machine: str, role: Role, content: Mapping[str, object]) -> None:
-        path = self._write(f"{role.value}-{machine}", content)
-        self.start(machine, [f"gdp.cli.{role.value}", "--config", str(path)], path.with_suffix(".log"), " is up")
-
-    def _credentials(self, role: Role, label: str) -> Credentials:
-        identity = self.identity(label, role)
-        make_node(identity, role, f"{role.value}-{label}", self.folder / "pair")
-        return Credentials(identity, self.folder / "pair" / ROOT_CERTIFICATE, ())
+    def _start_node(self, machine: str, role: str, path: Path) -> None:
+        self.start(machine, [f"gdp.cli.{role}", "--config", str(path)], path.with_suffix(".log"), " is up")
 
     def _hide(self, package: str) -> Path:
         """Return a folder, first on the path, that holds only an empty package of this name."""
         (self.folder / "hidden" / package).mkdir(parents=True, exist_ok=True)
         (self.folder / "hidden" / package / "__init__.py").touch()
         return self.folder / "hidden"
-
-    def _write(self, name: str, content: Mapping[str, object]) -> Path:
-        path = self.folder / f"{name}.yaml"
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
-        return path
 
     def _make_node(self, graph: str, name: str) -> Peer:
         machine = "a" if graph == "a" else "b"

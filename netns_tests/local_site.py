@@ -24,8 +24,6 @@ from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from tests.pages import ROOT
 
-__all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking"]
-
 PATIENCE_S: Final = 30.0
 _TICKS: Final = "import time\nprint('ready')\nwhile True:\n    time.sleep(0.01)\n    print('tick')"
 

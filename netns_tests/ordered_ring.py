@@ -24,5 +24,5 @@ def make_ordered_node(directory: Path, role: Role, label: str, domain: Path) -> 
 
 
 if __name__ == "__main__":
-    with mock.patch("ring.credentials.make_node", make_ordered_node):
+    with mock.patch("lab.credentials.make_node", make_ordered_node):
         cli.main()

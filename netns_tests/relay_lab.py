@@ -21,8 +21,8 @@ from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
-from lab.namespace import wait_for_carrier
 from lab.process import LabProcess, end_processes
+from netns_tests.cable import sim_link
 from netns_tests.spaces import Space
 from tests.waiting import until
 
@@ -32,11 +32,10 @@ _PATIENCE_S = 60.0
 
 
 class Node:
-    """One machine: a folder, a namespace and its processes."""
+    """One machine: a folder, a namespace, which ``enter`` leads into, and its processes."""
 
-    def __init__(self, home: Path, label: str, pid: int) -> None:
-        self.home, self.label, self.pid = home, label, pid
-        self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net", "--"]
+    def __init__(self, home: Path, label: str, enter: list[str]) -> None:
+        self.home, self.label, self.enter = home, label, enter
         self.running: list[LabProcess] = []
         self.identity = home / label
         self.name: Name = load_card(self.identity / "node.card").name
@@ -104,14 +103,12 @@ class Node:
 class RelayLab:
     """The two machines."""
 
-    def __init__(self, home: Path, pids: tuple[int, int]) -> None:
+    def __init__(self, home: Path, into_member: list[str]) -> None:
         self.home, self.domain = home, home / "domain"
         make_domain(self.domain, "lab", unix_s=time.time() - 30 * 86_400)
         for label in ("border", "member"):
             make_node(home / label, Role.SWITCH, label, self.domain, days=30, unix_s=time.time())
-        self.border, self.member = (
-            Node(home, label, pid) for label, pid in zip(("border", "member"), pids, strict=True)
-        )
+        self.border, self.member = Node(home, "border", []), Node(home, "member", into_member)
         self.member_device = tap_name(self.member.name, self.border.name)
 
     def relay_config(self, node: Node, *, standby: bool = False, **more: object) -> Path:
@@ -171,23 +168,12 @@ class RelayLab:
 @contextmanager
 def relay_lab(space: Space, home: Path) -> Iterator[RelayLab]:
     """Yield a border in this namespace and a member in another one."""
-    with Space() as other:
-        other.ip("set", "lo", "up")
-        far = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
-    near = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
-    lab = None
-    try:
-        space.ip("set", "lo", "up")
-        space.ip("add", "eth0", "type", "veth", "peer", "name", "eth0", "netns", str(far.pid))
-        lab = RelayLab(home, (near.pid, far.pid))
-        for node, address in ((lab.border, BORDER_ADDRESS), (lab.member, MEMBER_ADDRESS)):
-            node.ip("addr", "add", f"{address}/24", "dev", "eth0")
-            node.ip("link", "set", "eth0", "up")
-        wait_for_carrier("eth0")
-        yield lab
-    finally:
-        if lab is not None:
+    with sim_link(space) as enter:
+        lab = RelayLab(home, enter)
+        try:
+            for node, address in ((lab.border, BORDER_ADDRESS), (lab.member, MEMBER_ADDRESS)):
+                node.ip("addr", "add", f"{address}/24", "dev", "eth0")
+            yield lab
+        finally:
             lab.member.end()
             lab.border.end()
-        for anchor in (near, far):
-            anchor.communicate()

@@ -23,8 +23,6 @@ from netns_tests.spaces import Space
 from netns_tests.test_planes import LOOK_S, far_end
 from tests.waiting import until
 
-__all__ = ["FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "B", "Row", "frame", "mac_of", "waiting"]
-
 B, UNKNOWN, NOWHERE_NAME, FORGOTTEN = (bytes([0xE0 + n]) * 32 for n in range(4))
 KINDS: Mapping[str, Callable[[Sequence[str], Table], NetdevPlane]] = {"raw": RawPlane, "kernel": KernelPlane}
 LINKS = ("a", "b", "c", "d")

@@ -18,12 +18,10 @@ from gdp.host.run_registry import Run, RunRegistry
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.credentials import grant
 from lab.namespaces import Namespaces
-from lab.rights import grant
 from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
-
-__all__ = ["EXAMPLES", "PATIENCE_S", "SessionLab", "lines_of", "session_lab"]
 
 PATIENCE_S: Final = 30.0
 _MACHINE: Final = "lab"
@@ -105,8 +103,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 def session_lab(rights: Rights, types: Mapping[str, str] | None = None) -> Iterator[SessionLab]:
     """Run a lab whose nodes have these rights, without rights only an empty machine; end it on leaving.
 
-    Args:
-        types: ROS types of names.
+    ``types``: ROS types of names.
     """
     run = RunRegistry().start()
     with ExitStack() as undo:

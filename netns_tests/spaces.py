@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pyroute2 import netns
 
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 
 _LIBRARY = ctypes.CDLL(None, use_errno=True)
 
@@ -17,8 +17,7 @@ _LIBRARY = ctypes.CDLL(None, use_errno=True)
 class Space:
     """Entering moves the thread (and the processes it starts) into a new namespace; leaving moves it back.
 
-    Raises:
-        OSError: not allowed here.
+    Raises ``OSError``: not allowed here.
     """
 
     def __enter__(self) -> Space:

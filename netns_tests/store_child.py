@@ -1,20 +1,14 @@
-"""Child process with a run, a disk and a store of six servers; it prints the run's id and waits to be killed.
-
-I/O.
-"""
+"""Child process with a run, a disk and a store of six servers; it prints the run's id and waits to be killed. I/O."""
 
 from __future__ import annotations
 
 import sys
 
-from faults.disk import Disk
-from faults.store import StoreCluster
-from topologies import make_topology
+from faults.store import Disk, StoreCluster
 
 from gdp.host.run_registry import RunRegistry
 from lab.namespaces import Namespaces
-
-__all__: list[str] = []
+from lab.topology import make_topology
 
 
 def main() -> None:

@@ -10,17 +10,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from faults.disk import NOT_WRITTEN, Disk, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
-from faults.store import has_server
-from topologies import make_topology
+from faults.store import NOT_WRITTEN, Disk, has_server, snapshot_faults
 
 from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process
 from gdp.host.run_registry import RunRegistry
+from lab.topology import make_topology
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
 from tests.waiting import until

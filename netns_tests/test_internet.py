@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import time
-from itertools import product
 from pathlib import Path
 
 import pytest
@@ -16,16 +15,15 @@ import pytest
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
-from internet.access import TRAITS, Access, allows_direct
+from internet.access import TRAITS, Access
 from internet.host import ETHERNET, Host
 from internet.laboratory import Laboratory
-from internet.probe import SILENCE_S, UdpProbe, observe, open_paths
+from internet.probe import SILENCE_S, UdpProbe, observe
 
 pytestmark = pytest.mark.netns
 
 NATS = (Access.FULL_CONE, Access.PORT_RESTRICTED, Access.SYMMETRIC, Access.DOUBLE_NAT)
 PATIENCE_S = 10.0
-IP_RECVERR = 11
 
 
 @pytest.fixture
@@ -75,21 +73,6 @@ def test_a_full_cone_has_no_mapping_for_a_socket_that_never_sent(
     robot = attach(laboratory, Access.FULL_CONE)
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as stranger:
         assert observe(stranger, probe, Endpoint(robot.site().address, probe.local.port)) is None
-
-
-@pytest.mark.parametrize("hairpin", [True, False])
-@pytest.mark.parametrize("access", [Access.FULL_CONE, Access.PORT_RESTRICTED], ids=lambda each: each.value)
-def test_hosts_of_a_site_reach_each_other_by_public_endpoints_if_the_nat_hairpins(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access, hairpin: bool
-) -> None:
-    site = laboratory.add_site("home", access, hairpin=hairpin)
-    one, other = laboratory.add_host("one", site), laboratory.add_host("other", site)
-    with UdpProbe(one) as a, UdpProbe(other) as b, UdpProbe(borders[0]) as border:
-        seen_a, seen_b = observe(a, border), observe(b, border)
-        assert seen_b is not None
-        source = observe(a, b, seen_b, timeout_s=1.0)
-        assert observe(a, b) is not None  # by its own address it always does
-    assert source == (seen_a if hairpin else None)
 
 
 def test_where_udp_is_blocked_only_tcp_to_port_443_passes(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
@@ -155,16 +138,6 @@ def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
         assert observe(probe, border) == before
         robot.site().flush_mappings()
         assert observe(probe, border) not in (before, None)
-
-
-@pytest.mark.nightly
-def test_mappings_end_after_the_timeout_of_the_site(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
-    robot.site().set_mapping_timeout(1)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
-        public = observe(probe, border)
-        time.sleep(1.5)
-        assert observe(border, probe, public, timeout_s=SILENCE_S) is None
 
 
 @pytest.mark.nightly
@@ -257,24 +230,6 @@ def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
 
 
 @pytest.mark.nightly
-def test_a_router_without_carrier_answers_that_the_network_is_unreachable(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
-    robot.site().cut(is_silent=False)
-    with robot.space.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as connected:
-        connected.settimeout(PATIENCE_S)
-        connected.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
-        connected.connect((borders[0].lease().address.partition("/")[0], 9))
-        connected.send(b"to a router without a route")
-        with pytest.raises(OSError, match="unreachable"):
-            connected.recv(1)
-    robot.site().restore()
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
-        assert observe(probe, border) is not None
-
-
-@pytest.mark.nightly
 def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) -> None:
     robot = attach(laboratory, Access.PORT_RESTRICTED)
     seen = []
@@ -329,44 +284,6 @@ def send_many(sender: UdpProbe, receiver: UdpProbe, count: int) -> None:
 def test_a_delay_without_a_delay_line_is_refused(laboratory: Laboratory) -> None:
     with pytest.raises(LocalError, match="no delay line"):
         laboratory.add_site("home", Access.PUBLIC).set_delay(1.0)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 400, 400), (0.25, 200, 370), (1.0, 0, 0)])
-def test_a_site_loses_the_share_of_packets_that_is_set(
-    laboratory: Laboratory, borders: tuple[Host, Host], share: float, least: int, most: int
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
-        assert observe(probe, border) is not None
-        robot.site().set_loss(share)
-        send_many(probe, border, 400)
-        robot.site().set_loss(0.0)
-        assert observe(probe, border) is not None  # the last, so all others are there
-    assert least <= len(border.sources) - 2 <= most
-
-
-@pytest.mark.nightly
-def test_a_limited_uplink_drops_what_exceeds_its_queue(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
-    robot = attach(laboratory, Access.PUBLIC)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
-        for mbit, is_whole in ((1.0, False), (0.0, True)):
-            robot.site().set_rate(mbit)
-            border.sources.clear()
-            for number in range(90):
-                probe.send(border.local, b"%2d" % number + bytes(1_200))
-            border.wait(b"%2d" % 89 + bytes(1_200) if is_whole else b"never sent", 5.0 if is_whole else SILENCE_S)
-            assert (len(border.sources) == 90) is is_whole
-
-
-@pytest.mark.nightly
-def test_the_pairs_that_reach_each_other_directly_are_those_that_the_traits_allow(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    sides = [{access: attach(laboratory, access, f"{side}{n}") for n, access in enumerate(Access)} for side in "ab"]
-    pairs = list(product(Access, Access))
-    found = open_paths([(sides[0][one], sides[1][other]) for one, other in pairs], borders[0])
-    assert dict(zip(pairs, found, strict=True)) == {pair: allows_direct(*pair) for pair in pairs}
 
 
 ORPHAN = """

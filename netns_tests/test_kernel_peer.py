@@ -24,7 +24,7 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
 from gdp.ports.netlink import NetlinkSocket
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled

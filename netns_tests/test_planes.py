@@ -29,7 +29,7 @@ from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.switch.table import Table
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.fixtures_forwarding import (
     BOTH,

@@ -189,7 +189,7 @@ def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
 def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
     lab.start_relay(lab.border)
     border = {"peer": lab.border.name.to_text(), "endpoints": [f"localhost:{PORT}"], "standby": False}
-    guest = Node(lab.home, "member", lab.border.pid)  # in the namespace of the border, where this name leads to it
+    guest = Node(lab.home, "member", lab.border.enter)  # in the namespace of the border, where this name leads to it
     try:
         guest.start("gdp.cli.relay", lab.relay_config(lab.member, borders=[border]))
         until(lab.is_up)

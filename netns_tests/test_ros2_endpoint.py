@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from lab.namespace import wait_for_carrier
+from lab.namespaces import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.proxy.endpoints.ros2_net import DOMAIN, NODE, Peer, needs, peer_of
 

@@ -15,9 +15,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
 
-from devices import add_address
-from ros_environment import ros_environment
-from testbed import Lab
+from testbed import Lab, add_address, ros_environment
 
 from gdp.host.run_registry import RunRegistry
 from lab.topology import chain

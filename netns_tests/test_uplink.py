@@ -10,23 +10,21 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Final
 
 import pytest
-import yaml
 from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -54,14 +52,12 @@ class Field:
         self._undo = undo
         self._spaces = Namespaces(TOPOLOGY, run)
         self._starting: list[subprocess.Popen[bytes]] = []
-        make_domain(self._folder / "field", "field")
-        make_owner(self._folder / "owner")
+        self._credentials = OverlayCredentials(TOPOLOGY, self._folder)
         for name in TOPOLOGY.nodes:
-            content = switch_yaml(TOPOLOGY, name, self._credentials(Role.SWITCH, name), "auto", metrics=False)
-            self._command(Role.SWITCH, name, content)
+            self._start(name, ["gdp.cli.switch", "--config", str(self._credentials.switch(name, "auto"))])
         self.wait()
         (rib,) = TOPOLOGY.attached("rib")
-        self._command(Role.RIB, rib.switch, rib_yaml(rib, self._credentials(Role.RIB, "rib"), None, metrics=False))
+        self._start(rib.switch, ["gdp.cli.rib", "--config", str(self._credentials.rib(rib))])
 
     def wait(self) -> None:
         """Return when all started participants are up."""
@@ -72,10 +68,10 @@ class Field:
 
     def member(self, switch: str, right: Right, *load: int) -> subprocess.Popen[bytes]:
         """Start a participant at a switch without waiting for it."""
-        credentials = self._credentials(Role.PROXY, switch)
-        given = delegate(self._folder / "owner", credentials.identity / CARD, SERVICE, [right])
-        install_delegation(credentials.identity, given)
-        where = [given.name.to_text(), str(credentials.identity), str(credentials.root), "member"]
+        credentials = self._credentials
+        name = credentials.delegate(switch, SERVICE, right).to_text()
+        root = credentials.domain("field") / ROOT_CERTIFICATE
+        where = [name, str(credentials.identity(Role.PROXY, switch)), str(root), "member"]
         return self._start(switch, ["netns_tests.uplink_child", *where, right.value, *map(str, load)])
 
     def sent_bytes(self) -> int:
@@ -87,16 +83,6 @@ class Field:
                 return int(link.get_attr("IFLA_STATS64")["rx_bytes"])
 
         return self._spaces["gateway"].inside(look)
-
-    def _command(self, role: Role, switch: str, content: Mapping[str, object]) -> None:
-        path = self._folder / f"{role.value}-{switch}.yaml"
-        path.write_text(yaml.safe_dump(content))
-        self._start(switch, [f"gdp.cli.{role.value}", "--config", str(path)])
-
-    def _credentials(self, role: Role, name: str) -> Credentials:
-        identity = self._folder / "nodes" / f"{role.value}-{name}"
-        make_node(identity, role, f"{role.value}-{name}", self._folder / "field")
-        return Credentials(identity, self._folder / "field" / ROOT_CERTIFICATE, ())
 
     def _start(self, switch: str, argv: list[str]) -> subprocess.Popen[bytes]:
         with (self._folder / "log").open("ab") as log:

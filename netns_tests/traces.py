@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["GDP", "gdp", "traced"]
-
 GDP: Final = (sys.executable, "-m", "gdp.cli.gdp")
 _PATIENCE_S: Final = 60.0
 

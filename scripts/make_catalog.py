@@ -22,7 +22,7 @@ from fog.plan.trace import Trace, outages, times_independent
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "scripts" / "bench"))
-from preconditions import data_folder  # noqa: E402
+from machine import data_folder  # noqa: E402
 from skeleton import clean_exit  # noqa: E402
 
 TRACES: Final = "aws_*.json"

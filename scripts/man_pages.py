@@ -22,8 +22,6 @@ from typer.core import TyperGroup
 
 import gdp
 
-__all__ = ["PROGRAMS", "main", "pages"]
-
 PROGRAMS: Final = {
     "gdp": "gdp.cli.gdp",
     "gdp-delegate": "proxy.cli.delegate",

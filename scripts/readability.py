@@ -85,9 +85,7 @@ class Settings(NamedTuple):
     def from_file(cls, path: Path) -> Settings:
         """Read the settings.
 
-        Raises:
-            OSError: the file cannot be read.
-            ValueError: it is not the expected JSON.
+        Raises ``OSError``: the file cannot be read. Raises ``ValueError``: it is not the expected JSON.
         """
         data = json.loads(path.read_text())
         try:
@@ -241,8 +239,7 @@ def import_circles() -> list[list[str]]:
 def broken_import_rules(root: Path) -> int:
     """Return how many import rules of pyproject.toml are broken.
 
-    Raises:
-        RuntimeError: import-linter did not report.
+    Raises ``RuntimeError``: import-linter did not report.
     """
     tool = Path(sys.executable).parent / "lint-imports"
     report = subprocess.run([tool, "--no-cache"], cwd=root, capture_output=True, text=True, check=False)
@@ -382,8 +379,7 @@ def limit_versions(root: Path) -> list[dict[str, float]]:
 def loosened(versions: Sequence[dict[str, float]], reasons: Iterable[dict[str, Any]]) -> list[str]:
     """Return one line for each limit that became looser from a version to the next, and has no reason.
 
-    Args:
-        reasons: for each one that may: ``figure``, the new ``limit``, and ``reason``.
+    ``reasons``: for each one that may: ``figure``, the new ``limit``, and ``reason``.
     """
     permitted = {(each["figure"], each["limit"]) for each in reasons if each["reason"]}
     return [

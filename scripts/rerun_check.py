@@ -29,8 +29,7 @@ class QuarantineError(Exception):
 def read_quarantine(path: Path) -> dict[str, str]:
     """Return the reason of each quarantined test.
 
-    Raises:
-        QuarantineError: not a list of tests with reasons, a test twice, or too many.
+    Raises ``QuarantineError``: not a list of tests with reasons, a test twice, or too many.
     """
     try:
         entries = yaml.safe_load(path.read_text())
@@ -56,8 +55,7 @@ def read_quarantine(path: Path) -> dict[str, str]:
 def read_outcomes(path: Path) -> dict[str, bool]:
     """Return whether each test of a JUnit file passed, by file and name with parameters; skipped counts as passed.
 
-    Raises:
-        QuarantineError: the file is missing or not a JUnit file.
+    Raises ``QuarantineError``: the file is missing or not a JUnit file.
     """
     try:
         root = ET.parse(path).getroot()  # written by pytest on this machine

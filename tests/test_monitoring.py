@@ -114,7 +114,7 @@ def test_every_rule_says_what_is_wrong_and_how_bad() -> None:
 
 
 def test_ports_are_those_of_the_ring() -> None:
-    from ring.plan import METRICS_PORTS
+    from lab.credentials import METRICS_PORTS
 
     text = (FOLDER / "prometheus.yml").read_text(encoding="utf-8")
     assert all(f"127.0.0.1:{port}" in text for port in METRICS_PORTS.values())

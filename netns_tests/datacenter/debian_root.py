@@ -19,8 +19,6 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-__all__ = ["cache_folder", "debian_root", "why_not"]
-
 _INCLUDED: Final = (
     "ca-certificates",
     "cloud-init",

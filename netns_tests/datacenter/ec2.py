@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend
     from moto.ec2.models.instances import Instance, Reservation
 
-__all__ = ["UBUNTU", "DataCenter", "serving_ec2"]
-
 UBUNTU: Final = "099720109477"  # owner of images of moto's account, which has none of Debian's
 
 
@@ -102,8 +100,7 @@ class DataCenter:
 def serving_ec2(center: DataCenter, absent: Path) -> Iterator[str]:
     """Serve EC2's API on a loopback port, and yield its URL; the environment of this process leads boto3 there.
 
-    Args:
-        absent: a path without a file, for the configuration of the user that runs the tests.
+    ``absent``: a path without a file, for the configuration of the user that runs the tests.
     """
     from moto.core.models import DEFAULT_ACCOUNT_ID
     from moto.ec2.models import ec2_backends

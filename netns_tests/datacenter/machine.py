@@ -19,8 +19,6 @@ from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import Run
 from netns_tests.datacenter.router import Lease
 
-__all__ = ["BootedMachine"]
-
 _BOOT: Final = Path(__file__).with_name("boot.sh")
 _SPACES: Final = ("--mount", "--pid", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child")
 _PATIENCE_S: Final = 120.0

@@ -18,10 +18,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import IPv4Address
 from typing import Final
 
-from lab.namespace import Namespace
+from lab.namespaces import Namespace
 from netns_tests.datacenter.router import METADATA
-
-__all__ = ["InstanceDocument", "MetadataService"]
 
 _PORT: Final = 80
 _PATH: Final = re.compile(r"/(?:latest|\d{4}-\d\d-\d\d)/(.*)")

@@ -18,9 +18,7 @@ from typing import Final
 
 from gdp.host.run_registry import Run
 from internet.space import Space
-from lab.namespace import Namespace
-
-__all__ = ["CALLER", "METADATA", "Admitted", "Lease", "Router"]
+from lab.namespaces import Namespace
 
 CALLER: Final = IPv4Address("198.51.100.1")
 METADATA: Final = IPv4Address("169.254.169.254")

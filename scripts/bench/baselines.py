@@ -18,9 +18,9 @@ from socket import AF_INET
 from typing import Final
 
 from chains import Chain
-from devices import add_bridge
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
 from pyroute2 import IPRoute
+from testbed import add_bridge
 
 from gdp.frame.kinds import ETHERTYPE
 from lab.process import LabProcess
@@ -35,9 +35,7 @@ _IP_SETTINGS: Final = Path("/proc/sys/net/ipv4")
 class Baseline:
     """A way to forward; this one has no forwarder: the endpoints are joined directly, for the cost of these.
 
-    Attributes:
-        name: as it stands in tables.
-        processes: user processes in the middle that every frame goes through.
+    ``name``: as it stands in tables. ``processes``: user processes in the middle that every frame goes through.
     """
 
     processes = False
@@ -54,8 +52,7 @@ class Baseline:
     def stand(self, chain: Chain) -> Iterator[list[LabProcess]]:  # noqa: ARG002
         """Set it up in every middle of the chain for a context; yield the processes that forward.
 
-        Raises:
-            LocalError: it is not available here; the text gives the reason.
+        Raises ``LocalError``: it is not available here; the text gives the reason.
         """
         yield []
 
@@ -63,9 +60,7 @@ class Baseline:
 class Plane(Baseline):
     """A plane of this project, by its name in ``roles.py``.
 
-    Args:
-        name: the plane.
-        processes: frames go through the process, not only through the kernel.
+    ``name``: the plane. ``processes``: frames go through the process, not only through the kernel.
     """
 
     def __init__(self, name: str, *, processes: bool) -> None:

@@ -15,11 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import mac_addresses, set_link
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from rate_search import Try
-from testbed import Lab
+from testbed import Lab, mac_addresses, set_link
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import LabProcess, figures_of, floats_of
@@ -107,14 +106,8 @@ class Chain(Lab):
     ) -> Try:
         """Send for a while, at ``rate`` frames/s or flat out, and count.
 
-        Args:
-            wire: what to send.
-            switches: the processes whose time counts.
-            rate: None for flat out.
-            seconds: for how long.
-
-        Raises:
-            FailedError: a process of the bench ended.
+        ``wire``: what to send. ``switches``: the processes whose time counts. ``rate``: None for flat out. ``seconds``:
+        for how long. Raises ``FailedError``: a process of the bench ended.
         """
         self._sink.ask(do="count", ethertype=wire.ethertype)
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches)
@@ -134,8 +127,7 @@ class Chain(Lab):
     def round_trips(self, wire: Wire, pings: int, *, poll: bool) -> list[float]:
         """Return round-trip times in microseconds; fewer than ``pings`` when some were lost.
 
-        Raises:
-            FailedError: a process of the bench ended.
+        Raises ``FailedError``: a process of the bench ended.
         """
         same = {"ethertype": wire.ethertype, "pings": pings, "poll": poll}
         self._sink.ask(do="answer", frame=wire.back.hex(), **same)

@@ -1,8 +1,8 @@
 """Chaos bench: faults of every kind in a network of real processes, drawn from a seed; afterwards all flows must work.
 
 A random network of 12 to 20 switches, four domains, three tiers, several RIBs, two services with replicas, reliable and
-best-effort topics (``faults/network.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
-policy leave connected (``faults/oracle.py``) must continue. Promises:
+best-effort topics (``faults/plan.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
+policy leave connected (``faults/plan.py``) must continue. Promises:
 
     after the last fault    every flow that must be connected delivers again within a second, and stays so; with
                             --thin within two, if a queue holds 200 ms
@@ -35,23 +35,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from faults.accounts import Books, Silence
-from faults.continuity import Continuity
-from faults.disk import NOT_WRITTEN, snapshot_faults
+from faults.accounts import Books, Continuity, Silence
 from faults.link_faults import FrameFaults
-from faults.network import VICTIM, random_network
-from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.plan import Plan
+from faults.plan import VICTIM, Oracle, Plan, random_network
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
-from faults.store import StoreCluster, has_server
+from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
-from topologies import ends_of
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError, until
+from lab.topology import ends_of
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # observation after the last fault
@@ -80,9 +76,7 @@ SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
 class Chaos:
     """One run: a network, its faults, and the records.
 
-    Args:
-        overlay: of the plan, started.
-        faults: in the order of their starts.
+    ``overlay``: of the plan, started. ``faults``: in the order of their starts.
     """
 
     def __init__(self, overlay: Overlay, faults: list[Fault]) -> None:
@@ -100,11 +94,7 @@ class Chaos:
         self.revoked_ns: int | None = None
 
     def settle(self) -> None:
-        """Return when every flow is delivered and every service responds.
-
-        Raises:
-            FailedError: not in time.
-        """
+        """Return when every flow is delivered and every service responds. Raises ``FailedError``: not in time."""
         until(
             lambda: not self._unreachable(),
             lambda: f"before any fault: {', '.join(self._unreachable())}",
@@ -139,9 +129,8 @@ class Chaos:
     def broken_promises(self, limit_s: float, full_s: float = 0.0) -> list[str]:
         """Return what broke, in words.
 
-        Args:
-            limit_s: longest silence of connected ends during faults.
-            full_s: longest wait in a link's queue, if links are kept full.
+        ``limit_s``: longest silence of connected ends during faults. ``full_s``: longest wait in a link's queue, if
+        links are kept full.
         """
         last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
         found = [f"{who} ended by itself" for who in self._overlay.died()]
@@ -307,9 +296,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
 def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     """Run one seed; print its table; return what broke.
 
-    Raises:
-        FailedError: the network did not come up.
-        GdpError: the kernel refuses.
+    Raises ``FailedError``: the network did not come up. Raises ``GdpError``: the kernel refuses.
     """
     thin_bits_s = 1e6 * (options.thin or 0.0)
     plan = random_network(
@@ -362,11 +349,8 @@ def _waited_s() -> float:
 def _in_store(plan: Plan, seed: int, *, is_wanted: bool | None) -> list[str]:
     """Return the switches whose RIBs share a cluster: those of the top domain, or none.
 
-    Args:
-        is_wanted: None: for every third seed, where a server is installed.
-
-    Raises:
-        FailedError: it is wanted, and no server is installed.
+    ``is_wanted``: None: for every third seed, where a server is installed. Raises ``FailedError``: it is wanted, and no
+    server is installed.
     """
     if is_wanted and not has_server():
         raise FailedError("neither valkey-server nor redis-server is installed")

@@ -40,7 +40,7 @@ _SITES: Final = {"border": Access.PUBLIC, "robot": Access.PORT_RESTRICTED, "serv
 _PATIENCE_S: Final = 120.0
 _DELAY_MS: Final = 10.0  # of each uplink, each way
 _TOKEN: Final = re.compile(r"^gdp1\S+$", re.MULTILINE)
-_ENDPOINT: Final = str(Path(__file__).with_name("first_topic_endpoint.py"))
+_ENDPOINT: Final = str(Path(__file__).with_name("ros_topics.py"))
 _DONE: Final = {"gdp domain create": "listening on TCP port", "gdp join": "tunnels are up"}  # they go on running
 
 

@@ -67,11 +67,8 @@ class Bench:
     def measure(self, baseline: Baseline, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
         """Set a baseline up, measure each size, take it down; report the reason if it is not available.
 
-        Args:
-            baseline: what to measure.
-            chain: the chain of namespaces.
-            sizes: of frames, bytes.
-            lengths: chains in whose tables the figures appear.
+        ``baseline``: what to measure. ``chain``: the chain of namespaces. ``sizes``: of frames, bytes. ``lengths``:
+        chains in whose tables the figures appear.
         """
         if baseline.name in self.over.reasons:
             return

@@ -33,11 +33,7 @@ class Wire:
 
 
 def gdp_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> bytes:
-    """Return a whole data frame of ``size`` bytes.
-
-    Raises:
-        ValueError: too small for the headers.
-    """
+    """Return a whole data frame of ``size`` bytes. Raises ``ValueError``: too small for the headers."""
     payload = size - OVERHEAD_BYTES
     if payload < 0:
         raise ValueError(f"a frame has at least {OVERHEAD_BYTES} bytes")

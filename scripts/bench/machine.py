@@ -1,4 +1,4 @@
-"""State of the machine that a bench ran on; figures mean nothing without it.
+"""State of the machine that a bench ran on, and preconditions of a page: its data are there, it can be trusted.
 
 I/O. Reads /proc and queries devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
 netlink family are often absent. Functions on devices apply to the namespace of the calling thread
@@ -19,6 +19,7 @@ import platform
 import socket
 import struct
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -116,19 +117,14 @@ def _processor() -> str:
 
 
 def offloads(ifname: str) -> dict[str, bool]:
-    """Return which of tso, gso, gro and tx-checksum a device has on.
-
-    Raises:
-        OSError: no such device.
-    """
+    """Return which of tso, gso, gro and tx-checksum a device has on. Raises ``OSError``: no such device."""
     return {name: bool(_ask(ifname, get, 0)) for name, (get, _) in _GET_SET.items()}
 
 
 def set_offloads(ifname: str, *, on: bool) -> None:
     """Switch all four on or off; AF_PACKET frames never use them, IP does.
 
-    Raises:
-        OSError: no such device, or not allowed.
+    Raises ``OSError``: no such device, or not allowed.
     """
     first = _NEEDS if on else _NEEDS[::-1]
     for name in (*first, *(name for name in _GET_SET if name not in first)):
@@ -163,8 +159,7 @@ def processor_s(pid: int) -> float:
 def thread_s(pid: int) -> float:
     """Return the processor time of a process of one thread, including its soft interrupts (schedstat).
 
-    Raises:
-        OSError: no such process.
+    Raises ``OSError``: no such process.
     """
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
 
@@ -182,3 +177,47 @@ def _soft_interrupt_threads() -> list[int]:
             if comm.read_text(encoding="utf-8").startswith("ksoftirqd/"):
                 found.append(int(comm.parent.name))
     return found
+
+
+DATA: Final = ROOT / "scripts" / "data"
+
+
+class RefusedError(Exception):
+    """A command cannot begin; the text says what is wrong and what to do."""
+
+
+def data_folder(name: str, patterns: Iterable[str], within: Path = DATA) -> Path:
+    """Return a folder of recorded data, such as ``spot``; at least one file matches each pattern.
+
+    Raises ``RefusedError``: none does.
+    """
+    folder = within / name
+    for pattern in patterns:
+        if not any(folder.glob(pattern)):
+            does = "scripts/data/fetch.sh fetches" if name == "planning" else "git checkout -- scripts/data restores"
+            raise RefusedError(f"no {folder / pattern}: {does} it")
+    return folder
+
+
+def require_trust(state: MachineState, *, allow_load: bool) -> None:
+    """Refuse to measure for a page that could not name its commit, or whose machine does other work.
+
+    ``allow_load``: the rows are marked instead. Raises ``RefusedError``: such a page.
+    """
+    if not state.commit:
+        raise RefusedError(f"a page names its commit, and {ROOT} is no git repository: clone it by git, or use --quick")
+    if state.is_busy and not allow_load:
+        raise RefusedError(
+            f"the load before, {state.load_before:.2f}, exceeds half of {state.cores} cores:"
+            " wait for a quiet machine, or mark each row by --allow-load"
+        )
+
+
+def require_writable(folder: Path) -> None:
+    """Make a folder, and write a file into it for a moment. Raises ``RefusedError``: it cannot be made or written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise RefusedError(f"{folder} cannot be written ({error.strerror}): choose another folder") from error

@@ -19,11 +19,7 @@ from gdp.stores.keyring import load_delegations
 
 
 class End:
-    """Member on its plane.
-
-    Attributes:
-        topics: topics and services that its delegations name.
-    """
+    """Member on its plane. ``topics``: topics and services that its delegations name."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs

@@ -87,11 +87,7 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def positive(text: str) -> int:
-    """Return a whole number above 0.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Return a whole number above 0. Raises ``ValueError``: it is not."""
     number = int(text)
     if number < 1:
         raise ValueError(text)

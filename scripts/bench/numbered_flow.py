@@ -36,9 +36,7 @@ def open_sessions(
 ) -> list[gdp.Session]:
     """Start switches at a border, a robot and a server, and return sessions that publish and read the topics.
 
-    Args:
-        has_direct: robot and server open a tunnel to each other.
-        uplinks: of the robot; none: the usual one.
+    ``has_direct``: robot and server open a tunnel to each other. ``uplinks``: of the robot; none: the usual one.
     """
     border, robot, server = hosts
     overlay.add_switch(border, is_border=True)
@@ -55,9 +53,7 @@ def open_sessions(
 class NumberedFlow:
     """A flow of 100 bytes, ``HZ`` times a second, until ``close``.
 
-    Attributes:
-        sent_s: moment of each message, by number.
-        arrivals: moment and number.
+    ``sent_s``: moment of each message, by number. ``arrivals``: moment and number.
     """
 
     def __init__(self, publisher: gdp.Publisher, subscription: gdp.Subscription) -> None:
@@ -110,8 +106,7 @@ class NumberedFlow:
     def silence_until_steady_ms(self, since_s: float, patience_s: float) -> float:
         """Wait until the flow has been back for half a second; return the longest gap since a moment.
 
-        Raises:
-            FailedError: it does not come back.
+        Raises ``FailedError``: it does not come back.
         """
         while time.monotonic() < since_s + patience_s:
             time.sleep(0.05)

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import yaml
-from machine import ROOT, git
-from preconditions import RefusedError
+from machine import ROOT, RefusedError, git
 
 LISTS: Final = Path(__file__).with_name("pages.yaml")
 COMMITS_MAX: Final = 300
@@ -47,11 +46,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT, lists: Path = LI
 
 
 def old_pages(root: Path, lists: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str]]:
-    """Yield each old page with the reason.
-
-    Raises:
-        RefusedError: there is no history.
-    """
+    """Yield each old page with the reason. Raises ``RefusedError``: there is no history."""
     try:
         if git("rev-parse", "--is-shallow-repository", root=root) == "true":
             raise RefusedError(f"{root} is a shallow clone: run git fetch --unshallow")

@@ -62,9 +62,7 @@ def panel_of(
 ) -> Panel:
     """Return the panel of one column of one case; baselines without a figure are left out.
 
-    Args:
-        p99: the column that whiskers lead to; without it they span the rounds.
-        ours: baselines to colour as ours.
+    ``p99``: the column that whiskers lead to; without it they span the rounds. ``ours``: baselines to colour as ours.
     """
     bars = []
     for contender in contenders:

@@ -62,9 +62,8 @@ class Try:
 def highest(attempt: Callable[[float | None], Try], guess: float | None) -> Try | None:
     """Return the try with the highest rate that held; None if none did.
 
-    Args:
-        attempt: sends at a rate (None: full speed).
-        guess: an approximate rate, where one is known; else the search begins at full speed.
+    ``attempt``: sends at a rate (None: full speed). ``guess``: an approximate rate, where one is known; else the search
+    begins at full speed.
     """
     low: Try | None = None
     high = float("inf")

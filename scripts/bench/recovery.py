@@ -61,8 +61,7 @@ RATE: Final = 50.0
 def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
     """Make the event happen once; return the figures by column, when the cluster is complete again.
 
-    Raises:
-        FailedError: it is not in time.
+    Raises ``FailedError``: it is not in time.
     """
     victim = cluster.oldest() if cluster.gateway == DEDICATED else cluster.gateway_machine()
     begun_s = time.time()

@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from report import progress
-from ros_environment import ros_environment
-from testbed import Lab
-from topologies import single
+from testbed import Lab, ros_environment
 
 from fog.providers.local import fault_injection
 from fog.site import open_site
@@ -28,6 +26,7 @@ from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
 from lab.process import FailedError, LabProcess, until
+from lab.topology import single
 
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 DEDICATED, REPLICA = "dedicated", "replica"

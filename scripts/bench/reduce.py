@@ -18,8 +18,8 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from machine import DATA, RefusedError, data_folder
 from plot import Panel, panel_of
-from preconditions import DATA, RefusedError, data_folder
 from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
@@ -87,11 +87,7 @@ def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
 
 
 def frames(pattern: str) -> list[npt.NDArray[Any]]:
-    """Return recorded frames.
-
-    Raises:
-        RefusedError: the data, or the library to read them, are missing.
-    """
+    """Return recorded frames. Raises ``RefusedError``: the data, or the library to read them, are missing."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -193,8 +189,7 @@ def _short(bag: Path, type_name: str) -> Case | None:
 def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]:
     """Return median bytes of a message and the median CPU time at each end, in ms.
 
-    Raises:
-        FailedError: a message of a lossless reduction changed.
+    Raises ``FailedError``: a message of a lossless reduction changed.
     """
     rule = Rule.model_construct(encoding="cdr", **settings)
     messages = case.messages[:MESSAGES]

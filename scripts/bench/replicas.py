@@ -59,7 +59,7 @@ EXTRA: Final = "requests too many, %"
 ADDED_MS: Final = 0.2
 SEED: Final = 7  # of the deaths
 GAIN: Final = 5.0
-_END: Final = _HERE / "replicas_endpoint.py"
+_END: Final = _HERE / "ros_calls.py"
 TYPE: Final = "rcl_interfaces/srv/ListParameters"
 _MACHINES: Final = ("m1", "m2", "m3")
 _LANES: Final = 200
@@ -78,8 +78,7 @@ _SLOW: Final = {"slow_in": 100, "slow_s": 0.2, "threads": 8}
 class Kills:
     """Kills of all replicas but one at random moments, and their restart; then another one stays. A context manager.
 
-    Attributes:
-        count: deaths.
+    ``count``: deaths.
     """
 
     def __init__(self, here: Field, draw: random.Random) -> None:
@@ -136,11 +135,7 @@ class Kills:
 
 
 class Bench:
-    """Rounds in progress.
-
-    Attributes:
-        over: the figures.
-    """
+    """Rounds in progress. ``over``: the figures."""
 
     def __init__(self, runs: RunRegistry, rate: float, draw: random.Random) -> None:
         self._runs = runs
@@ -192,7 +187,9 @@ class Bench:
     @contextmanager
     def _field(self, served: Sequence[Served], settings: Mapping[str, object] | None = None) -> Iterator[Field]:
         names = {each: " ".join(one.name for one in served if each in one.machines) for each in _MACHINES}
-        work = {each: Work("serve", {**(settings or {}), "services": its}, _END) for each, its in names.items() if its}
+        work = {
+            each: Work("replicate", {**(settings or {}), "services": its}, _END) for each, its in names.items() if its
+        }
         with new_run(self._runs) as run, Field(run, served, work) as here:
             yield here
 

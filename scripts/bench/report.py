@@ -49,11 +49,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Return the spread of one value or more.
-
-        Raises:
-            ValueError: none at all.
-        """
+        """Return the spread of one value or more. Raises ``ValueError``: none at all."""
         return cls(statistics.median(values), min(values), max(values))
 
     def __str__(self) -> str:
@@ -169,8 +165,7 @@ def _target(what: str, asked: float | None, at_most: bool, values: Iterable[floa
 def percentile(values: Iterable[float], share: float) -> float:
     """Return the smallest value that at least ``share`` (0 to 1) of the values do not exceed.
 
-    Raises:
-        ValueError: no values.
+    Raises ``ValueError``: no values.
     """
     ordered = sorted(values)
     if not ordered:
@@ -255,8 +250,7 @@ def write_json(
 ) -> None:
     """Write all values of all rounds, the targets with their results, and day, commit and load of each row.
 
-    Args:
-        keeps: rows and targets that the file has and this run has not are kept.
+    ``keeps``: rows and targets that the file has and this run has not are kept.
     """
     held = json.loads(path.read_text(encoding="utf-8")) if keeps and path.exists() else {"rounds": {}, "targets": []}
     new = {target.what for target in targets}

@@ -27,8 +27,8 @@ from report import Rounds, Target
 from ros_row import READY_S, Carried, Row
 from ros_stage import CORES, DIRECT, MEDIAN, Bench, Measured, Turn, main
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
+from lab.topology import LEFT, RIGHT
 from proxy.config.config import Encoding
 
 MODULE: Final = "ros_topics"
@@ -60,11 +60,7 @@ _DONE_S: Final = 30.0
 def measure(kind: str, seconds: float, first_s: float, row: Row, encoding: Encoding | None, number: int) -> Measured:
     """Return the listener's report, and the cores that the proxies used.
 
-    Args:
-        first_s: seconds of the first round.
-
-    Raises:
-        FailedError: a node did not come up.
+    ``first_s``: seconds of the first round. Raises ``FailedError``: a node did not come up.
     """
     seconds = first_s if number == 1 else seconds
     every_s, is_direct = EVERY_S[kind], encoding is None

@@ -1,17 +1,22 @@
-"""Client and server of ``services.py``: ordinary rclpy nodes and ``std_srvs/srv/SetBool``.
+"""Client and server of ``services.py``, and replicas of ``replicas.py``: ordinary rclpy nodes.
 
 Process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
 clients, calls at a steady rate). The server echoes the request, so that an answer to another call is detected.
+``replicate`` runs in a field (``scripts/experiments/field.py``).
 """
 
 from __future__ import annotations
 
 import random
 import time
+from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from peers.jsonl import say
+from rcl_interfaces.srv import ListParameters
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.task import Future
 from report import percentile
@@ -130,5 +135,34 @@ def load(end: End, settings: Settings) -> None:
     calls.report()
 
 
+def replicate(end: End, settings: Settings) -> None:
+    """Answer until killed: the number of the request, the machine, and how many requests it has had to this service.
+
+    One in ``slow_in`` requests takes ``slow_s`` more; with ``threads`` it delays no other. The type is
+    ``rcl_interfaces/srv/ListParameters``, because its request has content (``Number`` in ``tasks.py``).
+    """
+    machine, group = str(settings["machine"]), ReentrantCallbackGroup()
+    slow_in, slow_s = int(str(settings.get("slow_in", 0))), float(str(settings.get("slow_s", 0.0)))
+    had: Counter[str] = Counter()
+
+    def answer(
+        name: str, request: ListParameters.Request, response: ListParameters.Response
+    ) -> ListParameters.Response:
+        if not had:
+            say(event="serving")
+        had[name] += 1
+        if slow_in and random.randrange(slow_in) == 0:
+            time.sleep(slow_s)
+        response.result.names = [str(request.depth), machine, str(had[name])]
+        return response
+
+    for name in str(settings["services"]).split():
+        end.node.create_service(
+            ListParameters, name, partial(answer, name), qos_profile=reliable(_DEPTH), callback_group=group
+        )
+    say(event="ready")
+    end.run()
+
+
 if __name__ == "__main__":
-    run_role({"serve": serve, "call": call, "load": load})
+    run_role({"serve": serve, "call": call, "load": load, "replicate": replicate})

@@ -28,20 +28,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Final, Literal
 
-from devices import add_address, add_bridge
 from machine import processor_s
-from ros_environment import BUFFER_BYTES, ros_environment
-from testbed import Lab, OverlayNodes
-from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
+from testbed import BUFFER_BYTES, Lab, OverlayNodes, add_address, add_bridge, ros_environment
 
 from gdp.host.run_registry import Run
-from gdp.metadata import Metadata
-from gdp.trust.right import Right
+from lab import credentials
 from lab.process import LabProcess
-from lab.topology import DomainPlan, Link, Topology
+from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 from proxy.config.config import Encoding
 
 READY_S: Final = 30.0
@@ -49,7 +44,6 @@ _BRIDGES: Final = ("p1", "p2", "p3")
 _ADDRESSES: Final = {LEFT: "10.98.0.1", RIGHT: "10.98.0.2"}
 _DOMAINS: Final = {LEFT: 141, RIGHT: 142}
 DIRECT_DOMAIN: Final = 143
-_RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ), "service": (Right.SERVE, Right.CALL)}
 _BRIDGE: Final = "bridge"
 
 
@@ -57,27 +51,21 @@ _BRIDGE: Final = "bridge"
 class Carried:
     """Topic or service that the proxies carry.
 
-    Attributes:
-        source: location of its publishers, or its server.
-        sign: of a service, as in its rules.
+    ``source``: location of its publishers, or its server. ``sign``: of a service, as in its rules.
     """
 
     name: str
     type_name: str
     encoding: Encoding
     source: str = LEFT
-    kind: Literal["topic", "service"] = "topic"
+    kind: credentials.Kind = "topic"
     sign: Literal["always", "session"] = "always"
 
     @property
-    def metadata(self) -> Metadata:
-        """Return the metadata of its name in the overlay."""
-        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name})
-
-    def rule(self, owner: Path) -> dict[str, object]:
-        """Return its rule in either proxy's configuration."""
-        keys = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
-        return {**keys, "owner": str(owner), **({"sign": self.sign} if self.kind == "service" else {})}
+    def at_proxies(self) -> credentials.Carried:
+        """Return it as either proxy carries it."""
+        sign = {"sign": self.sign} if self.kind == "service" else {}
+        return credentials.Carried(self.name, self.type_name, self.kind, {"encoding": self.encoding, **sign})
 
 
 class Row:
@@ -160,13 +148,9 @@ class Row:
 
     def _admit(self, side: str, carried: Sequence[Carried]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
-        node = self._machines[side]
-        sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
-        for each in carried:
-            is_source = each.source == side
-            self._nodes.admit(node, each.metadata, _RIGHTS[each.kind][not is_source])
-            sides["expose" if is_source else "import"].append(each.rule(self._nodes.owner_key))
-        return str(self._nodes.admit_proxy(node, _DOMAINS[side], sides))
+        exposed = [each.at_proxies for each in carried if each.source == side]
+        imported = [each.at_proxies for each in carried if each.source != side]
+        return self._nodes.admit_proxy(self._machines[side], _DOMAINS[side], {"expose": exposed, "import": imported})
 
 
 def _cyclone(side: str) -> str:

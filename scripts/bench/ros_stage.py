@@ -17,9 +17,9 @@ from typing import Final
 import skeleton
 from plot import Panel, panel_of
 from report import Rounds, Target
-from ros_environment import BUFFER_BYTES
 from ros_row import Carried, Row
 from skeleton import Options
+from testbed import BUFFER_BYTES
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError, figures_of
@@ -65,8 +65,7 @@ class Turn:
     def measure(self, row: Row, number: int) -> dict[str, float]:
         """Return the figures of one trial, by column.
 
-        Raises:
-            FailedError: a node did not come up, or nothing was received.
+        Raises ``FailedError``: a node did not come up, or nothing was received.
         """
         said, cores = self.report(row, self.encoding, number)
         figures = figures_of(said)

@@ -1,4 +1,4 @@
-"""Talker and listener of ``ros.py``: ordinary rclpy nodes that publish and receive typed messages.
+"""Talker and listener of ``ros.py``, camera and viewer of ``first_topic.py``: ordinary rclpy nodes.
 
 Process of its own, started by ``ros_row.py`` as ``talk`` or ``listen``. A message carries the wall clock at
 which it was published and its number, 1 and up. Until the talker gets the signal to start it sends greetings, numbered
@@ -27,6 +27,8 @@ _WIDTH, _HEIGHT, _PIXEL = 640, 480, 3
 _DEPTHS: Final = {"text": 10, "quick": 10, "image": 10, "small": 1_000}  # ten of 200/s would be 50 ms
 _GREETING_S: Final = 0.05
 _QUIET_S: Final = 8.0  # Fast DDS requests losses after 3 s
+_CAMERA_S: Final = 0.1
+_SIDE: Final = 64
 
 
 class _Texts:
@@ -168,5 +170,22 @@ def topics_of(settings: Settings) -> list[str]:
     return [str(topic) for topic in topics]
 
 
+def camera(end: End, settings: Settings) -> None:
+    """Publish until killed."""
+    publisher = end.node.create_publisher(Image, str(settings["topic"]), reliable())
+    image = Image(width=_SIDE, height=_SIDE, step=_SIDE, encoding="mono8", data=bytes(_SIDE * _SIDE))
+    end.every(_CAMERA_S, lambda: publisher.publish(image))
+    say(event="publishes")
+    end.run()
+
+
+def viewer(end: End, settings: Settings) -> None:
+    """Read until the first image."""
+    end.node.create_subscription(Image, str(settings["topic"]), lambda _: end.finish(), reliable())
+    say(event="reads")
+    end.run()
+    say(event="image", at_s=time.monotonic())
+
+
 if __name__ == "__main__":
-    run_role({"talk": talk, "listen": listen})
+    run_role({"talk": talk, "listen": listen, "camera": camera, "viewer": viewer})

@@ -23,13 +23,13 @@ from faults.plan import Flow, Plan
 from faults.records import Kind
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
-from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
 from lab.process import FailedError, until
+from lab.topology import make_topology
 
 TARGET_MS: Final = 1_000.0
 CASE: Final = "until the last message of the closed flow"
@@ -85,11 +85,7 @@ class _Closing:
         self._last_ns: dict[int, int] = {}  # by channel: when R got the last message
 
     def measure(self, over: Rounds) -> None:
-        """Add the measurements.
-
-        Raises:
-            FailedError: the flows did not come up, or a process ended by itself.
-        """
+        """Add the measurements. Raises ``FailedError``: the flows did not come up, or a process ended by itself."""
         flows = self._overlay.plan.flows
         until(
             lambda: len(self._last_ns) == len(flows),

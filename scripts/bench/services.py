@@ -21,8 +21,8 @@ from report import Rounds, Target
 from ros_row import READY_S, Carried, Row
 from ros_stage import DIRECT, MEDIAN, Bench, Measured, Turn, main
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
+from lab.topology import LEFT, RIGHT
 from proxy.config.config import Encoding
 
 MODULE: Final = "ros_calls"
@@ -46,8 +46,7 @@ def measure(
 ) -> Measured:
     """Return the client's report, and the cores that the proxies used.
 
-    Raises:
-        FailedError: a node did not come up.
+    Raises ``FailedError``: a node did not come up.
     """
     del number
     service, role, is_direct = (

@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from machine import ROOT, MachineState, machine_state
+from machine import ROOT, MachineState, RefusedError, machine_state, require_trust, require_writable
 from plot import Panel, require_plot, save_bars
-from preconditions import RefusedError, require_trust, require_writable
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
@@ -202,11 +201,7 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
 
 
 def _require_page(options: Options, state: MachineState) -> None:
-    """Refuse to measure for files that could not be written, or not be trusted.
-
-    Raises:
-        RefusedError: such files.
-    """
+    """Refuse to measure for files that could not be written, or not be trusted. Raises ``RefusedError``: such files."""
     is_quick = getattr(options, "quick", False)
     chosen = [path for path in (getattr(options, "json", None), getattr(options, "plot", None)) if path]
     is_whole = getattr(options, "is_whole", None)

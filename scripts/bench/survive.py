@@ -78,11 +78,7 @@ class Flowing:
         self.first_of: dict[int, int] = {}  # channel -> when its first message came
 
     def look(self) -> None:
-        """Read new records; end with an error if a process ended by itself.
-
-        Raises:
-            FailedError: one did.
-        """
+        """Read new records; end with an error if a process ended by itself. Raises ``FailedError``: one did."""
         for each in self._overlay.new_records("R"):
             if each.kind == Kind.DELIVERED:
                 self.first_of.setdefault(each.channel, each.at_ns)
@@ -133,9 +129,8 @@ class Flowing:
 def measure_row(runs: RunRegistry, row: Row, rounds: int, options: Options) -> Measured:
     """Make the event of a row happen so often.
 
-    Raises:
-        FailedError: the network did not come up, or a process ended by itself.
-        GdpError: the kernel refuses.
+    Raises ``FailedError``: the network did not come up, or a process ended by itself. Raises ``GdpError``: the kernel
+    refuses.
     """
     found = Measured()
     with new_run(runs) as run, Overlay(run, row.plan(HZ)) as overlay:

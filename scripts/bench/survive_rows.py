@@ -21,9 +21,8 @@ from typing import Final, TypedDict
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
-from topologies import ends_of, make_topology
 
-from lab.topology import Link
+from lab.topology import Link, ends_of, make_topology
 
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40

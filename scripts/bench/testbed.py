@@ -1,7 +1,8 @@
 """Test bed of the benches and experiments: machines in namespaces, and the overlay's nodes on them.
 
-I/O. ``topologies.py`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
-lab. ``run.end()`` removes namespaces and processes of a lab.
+I/O. ``lab.topology`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
+lab. ``run.end()`` removes namespaces and processes of a lab, and the file systems of its machines' shared memory.
+Source: shm_overview(7), mount_namespaces(7), unshare(1).
 """
 
 from __future__ import annotations
@@ -13,19 +14,35 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, TypeVar
 
-import yaml
-from shared_memory import SharedMemory
+from pyroute2 import IPRoute
 
+from gdp.crypto.certificates import Role
+from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
+from lab.credentials import Carried, OverlayCredentials, Side
 from lab.namespaces import Namespaces
 from lab.process import FailedError, LabProcess
-from lab.topology import Topology
+from lab.topology import Attachment, Topology
 from ring.cores import MachineCores
-from ring.credentials import OverlayCredentials
+
+_SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
+_ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
+
+
+class SharedMemory:
+    """The ``/dev/shm`` of a machine. Raises ``LocalError``: the kernel refuses."""
+
+    def __init__(self, run: Run, node: str) -> None:
+        self.folder = run.directory / f"shm-{node}"
+        run.plan_mount(self.folder)
+        mount_tmpfs(self.folder, _SIZE_BYTES)
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """Return the command line that runs ``argv`` with this ``/dev/shm``, under the same process id."""
+        return ["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", _ENTER, str(self.folder), *argv]
+
 
 _BENCH: Final = Path(__file__).resolve().parent
 
@@ -35,12 +52,8 @@ T = TypeVar("T")
 class Lab:
     """Machines of a topology, each in a namespace.
 
-    Args:
-        own_shared_memory: these machines have a ``/dev/shm`` each; the others see the one of the host.
-        cores: bound of processor time by machine; None: the machines share all cores.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. ``cores``: bound
+    of processor time by machine; None: the machines share all cores. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(
@@ -119,7 +132,7 @@ class OverlayNodes:
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        self._credentials = credentials = OverlayCredentials(self._topology, self.files, metrics=False)
+        self.credentials = credentials = OverlayCredentials(self._topology, self.files)
         self._switch_nodes = tuple(switches)
         self.planes: set[str] = set()
         self.undo = ExitStack()
@@ -144,40 +157,108 @@ class OverlayNodes:
         """End all processes, the last one first."""
         self.undo.close()
 
-    def admit(self, node: str, metadata: Metadata, right: Right) -> None:
-        """Give a member's node a delegation."""
-        identity = self._identity(node)
-        install_delegation(identity, delegate(self.files / "owner", identity / CARD, metadata, [right]))
-
     def admit_member(self, node: str, topics: Mapping[Right, Iterable[str]]) -> Path:
         """Delegate topics to a member without ROS; return its configuration file."""
         for right, names in topics.items():
             for name in names:
-                self.admit(node, Metadata({"kind": "topic", "name": name}), right)
-        return self._write(f"end-{node}.yaml", self._member(node))
+                self.credentials.delegate(node, Metadata({"kind": "topic", "name": name}), right)
+        content = {**self.credentials.node_yaml(Role.PROXY, node), "iface": self._iface(node)}
+        return self.credentials.write(f"end-{node}.yaml", content)
 
-    def admit_proxy(self, node: str, ros_domain: int, rules: Mapping[str, Sequence[Mapping[str, object]]]) -> Path:
-        """Write a proxy's configuration with its rules by side; return the file."""
-        identity = self._identity(node)
-        own = {"delegations": str(identity / DELEGATIONS), "ros": {"endpoint": "ros2", "domain": ros_domain}}
-        return self._write(f"proxy-{node}.yaml", {**self._member(node), **own, **rules})
+    def admit_proxy(self, node: str, ros_domain: int, carried: Mapping[Side, Sequence[Carried]]) -> str:
+        """Give a proxy the delegations of its sides, and write its configuration; return the file."""
+        at = Attachment(node, "proxy", self._iface(node))
+        return str(self.credentials.proxy(at, carried, ros={"endpoint": "ros2", "domain": ros_domain}))
 
-    @property
-    def owner_key(self) -> Path:
-        """The public key of the owner of all names."""
-        return self.files / "owner" / OWNER_PUBLIC
-
-    def _identity(self, node: str) -> Path:
-        return self.files / "nodes" / f"proxy-{node}"
-
-    def _member(self, node: str) -> dict[str, object]:
+    def _iface(self, node: str) -> str:
         if node in self._switch_nodes:
             (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
-        else:
-            iface = next(self._topology.links_of(node)).other(node)
-        return {**self._credentials.of_proxy(node).to_yaml(), "iface": iface}
+            return iface
+        return next(self._topology.links_of(node)).other(node)
 
-    def _write(self, name: str, content: Mapping[str, object]) -> Path:
-        path = self.files / name
-        path.write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
-        return path
+
+BUFFER_BYTES: Final = 4 << 20  # of a socket, and of a segment of shared memory: both hold a camera image
+_UDP: Final = f"""<transport_descriptor>
+  <transport_id>udp</transport_id><type>UDPv4</type>
+  <sendBufferSize>{BUFFER_BYTES}</sendBufferSize><receiveBufferSize>{BUFFER_BYTES}</receiveBufferSize>
+ </transport_descriptor>"""
+_SHM: Final = f"""<transport_descriptor>
+  <transport_id>shm</transport_id><type>SHM</type><segment_size>{BUFFER_BYTES}</segment_size>
+ </transport_descriptor>"""
+_PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com"><profiles>
+ <transport_descriptors>{descriptors}</transport_descriptors>
+ <participant profile_name="participant" is_default_profile="true"><rtps>
+  <userTransports>{transports}</userTransports><useBuiltinTransports>false</useBuiltinTransports>
+ </rtps></participant>
+</profiles></dds>
+"""
+
+
+def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -> list[str]:
+    """Return the environment of a ROS process, as ``KEY=value``.
+
+    The discovery range is ``SUBNET``, and the namespaces confine: ``LOCALHOST`` would change the transports.
+
+    Args:
+        folder: where the profile is written.
+        shared_memory: whether processes of one machine use it; they use UDP otherwise.
+    """
+    profile = folder / f"dds-{'shm' if shared_memory else 'udp'}.xml"
+    transports = ("shm", "udp") if shared_memory else ("udp",)
+    text = _PROFILE.format(
+        descriptors=_SHM + _UDP if shared_memory else _UDP,
+        transports="".join(f"<transport_id>{each}</transport_id>" for each in transports),
+    )
+    profile.write_text(text, encoding="utf-8")
+    return [
+        f"ROS_DOMAIN_ID={domain}",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
+        f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
+        f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
+    ]
+
+
+def add_address(device: str, address: str) -> None:
+    """Give a device an IPv4 address of a network of 24 bits."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.addr("add", index=index, address=address, prefixlen=24)
+
+
+def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
+    """Join devices by a new bridge without spanning tree."""
+    with IPRoute() as here:
+        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
+        (bridge,) = here.link_lookup(ifname=name)
+        for device in devices:
+            here.link("set", index=here.link_lookup(ifname=device)[0], master=bridge)
+        here.link("set", index=bridge, state="up")
+
+
+def add_neighbour(device: str, address: str, mac: bytes) -> None:
+    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=index, state="permanent")
+
+
+def set_link(device: str, **change: str | int) -> None:
+    """Change a device: ``state``, ``mtu`` in bytes, or ``net_ns_fd``, the namespace of a descriptor to move it to."""
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], **change)
+
+
+def received(devices: Sequence[str]) -> dict[str, int]:
+    """Return how many frames have come in, by device."""
+    with IPRoute() as here:
+        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
+    return {device: links[device]["rx_packets"] for device in devices}
+
+
+def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
+    """Return the MAC addresses, by device."""
+    with IPRoute() as here:
+        links = {link.get("ifname"): link.get("address") for link in here.get_links()}
+    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}

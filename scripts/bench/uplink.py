@@ -27,8 +27,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from machine import DATA, RefusedError
 from plot import Panel, panel_of
-from preconditions import DATA, RefusedError
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import Lab
@@ -79,8 +79,7 @@ def camera_of(link: Conditions, choice: str) -> str:
 def links_of(options: Options) -> list[Conditions]:
     """Return the links of the command line: the small grid, or all combinations of what was chosen.
 
-    Raises:
-        RefusedError: an unknown word, or a recording that is not there.
+    Raises ``RefusedError``: an unknown word, or a recording that is not there.
     """
     if any((options.rates, options.rtt, options.loss, options.fifo)):
         words = [
@@ -103,8 +102,7 @@ def exchange(
 ) -> tuple[Used, Mapping[str, Report]]:
     """Run the traffic of a system once (None: no system), with or without the TCP flow; return use and reports.
 
-    Raises:
-        FailedError: a process did not come up, or ended.
+    Raises ``FailedError``: a process did not come up, or ended.
     """
     camera = camera_of(link, options.camera)
     with ExitStack() as stack:

@@ -94,8 +94,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
     """Start everything; return the two flows by their number of paths, once both have what they asked for.
 
-    Raises:
-        FailedError: the second path does not come up.
+    Raises ``FailedError``: the second path does not come up.
     """
     overlay = stack.enter_context(Overlay(laboratory))
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))

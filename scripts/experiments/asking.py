@@ -30,10 +30,8 @@ class Place(Protocol):
 class Asking:
     """Series in progress, read a sample at a time; a context manager that ends its client.
 
-    Attributes:
-        twice: surplus answers that reached a call; None until the end, or where they were not counted.
-        heard: answers in all; the same.
-        warm_up: calls of each service before the series.
+    ``twice``: surplus answers that reached a call; None until the end, or where they were not counted. ``heard``:
+    answers in all; the same. ``warm_up``: calls of each service before the series.
     """
 
     def __init__(self, place: Place, series: Series) -> None:

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 from experiment import Computed, command_line, run_experiment
-from preconditions import data_folder
+from machine import data_folder
 from report import markdown_table, print_table
 from skeleton import Options
 
@@ -40,10 +40,8 @@ WAYS: Final = {
 class Case:
     """Replay of one pool.
 
-    Args:
-        way: of ``WAYS``.
-        none_up: share of time.
-        independent: product of the single replicas' shares; None where they have no share each.
+    ``way``: of ``WAYS``. ``none_up``: share of time. ``independent``: product of the single replicas' shares; None
+    where they have no share each.
     """
 
     way: str
@@ -78,11 +76,7 @@ def measure(options: Options) -> Computed:
 
 
 def recorded() -> list[Trace]:
-    """Read the traces.
-
-    Raises:
-        RefusedError: they are missing.
-    """
+    """Read the traces. Raises ``RefusedError``: they are missing."""
     paths = sorted(data_folder("spot", ["aws_*.json"]).glob("aws_*.json"))
     return [Trace.from_document(path.stem[-1], json.loads(path.read_text())) for path in paths]
 

@@ -21,8 +21,7 @@ from typing import Final
 
 from bench_path import ROOT
 from field import Field, Served, Work
-from machine import MachineState, machine_state
-from preconditions import require_trust, require_writable
+from machine import MachineState, machine_state, require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit, new_run
@@ -38,10 +37,8 @@ _FIGURES: Final = ("figure", "here", "target", "", "paper")
 class Finding:
     """Figure, with its target and the figure of the paper.
 
-    Args:
-        target: the least accepted value; None: there is no target.
-        at_most: ``target`` is the most instead.
-        paper: in words; empty: not known for sure.
+    ``target``: the least accepted value; None: there is no target. ``at_most``: ``target`` is the most instead.
+    ``paper``: in words; empty: not known for sure.
     """
 
     what: str
@@ -126,10 +123,8 @@ class Report:
 class Computed:
     """Outcome of an experiment that writes a document and a page of its own kind.
 
-    Args:
-        name: of its files, such as ``table1``.
-        print_tables: without a machine, which the page names in its last line.
-        draw: as in ``Report``.
+    ``name``: of its files, such as ``table1``. ``print_tables``: without a machine, which the page names in its last
+    line. ``draw``: as in ``Report``.
     """
 
     name: str
@@ -187,9 +182,7 @@ def gains(
 def latencies_of(groups: Mapping[str, Sequence[Sample]], label: str, names: Iterable[str], scale: float) -> Panels:
     """Return the latencies of both cases for each panel.
 
-    Args:
-        label: a group's name, with ``{name}`` and ``{case}`` in it.
-        scale: 1: seconds; 1,000: milliseconds.
+    ``label``: a group's name, with ``{name}`` and ``{case}`` in it. ``scale``: 1: seconds; 1,000: milliseconds.
     """
     return {
         name: {case: [scale * each.latency_s for each in groups[label.format(name=name, case=case)]] for case in CASES}
@@ -212,11 +205,7 @@ def run_experiment(
     measure: Callable[[Options], Report | Computed],
     words: Sequence[str] | None = None,
 ) -> None:
-    """Run an experiment to its tables, page, picture and JSON.
-
-    Args:
-        words: as ``sys.argv[1:]``.
-    """
+    """Run an experiment to its tables, page, picture and JSON. ``words``: as ``sys.argv[1:]``."""
     options, state = parser.parse_args(words), machine_state()
     folder: Path | None = options.out or (None if options.quick else OUTPUT)
     with clean_exit():

@@ -23,15 +23,12 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from ros_environment import ros_environment
-from testbed import Lab, OverlayNodes
-from topologies import flat_topology
+from testbed import Lab, OverlayNodes, ros_environment
 
 from gdp.host.run_registry import Run
-from gdp.metadata import Metadata
-from gdp.trust.right import Right
+from lab.credentials import Carried, Side
 from lab.process import LabProcess
-from lab.topology import Topology
+from lab.topology import Topology, flat_topology
 
 ROBOT: Final = "robot"
 READY_S: Final = 40.0
@@ -45,10 +42,8 @@ _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 class Served:
     """Service of the field.
 
-    Args:
-        machines: the machines that expose it.
-        expose: further keys of their rules.
-        imports: further keys of the robot's rule.
+    ``machines``: the machines that expose it. ``expose``: further keys of their rules. ``imports``: further keys of the
+    robot's rule.
     """
 
     name: str
@@ -57,15 +52,10 @@ class Served:
     expose: Mapping[str, object] = field(default_factory=dict)
     imports: Mapping[str, object] = field(default_factory=dict)
 
-    @property
-    def metadata(self) -> Metadata:
-        """Return the metadata of its name in the overlay."""
-        return Metadata({"kind": "service", "name": self.name, "type": self.type_name})
-
-    def rule(self, owner: Path, further: Mapping[str, object]) -> dict[str, object]:
-        """Return a rule for it."""
-        keys = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
-        return {**keys, "owner": str(owner), **further}
+    def carried(self, side: Side) -> Carried:
+        """Return it as the proxies of one side carry it."""
+        further = self.expose if side == "expose" else self.imports
+        return Carried(self.name, self.type_name, "service", {"encoding": "cdr", **further})
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +88,7 @@ class Server:
     def wait(self) -> None:
         """Wait until both are ready. They report it before the robot's proxy knows of them.
 
-        Raises:
-            FailedError: one did not come up.
+        Raises ``FailedError``: one did not come up.
         """
         for each in self._running:
             each.read_line(READY_S)
@@ -197,14 +186,9 @@ class Field:
 
     def _admit(self, node: str, served: Sequence[Served]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
-        side, right = ("import", Right.CALL) if node == ROBOT else ("expose", Right.SERVE)
-        rules = []
-        for each in served:
-            if node == ROBOT or node in each.machines:
-                self._nodes.admit(node, each.metadata, right)
-                further = each.imports if node == ROBOT else each.expose
-                rules.append(each.rule(self._nodes.owner_key, further))
-        return str(self._nodes.admit_proxy(node, self._domain(node), {side: rules}))
+        side: Side = "import" if node == ROBOT else "expose"
+        carried = [each.carried(side) for each in served if node == ROBOT or node in each.machines]
+        return self._nodes.admit_proxy(node, self._domain(node), {side: carried})
 
     def _topology(self) -> Topology:
         links = [(ROBOT, _NEAR), (_NEAR, _GATE)]

@@ -23,8 +23,8 @@ from typing import Final
 from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
+from machine import DATA, RefusedError, data_folder
 from pictures import save_distributions
-from preconditions import DATA, RefusedError, data_folder
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
@@ -110,11 +110,7 @@ def _named(what: str, found: Mapping[str, list[Sample]]) -> dict[str, list[Sampl
 
 
 def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
-    """Refuse a planner or a problem that is not available.
-
-    Raises:
-        RefusedError: one is not.
-    """
+    """Refuse a planner or a problem that is not available. Raises ``RefusedError``: one is not."""
     try:
         from planning import PROBLEMS, planners
     except ImportError as error:

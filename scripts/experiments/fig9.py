@@ -51,9 +51,8 @@ _NOTES: Final = (
 class _FaultInjector:
     """Kills the machine that has served for longest, whenever all serve; driven by the answers as they arrive.
 
-    Attributes:
-        spans: from the death of a machine until its replacement served; the last one may have no end.
-        labels: by machine, the name of the first of those that replace each other.
+    ``spans``: from the death of a machine until its replacement served; the last one may have no end. ``labels``: by
+    machine, the name of the first of those that replace each other.
     """
 
     def __init__(self, cluster: TagCluster) -> None:

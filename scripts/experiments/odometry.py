@@ -41,9 +41,8 @@ class Features:
     def of(cls, color: NDArray[np.uint8], depth: NDArray[np.uint16]) -> Features:
         """Detect the features of a frame.
 
-        Args:
-            color: uint8 [height, width, 3], RGB.
-            depth: uint16 [height, width], ``DEPTH_SCALE`` units a metre; 0: unknown.
+        ``color``: uint8 [height, width, 3], RGB. ``depth``: uint16 [height, width], ``DEPTH_SCALE`` units a metre; 0:
+        unknown.
         """
         points, descriptors = cv2.ORB.create(_FEATURES).detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
         return cls(np.array([point.pt for point in points]), np.asarray(descriptors, dtype=np.uint8), depth)

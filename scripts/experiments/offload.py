@@ -28,11 +28,10 @@ from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from report import progress
 from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
 from skeleton import Options, new_run
-from topologies import LEFT, RIGHT
 
 from gdp.host.cgroups import Cgroup
 from lab.process import LabProcess
-from lab.topology import ring5
+from lab.topology import LEFT, RIGHT, ring5
 from proxy.config.config import Encoding
 from ring.cores import CORES_HELP, cores_of
 

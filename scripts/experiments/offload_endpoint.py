@@ -21,8 +21,7 @@ from select import select
 from typing import Final, TypeAlias
 
 import bench_path  # noqa: F401 - finds ``peers``
-from offload_messages import TYPES, Message, number_of, set_number
-from offload_tasks import TASKS
+from offload_tasks import TASKS, TYPES, Message, number_of, set_number
 from peers.jsonl import say
 from rclpy.serialization import deserialize_message, serialize_message
 

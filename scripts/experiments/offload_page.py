@@ -53,9 +53,7 @@ Document = Mapping[str, Any]  # JSON
 def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, float]:
     """Return the network time that the overlay adds to ROS 2: median, least and most of the rounds.
 
-    Args:
-        overlay: ``JSON`` or ``CDR``.
-        other: ``CYCLONE`` or ``FAST``.
+    ``overlay``: ``JSON`` or ``CDR``. ``other``: ``CYCLONE`` or ``FAST``.
     """
     ours, theirs = (network["contenders"][who]["rounds_there_s"] for who in (overlay, other))
     gaps = [a - b for a, b in zip(ours, theirs, strict=True)]

@@ -1,7 +1,11 @@
 """Tasks of FogROS G's Table I: the robot's request, the server's computation, and the check of the answer.
 
 Reads recorded frames and meshes when a task is made; otherwise sans-I/O. The sizes of images and the types are those of
-the clients that the authors publish (``offload_messages.py`` names the files).
+the clients that the authors publish, with standard types where a package has no wheel. The number of a request is in
+its messages' headers, as ``frame_id``, or in their layouts, as ``data_offset``; requests numbered 0 are greetings.
+Source: github.com/BerkeleyAutomation: ``fogros2-examples`` (``vslam/TUTORIAL.md``: the TUM dataset freiburg1;
+``mpt/mpt_ros/src/mpt_ros_client.cpp``: meshes of OMPL's "cubicles", ``MotionPlanRequest``), ``fogros-demos``
+(``gqcnn-ros/nodes/gqcnn_ros_client.py``), ``gqcnn`` (``data/calib/phoxi/phoxi.intr``: 516 x 386).
 
     vSLAM             colour (rgb8) and depth (16UC1) of 640 x 480 -> pose          stand-in: odometry.py
     motion planning   meshes of OMPL's Home and a request -> path                   OMPL's RRTConnect, FCL
@@ -18,11 +22,41 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from machine import data_folder
 from numpy.typing import NDArray
-from offload_messages import CAMERA, IMAGE, NUMBERS, OCTETS, POSE, Message
-from preconditions import data_folder
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+
+Message: TypeAlias = "CameraInfo | Float64MultiArray | Image | PoseStamped | UInt8MultiArray"
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+CAMERA: Final = "sensor_msgs/msg/CameraInfo"
+POSE: Final = "geometry_msgs/msg/PoseStamped"
+OCTETS: Final = "std_msgs/msg/UInt8MultiArray"
+NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
+TYPES: Final = {
+    CAMERA: CameraInfo,
+    IMAGE: Image,
+    NUMBERS: Float64MultiArray,
+    OCTETS: UInt8MultiArray,
+    POSE: PoseStamped,
+}
+
+
+def set_number(message: Message, number: int) -> None:
+    """Write the number of its request into a message."""
+    if isinstance(message, Float64MultiArray | UInt8MultiArray):
+        message.layout.data_offset = number
+    else:
+        message.header.frame_id = str(number)
+
+
+def number_of(message: Message) -> int:
+    """Return the number of the request of a message."""
+    if isinstance(message, Float64MultiArray | UInt8MultiArray):
+        return int(message.layout.data_offset)
+    return int(message.header.frame_id)
+
 
 if TYPE_CHECKING:
     from planning import Problem
@@ -199,11 +233,7 @@ _KINDS: Final = {"rgb8": (np.uint8, 3), "16UC1": (np.uint16, 1), "32FC1": (np.fl
 
 
 def _read(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
-    """Return the pixels of an image file.
-
-    Raises:
-        FileNotFoundError: it is missing, or no image.
-    """
+    """Return the pixels of an image file. Raises ``FileNotFoundError``: it is missing, or no image."""
     image = cv2.imread(str(path), flags)
     if image is None:
         raise FileNotFoundError(path)

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Final
 
 from experiment import OUTPUT
-from machine import machine_state
-from preconditions import data_folder, require_trust, require_writable
+from machine import data_folder, machine_state, require_trust, require_writable
 from report import progress
 from results import machines_of, page_of, rows_of
 from skeleton import add_allow_load, clean_exit

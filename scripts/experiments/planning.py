@@ -33,9 +33,8 @@ Way: TypeAlias = "list[Place]"
 class Solved(NamedTuple):
     """Outcome of one run.
 
-    Args:
-        way: poses, each with a position and a quaternion (w last); None: not found in time.
-        checks: states whose validity was checked; this measure of work does not depend on other load of the machine.
+    ``way``: poses, each with a position and a quaternion (w last); None: not found in time. ``checks``: states whose
+    validity was checked; this measure of work does not depend on other load of the machine.
     """
 
     way: Way | None
@@ -57,9 +56,7 @@ class Problem:
     def load(cls, folder: Path, name: str) -> Problem:
         """Read a problem by its name in ``PROBLEMS``.
 
-        Raises:
-            OSError: a file is missing.
-            KeyError: no such problem, or a file without what it needs.
+        Raises ``OSError``: a file is missing. Raises ``KeyError``: no such problem, or a file without what it needs.
         """
         stem = PROBLEMS[name]
         robot, world = ((folder / f"{stem}_{what}.dae").read_bytes() for what in ("robot", "env"))
@@ -126,9 +123,7 @@ class Problem:
 def limits(folder: Path, name: str) -> tuple[Place, Place, Place, Place]:
     """Return positions of start and goal, and the lowest and highest position, of a problem in ``PROBLEMS``.
 
-    Raises:
-        OSError: the file is missing.
-        KeyError: no such problem, or a file without what it needs.
+    Raises ``OSError``: the file is missing. Raises ``KeyError``: no such problem, or a file without what it needs.
     """
     parser = configparser.ConfigParser(strict=False, allow_no_value=True)
     with (folder / f"{PROBLEMS[name]}.cfg").open(encoding="utf-8") as file:

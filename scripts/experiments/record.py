@@ -13,9 +13,9 @@ import json
 from pathlib import Path
 from typing import Final
 
-import bench_path  # noqa: F401 - finds ``preconditions``
+import bench_path  # noqa: F401 - finds ``machine``
+from machine import DATA
 from planning import PROBLEMS, Problem, be_quiet
-from preconditions import DATA
 from recorded import MOST_CHECKS, RECORDING
 
 _PATIENCE_S: Final = 100_000.0  # of the wall clock, which other work may slow: the limit is that of checks

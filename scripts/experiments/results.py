@@ -51,9 +51,8 @@ _NUMBERS: Final = {"fig5": "FT Figure 5", "fig6": "FT Figure 6", "fig7": "FT Fig
 class Row:
     """Figure of a paper and ours, as text.
 
-    Args:
-        spread: of ours, with its definition.
-        measured: ``THIS_RUN``, or day, commit and load of an earlier one; also of this one where the load was high.
+    ``spread``: of ours, with its definition. ``measured``: ``THIS_RUN``, or day, commit and load of an earlier one;
+    also of this one where the load was high.
     """
 
     figure: str
@@ -69,8 +68,7 @@ class Row:
 def rows_of(folder: Path, measured: Collection[str]) -> tuple[list[Row], list[str]]:
     """Return the rows of those experiments whose JSON is in a folder, and the names of the others.
 
-    Args:
-        measured: experiments that wrote their JSON in this run.
+    ``measured``: experiments that wrote their JSON in this run.
     """
     makers: dict[str, Callable[[Any], Iterator[Row]]] = {
         "offload": _offload,
@@ -123,11 +121,7 @@ def _origin(document: Any, *, is_measured: bool) -> str:
 
 
 def page_of(rows: Sequence[Row], machines: Sequence[str], missing: Sequence[str]) -> str:
-    """Return the page, in Markdown.
-
-    Args:
-        missing: experiments that have no rows.
-    """
+    """Return the page, in Markdown. ``missing``: experiments that have no rows."""
     head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here", "measured")
     cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions, r.measured) for r in rows]
     return "\n\n".join([

@@ -80,8 +80,7 @@ class Summary:
     def of(cls, samples: Sequence[Sample]) -> Summary:
         """Return the summary of one request or more; failed ones count with the time that they cost.
 
-        Raises:
-            ValueError: none at all.
+        Raises ``ValueError``: none at all.
         """
         times = [each.latency_s for each in samples]
         failed = sum(not each.is_right for each in samples)
@@ -91,8 +90,7 @@ class Summary:
 def p99(values: Sequence[float]) -> float:
     """Return the 99th percentile; of fewer than a hundred values it is the largest.
 
-    Raises:
-        ValueError: no values.
+    Raises ``ValueError``: no values.
     """
     return percentile(values, 0.99)
 

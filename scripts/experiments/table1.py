@@ -62,12 +62,8 @@ class Row:
 class Application:
     """Three costs of an application, on the cheapest machines that meet its needs.
 
-    Args:
-        needs: as in ``fog.hardware``.
-        on_demand: machine and region, one a region, the cheaper one first.
-        spot: the same.
-        usd_per_hour: one on-demand, two on-demand, two spot.
-        paper: the same three.
+    ``needs``: as in ``fog.hardware``. ``on_demand``: machine and region, one a region, the cheaper one first. ``spot``:
+    the same. ``usd_per_hour``: one on-demand, two on-demand, two spot. ``paper``: the same three.
     """
 
     name: str
@@ -107,11 +103,7 @@ def measure(options: Options) -> Computed:
 
 
 def bills(region: str) -> list[Row]:
-    """Return the rows of the types that have both prices there.
-
-    Raises:
-        LocalError: none has.
-    """
+    """Return the rows of the types that have both prices there. Raises ``LocalError``: none has."""
     prices = aws_prices()
     offers: dict[tuple[str, bool], Offer] = {
         (offer.type_name, offer.is_spot): offer for offer in prices.offers if offer.region == region

@@ -106,8 +106,7 @@ class TagCamera:
 def _pattern(family: object) -> NDArray[np.float64]:
     """Return the grey of each module of the first tag of a family, its white margin included.
 
-    Args:
-        family: the library's C struct ``apriltag_family``.
+    ``family``: the library's C struct ``apriltag_family``.
     """
     total, border = int(family.total_width), int(family.width_at_border)  # type: ignore[attr-defined]
     bits, code = int(family.nbits), int(family.codes[0])  # type: ignore[attr-defined]

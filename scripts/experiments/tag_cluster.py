@@ -45,9 +45,7 @@ def generate_launch_description():
 class TagCluster(Cluster):
     """Machines that serve; each service has as many of its own.
 
-    Args:
-        replicas: machines of each service.
-        timeout_s: after which a call has failed.
+    ``replicas``: machines of each service. ``timeout_s``: after which a call has failed.
     """
 
     def __init__(self, services: Sequence[str], replicas: int, gateway: str, timeout_s: float) -> None:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Final, TypeAlias
 
-import bench_path  # noqa: F401 - finds ``preconditions``
+import bench_path  # noqa: F401 - finds ``machine``
 import numpy as np
+from machine import RefusedError
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from preconditions import RefusedError
 from scipy import ndimage
 
 Grey: TypeAlias = "NDArray[np.uint8]"
@@ -99,8 +99,7 @@ class Networks:
 def require_networks(instead: str) -> None:
     """Refuse to compute without the networks; ``instead`` is what else to do.
 
-    Raises:
-        RefusedError: they are not installed.
+    Raises ``RefusedError``: they are not installed.
     """
     if find_spec(_WHEEL) is None:
         what = f"{_WHEEL} is not installed: pip install 'gdp-ros[experiments]' (Python 3.10 to 3.12)"

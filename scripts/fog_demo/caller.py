@@ -26,8 +26,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_services_default
 from std_srvs.srv import SetBool
 
-__all__ = ["Tally", "main"]
-
 
 class _Answer(Protocol):
     success: bool

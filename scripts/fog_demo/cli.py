@@ -17,14 +17,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from fog_demo.display import Display
 from fog_demo.environment import Environment, end_all_of, standing_runs, sweep
-from fog_demo.scenario import Outcome, Pace, run_scenario
+from fog_demo.scenario import Display, Outcome, Pace, run_scenario
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run
 from lab.command import FAILED, PASSED, console_of, exit_with, new_app
-
-__all__ = ["main"]
 
 _PACE: Final = Pace()
 

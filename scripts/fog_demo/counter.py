@@ -16,8 +16,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 
-__all__ = ["main"]
-
 _COUNT: Final = struct.Struct("<Q")
 _STATE: Final = "state"
 

@@ -15,8 +15,6 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from std_srvs.srv import SetBool
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Serve until Ctrl-C or SIGTERM."""

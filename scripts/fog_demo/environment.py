@@ -15,22 +15,16 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import yaml
-
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from gdp.stores.keyring import DELEGATIONS
-from lab.child import Child
-from lab.children import Children
+from lab.children import Child, Children
+from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5
-from ring.credentials import OverlayCredentials
-
-__all__ = ["ENVIRONMENT", "SITE", "STATE", "Environment", "end_all_of", "fog_command", "standing_runs", "sweep"]
 
 ROBOT: Final = "nuc1"
 FAR: Final = "nuc5"
@@ -50,8 +44,7 @@ ENVIRONMENT: Final = {
 class Environment:
     """Ring of one run and its site.
 
-    Args:
-        run: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
+    ``run``: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
     """
 
     def __init__(self, run: Run) -> None:
@@ -64,7 +57,7 @@ class Environment:
         self._topology = Topology(ring.links, (DomainPlan("ring", ring.nodes),), attached)
         self._run = run
         self._namespaces = Namespaces(self._topology, run)
-        self._materials = OverlayCredentials(self._topology, run.directory, metrics=False)
+        self._credentials = OverlayCredentials(self._topology, run.directory)
         self.children = Children(run, kept=False)
         self.state = run.directory / STATE
         self.site_file = run.directory / SITE
@@ -76,11 +69,11 @@ class Environment:
         self._write_site(uplink, proxy, far_switch)
         switches = []
         for node in self._topology.nodes:
-            config = far_switch if node == FAR else self._materials.switch(node, "auto")
+            config = far_switch if node == FAR else self._credentials.switch(node, "auto")
             switches.append(self._start(node, "switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"]))
         planes = {each.text("data_plane") for each in await self.children.ready(switches)}
         (at,) = self._topology.attached("rib")
-        rib = ["-m", "gdp.cli.rib", "--config", str(self._materials.rib(at)), "--json"]
+        rib = ["-m", "gdp.cli.rib", "--config", str(self._credentials.rib(at)), "--json"]
         await self.children.ready([self._start(at.switch, "rib", rib)])
         await self.children.ready(
             [self._start(ROBOT, "proxy", ["-m", "proxy.cli.proxy", "--config", str(proxy), "--json"])]
@@ -90,8 +83,7 @@ class Environment:
     async def fog(self, *words: str, patience_s: float) -> None:
         """Run a command of ``fog`` on the host of the far switch until it ends.
 
-        Raises:
-            FailedError: it failed; the text has its last output.
+        Raises ``FailedError``: it failed; the text has its last output.
         """
         argv = fog_command(self._run, words)
         child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)
@@ -107,27 +99,16 @@ class Environment:
         return self.children.start_in(self._namespaces, node, role, arguments, heard=heard, environment=ENVIRONMENT)
 
     def _write_proxy(self) -> Path:
-        """Write the robot's ``proxy.yaml``, without a rule: ``fog`` adds them."""
-        credentials = self._materials.of_proxy(ROBOT)
-        delegations = credentials.identity / DELEGATIONS
-        delegations.mkdir(mode=0o700, exist_ok=True)
+        """Write the robot's configuration, without a rule: ``fog`` adds them."""
         (at,) = (each for each in self._topology.attached("proxy") if each.switch == ROBOT)
-        content = {
-            **credentials.to_yaml(),
-            "iface": at.ifname,
-            "delegations": str(delegations),
-            "ros": {"endpoint": "ros2", "domain": _DOMAIN},
-        }
-        return self._write("proxy.yaml", content)
+        return self._credentials.proxy(at, {}, ros={"endpoint": "ros2", "domain": _DOMAIN})
 
     def _write_far_switch(self, uplink: str) -> Path:
         """Write ``switch.yaml`` of the far switch, with an additional port and the folder of revocations."""
-        path = self._materials.switch(FAR, "auto")
         revocations = self._run.directory / "revocations"
         revocations.mkdir(mode=0o700)
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        content["ports"].append({"iface": uplink, "optional": True})
-        return self._write(path.name, {**content, "revocations": str(revocations)})
+        ports = [*self._credentials.ports(FAR), {"iface": uplink, "optional": True}]
+        return self._credentials.switch(FAR, "auto", ports=ports, revocations=str(revocations))
 
     def _write_site(self, uplink: str, proxy: Path, switch: Path) -> None:
         folder = self._run.directory
@@ -139,19 +120,13 @@ class Environment:
             "watch": _WATCH,
             "uplink": uplink,
         }
-        self._write(SITE, content)
-
-    def _write(self, name: str, content: Mapping[str, object]) -> Path:
-        path = self._run.directory / name
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        return path
+        self._credentials.write(SITE, content)
 
 
 def standing_runs(what: str) -> RunRegistry:
     """Return the records of runs of one kind, such as ``demo``, with machines of ``fog``.
 
-    Raises:
-        LocalError: the folder belongs to another user.
+    Raises ``LocalError``: the folder belongs to another user.
     """
     return RunRegistry(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
 
@@ -167,8 +142,7 @@ def sweep(runs: RunRegistry) -> list[str]:
 def end_all_of(run: Run) -> None:
     """Release the machines of a run, and take down the rest.
 
-    Raises:
-        LocalError: machines remain; the text has the output of ``fog down``.
+    Raises ``LocalError``: machines remain; the text has the output of ``fog down``.
     """
     if (run.directory / STATE).exists():
         argv = [sys.executable, *fog_command(run, ["down", "--all"])]

@@ -9,25 +9,83 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from rich.console import Console, Group, RenderableType
+from rich.text import Text
+
+from fog.cli.views import event_line, machine_fields, machines_table, stage
 from fog.providers.local.fault_injection import kill, notice
 from fog.site import Site, open_site
 from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Entry, Journal
-from fog_demo.display import Counts, Display
 from fog_demo.environment import Environment
 from gdp.errors import LocalError
-from lab.child import Child
-from lab.children import cancel
+from lab.children import Child, cancel
+from lab.command import StepDisplay
 from lab.events import Event
 
-__all__ = ["Outcome", "Pace", "run_scenario"]
+_EVENTS: Final = 10  # number of the newest events shown
+_PLAIN_EVERY_S: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counts:
+    """Request statistics of the robot's node.
+
+    ``failed``: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
+    """
+
+    requests: int = 0
+    answered: int = 0
+    failed: int = 0
+    median_ms: float | None = None
+    p99_ms: float | None = None
+    rate: float = 0.0
+    by_machine: tuple[tuple[str, int], ...] = ()
+
+    def line(self) -> Text:
+        """Return the counts as one line."""
+        median, p99 = ("-" if each is None else f"{each:.1f} ms" for each in (self.median_ms, self.p99_ms))
+        failed = Text(f"{self.failed} failed", style="bold red" if self.failed else "green")
+        won = ", ".join(f"{machine} {count}" for machine, count in self.by_machine)
+        rest = (
+            f" of {self.requests} requests   {self.rate:.0f}/s   latency {median}, p99 {p99}   first were: {won or '-'}"
+        )
+        return Text.assemble(failed, rest)
+
+
+class Display(StepDisplay):
+    """Display of steps, machines, events and counts."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console, is_kept=True, plain_every_s=_PLAIN_EVERY_S)
+        self._events: deque[Entry] = deque(maxlen=_EVENTS)
+
+    def happened(self, entries: Sequence[Entry]) -> None:
+        """Add new events of the journal."""
+        self._events.extend(entries)
+        if self._live is None:
+            for each in entries:
+                self._console.print(Text("         ") + event_line(each), soft_wrap=True)
+
+    def show(self, machines: Sequence[Record], counts: Counts) -> None:
+        """Show the present state; plain lines appear every few seconds."""
+        there = ", ".join(f"{each.name} {each.spec.offer.region} {stage(each)}" for each in machines)
+        self._show(self._page(machines, counts), counts.line() + Text(f"   machines: {there}"))
+
+    def _page(self, machines: Sequence[Record], counts: Counts) -> RenderableType:
+        now_s = time.time()
+        rows = [machine_fields(each, now_s) for each in machines]
+        events = [event_line(each) for each in self._events]
+        return Group("", machines_table(rows, now_s), "", counts.line(), "", *events)
+
 
 _LOOK_S: Final = 0.2
 _BOOT_S: Final = 90.0
@@ -48,9 +106,8 @@ class Pace:
 class Outcome:
     """Result of the scenario.
 
-    Args:
-        steps_s: seconds from the notice, or the kill, until its detection, and until a replacement served.
-        complaints: lines of the robot's node about failed requests.
+    ``steps_s``: seconds from the notice, or the kill, until its detection, and until a replacement served.
+    ``complaints``: lines of the robot's node about failed requests.
     """
 
     counts: Counts

@@ -21,8 +21,6 @@ from gdp.errors import LocalError
 from internet.host import Host
 from lab.process import LabProcess
 
-__all__ = ["HIDDEN", "FreshMachine", "Shell", "TypedCommand", "typed_commands"]
-
 HIDDEN: Final = ("/var/lib", "/run", "/dev/shm")
 _HOME: Final = "/run/root"
 _ROOT: Final = Path(__file__).resolve().parents[2]
@@ -96,11 +94,7 @@ class Shell(LabProcess):
 class FreshMachine:
     """A machine with empty folders; a context manager that ends its commands.
 
-    Args:
-        host: of a laboratory.
-
-    Raises:
-        LocalError: the kernel refuses the mounts.
+    ``host``: of a laboratory. Raises ``LocalError``: the kernel refuses the mounts.
     """
 
     def __init__(self, host: Host, folder: Path) -> None:

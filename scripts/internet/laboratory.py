@@ -13,13 +13,10 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from internet.access import Access
+from internet.access import Access, core_rules
 from internet.host import ETHERNET, Host
-from internet.rules import core_rules
 from internet.site import Site
 from internet.space import Space
-
-__all__ = ["Laboratory"]
 
 _PUBLIC: Final = (IPv4Network("198.51.100.0/24"), IPv4Network("203.0.113.0/24"), IPv4Network("192.0.2.0/24"))
 _PUBLIC6: Final = IPv6Network("2001:db8::/32")
@@ -30,8 +27,7 @@ _FIRST_INDEX: Final = 1_000  # ends of a pair differ in index; see ``lab.namespa
 class Laboratory:
     """The core and what is attached to it; a context manager that ends the processes of delay lines.
 
-    Raises:
-        LocalError: the kernel refuses; the run's record names what was made before.
+    Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, run: Run) -> None:
@@ -53,15 +49,13 @@ class Laboratory:
         for site in self.sites.values():
             site.close()
 
-    def add_site(self, label: str, access: Access, *, hairpin: bool = False, has_line: bool = False) -> Site:
+    def add_site(self, label: str, access: Access, *, has_line: bool = False) -> Site:
         """Attach a site.
 
-        Args:
-            label: at most 10 letters, unique among sites and hosts.
-            hairpin: whether its NAT forwards between its own hosts by their public endpoints.
-            has_line: whether packets can be delayed, which costs a process.
+        ``label``: at most 10 letters, unique among sites and hosts. ``has_line``: whether packets can be delayed, which
+        costs a process.
         """
-        site = self.sites[label] = Site(self, label, access, hairpin=hairpin, has_line=has_line)
+        site = self.sites[label] = Site(self, label, access, has_line=has_line)
         return site
 
     def add_host(self, label: str, site: Site, device: str = ETHERNET) -> Host:
@@ -101,6 +95,6 @@ class Laboratory:
             for device in host.devices_at(site):
                 (host.plug if is_up else host.unplug)(device)
 
-    def apply_faults(self) -> None:
-        """Apply the faults that the sites' uplinks have now."""
-        self.core.nft(core_rules({site.uplink: site.fault for site in self.sites.values()}))
+    def apply_cuts(self) -> None:
+        """Cut the uplinks of the sites that are to be cut, and no other."""
+        self.core.nft(core_rules(site.uplink for site in self.sites.values() if site.is_cut))

@@ -25,8 +25,6 @@ from gdp.host.run_registry import Run
 from internet.space import Space
 from lab.process import FailedError, LabProcess
 
-__all__ = ["LineProcess", "main"]
-
 log = logging.getLogger(__name__)
 
 _ALL: Final = 3  # ETH_P_ALL
@@ -41,8 +39,7 @@ _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
 class LineProcess(LabProcess):
     """A running delay line between two devices of a namespace; it starts without delay.
 
-    Raises:
-        FailedError: it does not start.
+    Raises ``FailedError``: it does not start.
     """
 
     def __init__(self, run: Run, space: Space, one: str, other: str) -> None:

@@ -22,8 +22,6 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 
-__all__ = ["Outcome", "Pair", "batches", "measure"]
-
 _LOOK_S: Final = 0.25
 _GROUP: Final = 3
 _CALL_S: Final = 5.0
@@ -58,11 +56,8 @@ class Outcome(NamedTuple):
 def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float = 60.0) -> dict[Pair, Outcome]:
     """Return the outcome of each ordered pair of these kinds.
 
-    Args:
-        timeout_s: longest wait for calls and for the direct tunnels that are possible, once every node is attached.
-
-    Raises:
-        LocalError: a switch does not start, for example because there is no WireGuard.
+    ``timeout_s``: longest wait for calls and for the direct tunnels that are possible, once every node is attached.
+    Raises ``LocalError``: a switch does not start, for example because there is no WireGuard.
     """
     chosen = list(kinds)
     pairs = list(product(chosen, chosen))

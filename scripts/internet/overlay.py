@@ -25,10 +25,8 @@ from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from internet.host import Host
 from internet.laboratory import Laboratory
+from lab.credentials import grant
 from lab.process import LabProcess, end_processes
-from lab.rights import grant
-
-__all__ = ["LISTEN", "Overlay"]
 
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0
@@ -42,11 +40,7 @@ Yaml = Mapping[str, object]
 
 
 class Overlay:
-    """Processes of a domain; a context manager that ends them.
-
-    Attributes:
-        folder: of all keys and configuration files.
-    """
+    """Processes of a domain; a context manager that ends them. ``folder``: of all keys and configuration files."""
 
     def __init__(self, laboratory: Laboratory) -> None:
         self.folder = laboratory.run.directory
@@ -116,8 +110,7 @@ class Overlay:
     def start(self, *hosts: Host) -> None:
         """Start the switches and relays of these hosts; return when all are ready.
 
-        Raises:
-            FailedError: one does not start.
+        Raises ``FailedError``: one does not start.
         """
         self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
         relays = {f"{host.label}-{_RELAY}": host for host in hosts}

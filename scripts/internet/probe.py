@@ -1,4 +1,4 @@
-"""UDP probes of a laboratory: which endpoint a host has in the eyes of another, and which pairs can open a direct path.
+"""UDP probes of a laboratory: which endpoint a host has in the eyes of another.
 
 I/O. All sockets belong to this process, each in the namespace of its host, so no datagram of a signalling channel
 crosses the laboratory. Source: RFC 4787 and RFC 5128, section 3.
@@ -10,20 +10,14 @@ import secrets
 import select
 import socket
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
 from typing import Final
 
 from gdp.control.endpoints import Endpoint
 from gdp.ports.sockets import large_buffers
 from internet.host import Host
 
-__all__ = ["SILENCE_S", "UdpProbe", "observe", "open_paths"]
-
 _PATIENCE_S: Final = 5.0
 SILENCE_S: Final = 0.3  # after which a datagram that is expected to be lost counts as lost
-_QUIET_S: Final = 1.0  # ... and one that may come or not
-_ROUNDS: Final = 3
 _TOKEN_BYTES: Final = 8
 _DATAGRAM_BYTES: Final = 2_048
 
@@ -98,91 +92,8 @@ def observe(
 ) -> Endpoint | None:
     """Send a datagram and return the source that the receiver sees; None: it does not arrive in time.
 
-    Args:
-        to: destination; by default the receiver's own address.
+    ``to``: destination; by default the receiver's own address.
     """
     token = secrets.token_bytes(_TOKEN_BYTES)
     sender.send(to or receiver.local, token)
     return receiver.wait(token, timeout_s)
-
-
-class _Attempt:
-    """Two sockets, one on each host of a pair, that try to reach each other."""
-
-    def __init__(self, pair: int, version: int, probes: tuple[UdpProbe, UdpProbe]) -> None:
-        self.pair, self.version, self.probes = pair, version, probes
-        self.tokens = tuple(secrets.token_bytes(_TOKEN_BYTES) for _ in probes)
-        self.observed: list[Endpoint | None] = [None, None]
-
-    @property
-    def is_observed(self) -> bool:
-        """Whether a third host sees both sockets."""
-        return None not in self.observed
-
-    def send(self, number: int) -> None:
-        """Send from both ends to where the other one was seen: by itself, else by the third host."""
-        for own, other in ((0, 1), (1, 0)):
-            seen = [
-                source for content, source in self.probes[own].sources.items() if content[:-1] == self.tokens[other]
-            ]
-            for to in (self.observed[other], *seen[-1:]):
-                if to is not None:
-                    self.probes[own].send(to, self.tokens[own] + bytes([number]))
-
-    def has_arrived(self, number: int) -> bool:
-        """Return whether both ends received a datagram of this round."""
-        return all(self.tokens[1 - own] + bytes([number]) in probe.sources for own, probe in enumerate(self.probes))
-
-
-def open_paths(pairs: Sequence[tuple[Host, Host]], border: Host) -> list[bool]:
-    """Return for each pair whether its hosts reach each other by UDP without the border, in both directions.
-
-    Both ends learn from the border where it sees the other, and send there at once.
-    """
-    with ExitStack() as stack:
-        reflectors = {version: stack.enter_context(UdpProbe(border, version)) for version in (4, 6)}
-        attempts = [
-            _Attempt(
-                pair, version, (stack.enter_context(UdpProbe(a, version)), stack.enter_context(UdpProbe(b, version)))
-            )
-            for pair, (a, b) in enumerate(pairs)
-            for version in (4, 6)
-            if all(host.lease().has(version) for host in (a, b))
-        ]
-        _observe_all(attempts, reflectors)
-        attempts = [each for each in attempts if each.is_observed]
-        for number in range(_ROUNDS):
-            for attempt in attempts:
-                attempt.send(number)
-            _fence(attempts, reflectors, number)
-        direct = {each.pair for each in attempts if each.has_arrived(_ROUNDS - 1)}
-    return [pair in direct for pair in range(len(pairs))]
-
-
-def _observe_all(attempts: Sequence[_Attempt], reflectors: dict[int, UdpProbe]) -> None:
-    for attempt in attempts:
-        for probe, token in zip(attempt.probes, attempt.tokens, strict=True):
-            probe.send(reflectors[attempt.version].local, token)
-    while ready := select.select(list(reflectors.values()), (), (), _QUIET_S)[0]:
-        for reflector in ready:
-            reflector.receive()
-    for attempt in attempts:
-        attempt.observed = [reflectors[attempt.version].sources.get(token) for token in attempt.tokens]
-
-
-def _fence(attempts: Sequence[_Attempt], reflectors: dict[int, UdpProbe], number: int) -> None:
-    """Return when each socket has received what was sent to it before: the reflector's datagram comes after that."""
-    fence = b"fence %d" % number
-    waiting = []
-    for attempt in attempts:
-        for probe, to in zip(attempt.probes, attempt.observed, strict=True):
-            if to is not None:
-                reflectors[attempt.version].send(to, fence)
-                waiting.append(probe)
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while waiting := [probe for probe in waiting if fence not in probe.sources]:
-        ready = select.select(waiting, (), (), max(deadline_s - time.monotonic(), 0.0))[0]
-        if not ready:
-            raise TimeoutError("a mapping towards the border was lost")
-        for probe in ready:
-            probe.receive()

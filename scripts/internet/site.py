@@ -20,15 +20,12 @@ from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError
-from internet.access import TRAITS, Access
+from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
 from internet.line import LineProcess
-from internet.rules import FLUSH_MAPPINGS, LAN, WAN, Fault, router_rules
 from internet.space import Space
 
 if TYPE_CHECKING:
     from internet.laboratory import Laboratory
-
-__all__ = ["Lease", "Site"]
 
 _CORE_END, _ROUTER_END = "169.254.0.1", "169.254.0.2"  # RFC 3927, on every link towards the core
 _CORE_END6, _ROUTER_END6 = "fe80::1", "fe80::2"
@@ -37,7 +34,6 @@ _HOME: Final = IPv4Network("192.168.1.0/24")
 _CARRIER: Final = IPv4Network("100.64.0.0/24")  # RFC 6598
 _MAC: Final = b"\x02gdp"  # fixed, because a bridge otherwise takes the address of one of its ports
 _FIRST_HOST: Final = 10
-_MAPPING_TIMEOUTS: Final = ("nf_conntrack_udp_timeout", "nf_conntrack_udp_timeout_stream")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +53,14 @@ class Lease:
 class Site:
     """Access of some hosts to the core; ``Laboratory.add_site`` makes it.
 
-    Attributes:
-        access: its kind.
-        routers: from its hosts outwards.
+    ``access``: its kind. ``routers``: from its hosts outwards.
     """
 
-    def __init__(self, laboratory: Laboratory, label: str, access: Access, *, hairpin: bool, has_line: bool) -> None:
-        self.label, self.access, self._hairpin = label, access, hairpin
+    def __init__(self, laboratory: Laboratory, label: str, access: Access, *, has_line: bool) -> None:
+        self.label, self.access = label, access
         self._laboratory = laboratory
         self._core = laboratory.core
-        self.fault = Fault()
+        self.is_cut = False
         self.uplink = laboratory.next_device()  # the core's device
         self._leases = 0
         self._line: LineProcess | None = None
@@ -143,22 +137,15 @@ class Site:
             self._outer.flush_connections()  # packets that came in between have a mapping to an inner address
         self._laboratory.renew_leases(self)
 
-    def cut(self, *, is_silent: bool = True) -> None:
-        """Cut the uplink.
-
-        Args:
-            is_silent: packets vanish; otherwise the router's device goes down, and the router answers that the
-                network is unreachable.
-        """
-        if is_silent:
-            self._set_fault(replace(self.fault, is_cut=True))
-        else:
-            self._outer.ip([f"link set {WAN} down"])
+    def cut(self) -> None:
+        """Let all packets of the uplink vanish."""
+        self.is_cut = True
+        self._laboratory.apply_cuts()
 
     def restore(self) -> None:
-        """End a cut of either kind."""
-        self._set_fault(replace(self.fault, is_cut=False))
-        self._configure()
+        """End a cut."""
+        self.is_cut = False
+        self._laboratory.apply_cuts()
 
     def flush_mappings(self) -> None:
         """Let the NATs of the site forget their mappings; those that new datagrams make may have the same ports."""
@@ -166,11 +153,6 @@ class Site:
             router.flush_connections()
             if self.access is not Access.PUBLIC:
                 router.nft(FLUSH_MAPPINGS)
-
-    def set_mapping_timeout(self, seconds: int) -> None:
-        """Let UDP mappings end after so many seconds without a datagram."""
-        for router in self.routers:
-            router.set({f"netfilter/{name}": seconds for name in _MAPPING_TIMEOUTS})
 
     def power_off(self) -> None:
         """Switch the routers off: all their links lose the carrier, and they forget their mappings."""
@@ -184,20 +166,10 @@ class Site:
         self._configure()
         self._laboratory.set_ports(self, is_up=True)
 
-    def set_loss(self, share: float) -> None:
-        """Lose this share of the packets, 0 to 1, in each direction."""
-        self._set_fault(replace(self.fault, loss=share))
-
-    def set_rate(self, mbit: float) -> None:
-        """Limit the uplink in each direction, in Mbit/s; 0: unlimited."""
-        self._outer.shape(WAN, mbit)
-        self._core.shape(self.uplink, mbit)
-
     def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
         """Delay packets by ``ms``, and up to ``jitter_ms`` more, in each direction; their order stays.
 
-        Raises:
-            LocalError: the site was made without a delay line.
+        Raises ``LocalError``: the site was made without a delay line.
         """
         if self._line is None:
             raise LocalError(f"site {self.label} has no delay line")
@@ -256,7 +228,7 @@ class Site:
         self._outer.wait_for_carrier(WAN)
         self._configure_lan()
         for router, address in zip(self.routers, self._wan_addresses, strict=True):
-            if rules := router_rules(self.access, address, hairpin=self._hairpin):
+            if rules := router_rules(self.access, address):
                 router.nft(rules)
 
     @property
@@ -275,8 +247,3 @@ class Site:
                 f"addr replace {self._prefix[1]}/64 dev {LAN} nodad",
             ]
         self.routers[0].ip(lines)
-
-    def _set_fault(self, fault: Fault) -> None:
-        if fault != self.fault:
-            self.fault = fault
-            self._laboratory.apply_faults()

@@ -1,7 +1,4 @@
-"""Network namespace of a laboratory: commands of ip(8), nft(8) and conntrack(8) inside it.
-
-I/O; needs CAP_NET_ADMIN.
-"""
+"""Network namespace of a laboratory: commands of ip(8), nft(8) and conntrack(8) inside it. I/O; needs CAP_NET_ADMIN."""
 
 from __future__ import annotations
 
@@ -13,11 +10,9 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from lab.namespace import Namespace, wait_for_carrier
+from lab.namespaces import Namespace, wait_for_carrier
 
-__all__ = ["TOOLS", "Space"]
-
-TOOLS: Final = ("ip", "nft", "conntrack", "tc")
+TOOLS: Final = ("ip", "nft", "conntrack")
 
 _NET: Final = Path("/proc/sys/net")
 _SETTINGS: Final = {  # no address waits for duplicate detection, and none is lost with the carrier
@@ -36,12 +31,8 @@ _NO_BRIDGE_RULES: Final = {"bridge/bridge-nf-call-iptables": 0, "bridge/bridge-n
 class Space(Namespace):
     """A namespace of a run, whose loopback is up.
 
-    Args:
-        label: part of its name; unique in the run.
-        forwards: whether it is a router.
-
-    Raises:
-        LocalError: the kernel refuses.
+    ``label``: part of its name; unique in the run. ``forwards``: whether it is a router. Raises ``LocalError``: the
+    kernel refuses.
     """
 
     def __init__(self, run: Run, label: str, *, forwards: bool = False) -> None:
@@ -66,14 +57,6 @@ class Space(Namespace):
     def flush_connections(self) -> None:
         """Forget the connections that the namespace tracks, and with them their NAT mappings."""
         self._run(["conntrack", "-F"])
-
-    def shape(self, device: str, mbit: float) -> None:
-        """Limit what leaves by a device, in Mbit/s; 0: unlimited."""
-        if mbit:
-            limit = f"rate {mbit}mbit burst 64k latency 50ms"
-            self._run(["tc", "qdisc", "replace", "dev", device, "root", "tbf", *limit.split()])
-        elif "tbf" in self._run(["tc", "qdisc", "show", "dev", device]):
-            self._run(["tc", "qdisc", "del", "dev", device, "root"])
 
     def set(self, settings: dict[str, int]) -> None:
         """Set values below ``/proc/sys/net``."""

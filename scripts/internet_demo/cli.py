@@ -26,12 +26,9 @@ from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import RunRegistry, outer_uid
 from internet.laboratory import Laboratory
 from internet.space import TOOLS
-from internet_demo.display import Display
 from internet_demo.figure1 import run_figure1
-from internet_demo.scenario import Outcome, Pace, run_scenario
+from internet_demo.scenario import Display, Outcome, Pace, run_scenario
 from lab.command import FAILED, PASSED, console_of, exit_with, new_app
-
-__all__ = ["app", "main"]
 
 _PACE: Final = Pace()
 

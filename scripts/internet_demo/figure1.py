@@ -23,13 +23,10 @@ from gdp.state.control_protocol import Command
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
-from internet_demo.display import Display
-from internet_demo.scenario import Event, Outcome, Pace
+from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph
-
-__all__ = ["run_figure1"]
 
 _PATIENCE_S: Final = 60.0
 _DOMAIN: Final = 42
@@ -107,8 +104,7 @@ class _Node:
 def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
     """Play the figure, with ``pace.calm_s`` seconds of traffic before the flight and after it.
 
-    Raises:
-        LocalError: ROS is missing, a machine does not join, or a program does not start.
+    Raises ``LocalError``: ROS is missing, a machine does not join, or a program does not start.
     """
     rospy_folder()  # raises
     outcome = Outcome()

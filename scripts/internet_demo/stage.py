@@ -37,10 +37,8 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
+from lab.credentials import grant
 from lab.process import LabProcess, end_processes, python_environment, until
-from lab.rights import grant
-
-__all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
 
 WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"
@@ -53,11 +51,7 @@ _StageT = TypeVar("_StageT", bound="Stage")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """A machine of the domain.
-
-    Args:
-        directory: of its keys and configuration.
-    """
+    """A machine of the domain. ``directory``: of its keys and configuration."""
 
     label: str
     host: Host

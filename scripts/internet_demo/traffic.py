@@ -15,8 +15,6 @@ from typing import Final
 
 import gdp
 
-__all__ = ["CAMERA", "PLAN", "Calls", "Camera", "Reader", "Traffic"]
-
 CAMERA: Final = "/camera/image"
 PLAN: Final = "/plan"
 _NUMBER_BYTES: Final = 8
@@ -91,10 +89,7 @@ class Camera:
 class Traffic:
     """All traffic; a context manager that closes what it opened.
 
-    Args:
-        robot: publishes and calls.
-        server: serves the calls, and reads.
-        readers: sessions that read, by label.
+    ``robot``: publishes and calls. ``server``: serves the calls, and reads. ``readers``: sessions that read, by label.
     """
 
     def __init__(

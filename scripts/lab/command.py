@@ -18,8 +18,6 @@ from rich.text import Text
 from gdp.errors import GdpError
 from lab.process import FailedError
 
-__all__ = ["FAILED", "PASSED", "StepDisplay", "console_of", "exit_with", "new_app"]
-
 PASSED: Final = 0
 FAILED: Final = 1
 _WRONG_INPUT: Final = 2
@@ -56,9 +54,8 @@ def exit_with(work: Callable[[], int]) -> None:
 class StepDisplay:
     """Display of steps and of the present state; a context manager.
 
-    Args:
-        is_kept: whether the last state stays in the terminal.
-        plain_every_s: time between two plain lines where there is no terminal.
+    ``is_kept``: whether the last state stays in the terminal. ``plain_every_s``: time between two plain lines where
+    there is no terminal.
     """
 
     def __init__(self, console: Console, *, is_kept: bool, plain_every_s: float) -> None:

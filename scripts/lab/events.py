@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 from gdp.errors import LocalError
 
-__all__ = ["Event"]
-
 
 @dataclass(frozen=True, slots=True)
 class Event:
@@ -22,11 +20,7 @@ class Event:
 
     @classmethod
     def from_line(cls, line: str) -> Event:
-        """Read a line.
-
-        Raises:
-            LocalError: it is not a JSON object.
-        """
+        """Read a line. Raises ``LocalError``: it is not a JSON object."""
         try:
             fields: object = json.loads(line)
         except ValueError as error:

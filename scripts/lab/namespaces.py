@@ -7,20 +7,60 @@ neighbour that it leads to. Its MAC encodes both switches (``02:67:64:70:AA:BB``
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final
+from typing import Final, TypeVar
 
 from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
-from gdp.host.run_registry import Run
-from lab.namespace import Namespace
+from gdp.host.run_registry import Run, in_first_user_namespace
+from gdp.ports.rtnetlink import LinkMonitor
 from lab.topology import Link, Topology
 
-__all__ = ["Namespaces"]
+_PATIENCE_S: Final = 10.0
+
+T = TypeVar("T")
+
+
+class Namespace:
+    """A network namespace.
+
+    ``label``: part of its name; unique in the run. ``path``: the file that holds it. Raises ``LocalError``: the kernel
+    refuses.
+    """
+
+    def __init__(self, run: Run, label: str) -> None:
+        folder = netns_files.IP_NETNS_DIRECTORY if in_first_user_namespace() else run.directory / "netns"
+        self.path = folder / f"gdp-{run.id}-{label}"
+        run.plan_namespace(self.path)
+        netns_files.create(self.path)
+
+    def inside(self, work: Callable[[], T]) -> T:
+        """Call ``work`` in a thread inside, and return its result; a socket made there stays there."""
+        return netns_files.inside(self.path, work)
+
+    def command(self, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
+        """Return the command line that runs ``argv`` inside, under the same process id.
+
+        ``dies_with_us``: whether the kernel kills it when the thread that starts it ends in any way.
+        """
+        leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
+        return ["nsenter", f"--net={self.path}", "--", *leash, *argv]
+
+
+def wait_for_carrier(*devices: str) -> None:
+    """Return when these devices of the thread's namespace can send. Raises ``LocalError``: they do not get so far."""
+    with contextlib.closing(LinkMonitor()) as monitor:
+        while not all(link is not None and link.up for link in map(monitor.get, devices)):
+            if not select.select([monitor], [], [], _PATIENCE_S)[0]:
+                raise LocalError(f"no carrier at {', '.join(devices)}")
+            monitor.poll()
+
 
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
 _LOOPBACK: Final = 1  # the index of lo in every namespace
@@ -31,8 +71,7 @@ _PLUG_FROM: Final = 10_000
 class Namespaces:
     """The namespaces of one run. ``run.end()`` removes exactly these, and with them every device inside.
 
-    Raises:
-        LocalError: the kernel refuses; the run's record names what was made before.
+    Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, topology: Topology, run: Run) -> None:

@@ -20,8 +20,6 @@ from gdp.sansio import BROADCAST, OutgoingFrames, ProtocolCore, ReceivedFrame, T
 from gdp.switch.forwarder import Drop, Forward, decide, rewrite
 from gdp.switch.table import Table
 
-__all__ = ["SimLink", "SimNetwork", "Tap"]
-
 _STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
 _SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
@@ -97,12 +95,8 @@ class _Node:
 class SimNetwork:
     """Nodes, links, and the events between them.
 
-    Args:
-        seed: of all random choices.
-
-    Attributes:
-        taps: called for each frame that enters a link, with (second, from node, to node, frame with Ethernet header).
-        drops: frames that the simulated data planes dropped, by reason.
+    ``seed``: of all random choices. ``taps``: called for each frame that enters a link, with (second, from node, to
+    node, frame with Ethernet header). ``drops``: frames that the simulated data planes dropped, by reason.
     """
 
     def __init__(self, seed: int = 1) -> None:

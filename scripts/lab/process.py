@@ -22,8 +22,6 @@ from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 from gdp.ports.readiness import readable
 
-__all__ = ["FailedError", "LabProcess", "end_processes", "figures_of", "floats_of", "python_environment", "until"]
-
 _SCRIPTS: Final = Path(__file__).resolve().parents[1]
 _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0
@@ -133,8 +131,7 @@ class LabProcess:
     def read(self, patience_s: float) -> dict[str, object]:
         """Return the next line that it prints, a JSON object.
 
-        Raises:
-            FailedError: it ended, or printed nothing in time, or a reason why it refuses, or something else.
+        Raises ``FailedError``: it ended, or printed nothing in time, or a reason why it refuses, or something else.
         """
         said = json.loads(self.read_line(patience_s))
         if not isinstance(said, dict):
@@ -205,12 +202,8 @@ def until(
 ) -> T:
     """Return what a function finds once that is true; nothing here is notified of it.
 
-    Args:
-        what: says what is missing.
-        meanwhile: is called between two looks, and waits a moment; None: a pause.
-
-    Raises:
-        FailedError: not in time.
+    ``what``: says what is missing. ``meanwhile``: is called between two looks, and waits a moment; None: a pause.
+    Raises ``FailedError``: not in time.
     """
     end_s = time.monotonic() + patience_s
     while not (value := found()):
@@ -229,11 +222,7 @@ def figures_of(said: Mapping[str, object]) -> dict[str, float]:
 
 
 def floats_of(said: Mapping[str, object], key: str) -> list[float]:
-    """Return a list of figures of a report.
-
-    Raises:
-        FailedError: it has none.
-    """
+    """Return a list of figures of a report. Raises ``FailedError``: it has none."""
     values = said.get(key)
     if not isinstance(values, list):
         raise FailedError(f"a list {key!r} was expected, not {said}")

@@ -34,8 +34,6 @@ from gdp.trust.right import Right
 from lab.network import EPOCH_UNIX_S, SimLink, SimNetwork
 from lab.topology import Attachment, Topology
 
-__all__ = ["Simulation"]
-
 _YEAR_S = 365 * 86_400
 _ORDER: Final = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551  # of P-256
 

@@ -5,15 +5,13 @@ Sans-I/O. ``namespaces.py`` makes kernel namespaces of it; ``simulation.py`` mak
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
 
 from gdp.errors import LocalError
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
-
-__all__ = ["Attachment", "DomainPlan", "Link", "Topology", "chain", "ring5"]
 
 Role = Literal["rib", "proxy"]
 
@@ -70,9 +68,8 @@ class DomainPlan:
 class Topology:
     """Switches, links, domains and attached nodes, validated on construction.
 
-    Raises:
-        LocalError: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU or
-            device name out of bounds. Methods raise it for switches that are unknown or not joined.
+    Raises ``LocalError``: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU
+    or device name out of bounds. Methods raise it for switches that are unknown or not joined.
     """
 
     links: tuple[Link, ...]
@@ -170,8 +167,7 @@ def ring5(mtu: int = MTU_BYTES) -> Topology:
 def chain(length: int, mtu: int = MTU_BYTES) -> Topology:
     """Return ``length`` switches ``s1 .. sN`` in a row in one domain: its RIB in the middle, a proxy at either end.
 
-    Raises:
-        LocalError: no switch at all.
+    Raises ``LocalError``: no switch at all.
     """
     _require(length >= 1, "a chain has at least one switch")
     nodes = tuple(f"s{number}" for number in range(1, length + 1))
@@ -183,4 +179,77 @@ def chain(length: int, mtu: int = MTU_BYTES) -> Topology:
             Attachment(nodes[0], "proxy", "left"),
             Attachment(nodes[-1], "proxy", "right"),
         ),
+    )
+
+
+LEFT: Final = "a"
+MIDDLE: Final = ("s1", "s2", "s3")
+RIGHT: Final = "b"
+ROW: Final = (LEFT, *MIDDLE, RIGHT)
+_DOMAIN: Final = "lab"
+
+
+def ends_of(link: str) -> tuple[str, str]:
+    """Return the two ends of a link ``a-b``."""
+    a, _, b = link.partition("-")
+    return a, b
+
+
+def make_topology(
+    domains: Mapping[str, Iterable[str]],
+    uppers: Mapping[str, str],
+    links: Iterable[str | Link],
+    ribs: Iterable[str],
+    members: Mapping[str, str],
+) -> tuple[Topology, tuple[str, ...]]:
+    """Return a topology, and its members.
+
+    Args:
+        domains: switches by label.
+        uppers: the domain of the tier above, by label.
+        links: between switches, ``a-b`` at the usual cost.
+        ribs: switches with a RIB, in the order of the topology's attachments.
+        members: home switch by member, joined by a link; a member is of its home's domain.
+
+    Raises:
+        LocalError: they do not fit together.
+    """
+    of = {switch: label for label, switches in domains.items() for switch in switches}
+    plans = tuple(
+        DomainPlan(label, (*switches, *(m for m, home in members.items() if of[home] == label)), uppers.get(label))
+        for label, switches in domains.items()
+    )
+    made = [Link(*ends_of(each)) if isinstance(each, str) else each for each in links]
+    leads = [Link(member, home) for member, home in members.items()]
+    return Topology((*made, *leads), plans, _attachments(ribs, members)), tuple(members)
+
+
+def flat_topology(
+    links: Iterable[tuple[str, str]], *, mtu: int, rib: str, members: Sequence[str], switches: Sequence[str] = ()
+) -> Topology:
+    """Return the topology of one trust domain; ``rib`` is the switch with the RIB.
+
+    ``mtu``: bytes after the Ethernet header, of every link. ``switches``: nodes that come first in the topology's
+    order. Raises ``LocalError``: they do not fit together.
+    """
+    pairs = list(links)
+    nodes = tuple(dict.fromkeys((*switches, *(end for pair in pairs for end in pair))))
+    made = tuple(Link(a, b, mtu=mtu) for a, b in pairs)
+    return Topology(made, (DomainPlan(_DOMAIN, nodes),), _attachments([rib], members))
+
+
+def row(mtu: int) -> Topology:
+    """Return A - s1 - s2 - s3 - B with the RIB at s2. Raises ``LocalError``: the MTU is out of bounds."""
+    return flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
+
+
+def single(node: str) -> Topology:
+    """Return the topology of one machine without links."""
+    return Topology((), (DomainPlan(_DOMAIN, (node,)),), ())
+
+
+def _attachments(ribs: Iterable[str], members: Iterable[str]) -> tuple[Attachment, ...]:
+    return (
+        *(Attachment(switch, "rib", "rib") for switch in ribs),
+        *(Attachment(member, "proxy", "end") for member in members),
     )

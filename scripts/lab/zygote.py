@@ -36,8 +36,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["Popen", "Zygote", "install", "run_command"]
-
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PRELOADED: Final = (
     "gdp.cli.switch",

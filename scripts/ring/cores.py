@@ -13,8 +13,6 @@ from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import Run
 from lab.topology import Topology
 
-__all__ = ["CORES_HELP", "EDGE_CORES", "ROBOT_CORES", "MachineCores", "cores_of"]
-
 ROBOT_CORES: Final = 2
 EDGE_CORES: Final = 4
 CORES_HELP: Final = "Two cores' worth for the robot, four for each edge server, by cgroups."
@@ -29,11 +27,7 @@ def cores_of(topology: Topology) -> dict[str, int]:
 class MachineCores:
     """Control groups of the machines of one run.
 
-    Args:
-        cores: by machine.
-
-    Raises:
-        LocalError: this system permits no such groups; none is left.
+    ``cores``: by machine. Raises ``LocalError``: this system permits no such groups; none is left.
     """
 
     def __init__(self, run: Run, cores: dict[str, int]) -> None:

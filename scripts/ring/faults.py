@@ -14,8 +14,6 @@ from typing import Final, Literal, TypeAlias, cast, get_args
 from gdp.errors import LocalError
 from lab.topology import Attachment, Topology
 
-__all__ = ["Cut", "Fault", "Kill", "KillRole", "Roam", "check_faults", "roamers"]
-
 KillRole = Literal["rib", "switch"]
 
 _SECONDS: Final = r"\d+(?:\.\d+)?"
@@ -38,8 +36,7 @@ class Cut:
     def from_text(cls, text: str) -> Cut:
         """Parse ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
 
-        Raises:
-            LocalError: anything else, or a link that comes up before it goes down.
+        Raises ``LocalError``: anything else, or a link that comes up before it goes down.
         """
         found = _CUT.match(text)
         if found is None:
@@ -61,8 +58,7 @@ class Cut:
 class Kill:
     """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, restarted.
 
-    Args:
-        of: a switch; for a RIB its domain, or the switch to which it is attached.
+    ``of``: a switch; for a RIB its domain, or the switch to which it is attached.
     """
 
     role: KillRole
@@ -74,8 +70,7 @@ class Kill:
     def from_text(cls, text: str) -> Kill:
         """Parse ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
 
-        Raises:
-            LocalError: anything else, or a process that restarts before it is killed.
+        Raises ``LocalError``: anything else, or a process that restarts before it is killed.
         """
         found = _KILL.match(text)
         if found is None:
@@ -116,11 +111,7 @@ class Roam:
 
     @classmethod
     def from_text(cls, text: str) -> Roam:
-        """Parse ``robot:nuc3@10``.
-
-        Raises:
-            LocalError: anything else.
-        """
+        """Parse ``robot:nuc3@10``. Raises ``LocalError``: anything else."""
         found = _ROAM.match(text)
         if found is None:
             raise LocalError(f"roaming is written like robot:nuc3@10 (proxy, new switch, seconds), not {text!r}")

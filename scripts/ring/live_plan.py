@@ -1,44 +1,21 @@
-"""Plan of a live run, as data: the graphs of both sides, the names that cross, and the amount of traffic.
-
-Sans-I/O.
-"""
+"""Plan of a live run, as data: the graphs of both sides, the names that cross, and the amount of traffic. Sans-I/O."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
-from gdp.metadata import Metadata
-from gdp.trust.right import Right
+from lab.credentials import Carried, Yaml
 from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
 from ring.options import Live
-from ring.plan import AUTHOR, Yaml
-
-__all__ = [
-    "CARRIED",
-    "FAST_DDS_PROFILES",
-    "MASTER_PORT",
-    "Carried",
-    "Graph",
-    "Side",
-    "calls_in",
-    "graphs_of",
-    "messages_in",
-]
-
-Side = Literal["expose", "import"]
 
 MASTER_PORT: Final = 11_311
-_RIGHTS: Final[dict[tuple[str, Side], Right]] = {
-    ("topic", "expose"): Right.PUBLISH,
-    ("topic", "import"): Right.READ,
-    ("service", "expose"): Right.SERVE,
-    ("service", "import"): Right.CALL,
-}
+AUTHOR: Final = "ring"
 # A picture arrives as fifteen datagrams at once, which exceeds Linux's default receive buffer.
 FAST_DDS_PROFILES: Final = """\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -62,36 +39,10 @@ FAST_DDS_PROFILES: Final = """\
 _DOMAINS: Final = 100  # above that, a domain's ports are in Linux's ephemeral range
 
 
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """A topic or a service that the proxies carry from the robot to the server."""
-
-    name: str
-    type_name: str
-    kind: Literal["topic", "service"] = "topic"
-
-    @property
-    def metadata(self) -> Metadata:
-        """Return the metadata that its overlay name digests."""
-        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name, "author": AUTHOR})
-
-    def right(self, side: Side) -> Right:
-        """Return the right that the proxy of one side needs."""
-        return _RIGHTS[self.kind, side]
-
-    def rule(self, owner: Path, encoding: Encoding) -> Yaml:
-        """Return its rule in either ``proxy.yaml``; reliability and durability follow from the nodes' QoS."""
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "type": self.type_name,
-            "metadata": {"author": AUTHOR},
-            "owner": str(owner),
-            "encoding": encoding,
-        }
-
-
-CARRIED: Final = (*(Carried(talk.topic, talk.type_name) for talk in TALKS), Carried(LAMP, LAMP_TYPE, "service"))
+def carried_in(encoding: Encoding) -> tuple[Carried, ...]:
+    """Return what the proxies carry; reliability and durability follow from the nodes' QoS."""
+    make = partial(Carried, options={"encoding": encoding}, author=AUTHOR)
+    return (*(make(talk.topic, talk.type_name) for talk in TALKS), make(LAMP, LAMP_TYPE, "service"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,4 @@
-"""Options of a run of the ring.
-
-Sans-I/O.
-"""
+"""Options of a run of the ring. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -16,8 +13,6 @@ from lab.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
 from ring.nodes.content import CAMERA_HZ
-
-__all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
 
 RingPlane = Literal["auto", "kernel", "raw", "scapy"]
 Live = Literal["ros2", "ros1", "mixed"]
@@ -103,11 +98,7 @@ class Options:
         return LIVE_S if self.seconds is None else self.seconds
 
     def topology(self) -> Topology:
-        """Return the ring with the requested MTU.
-
-        Raises:
-            LocalError: no link can have that MTU.
-        """
+        """Return the ring with the requested MTU. Raises ``LocalError``: no link can have that MTU."""
         return ring5(self.mtu)
 
     def settings(self) -> dict[str, object]:

@@ -1,7 +1,4 @@
-"""Progress of a run on standard error: a moving bar in a terminal, plain lines elsewhere.
-
-I/O.
-"""
+"""Progress of a run on standard error: a moving bar in a terminal, plain lines elsewhere. I/O."""
 
 from __future__ import annotations
 
@@ -12,8 +9,6 @@ from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-
-__all__ = ["ProgressReporter", "Traffic"]
 
 _PLAIN_EVERY_S: Final = 2.0
 

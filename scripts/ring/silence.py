@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["REPORTED_FROM_S", "Silence"]
-
 REPORTED_FROM_S: Final = 1.5  # both ends report twice a second
 
 

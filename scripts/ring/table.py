@@ -1,7 +1,4 @@
-"""Table at the end of a run.
-
-I/O layer; it builds rich renderables, and prints nothing.
-"""
+"""Table at the end of a run. I/O layer; it builds rich renderables, and prints nothing."""
 
 from __future__ import annotations
 
@@ -11,8 +8,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from ring.result import Journey, Result, TopicResult
-
-__all__ = ["hops_in_words", "summary", "table"]
 
 _EDGE_SWITCHES: Final = 2
 _TEXTS: Final = ("topic", "type", "identical", "hops")

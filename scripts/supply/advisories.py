@@ -14,8 +14,6 @@ from typing import Any
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
-__all__ = ["AdvisoryError", "is_affected", "read_advisories"]
-
 _FILE_MAX_BYTES = 256 << 20
 _KINDS = ("introduced", "last_affected", "fixed")
 
@@ -27,8 +25,7 @@ class AdvisoryError(Exception):
 def read_advisories(path: Path) -> list[Mapping[str, Any]]:
     """Return the advisories of a file (one, a list, or one a line) or a folder's files, but for withdrawn ones.
 
-    Raises:
-        AdvisoryError: a file cannot be read, or is something else.
+    Raises ``AdvisoryError``: a file cannot be read, or is something else.
     """
     files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
     found = [each for file in files for each in _of_file(file)]

@@ -88,8 +88,7 @@ def check_archives(folder: Path, pins: Sequence[Pin]) -> Iterator[Finding]:
 def check_advisories(installed: Iterable[Distribution], path: Path) -> Iterator[Finding]:
     """Yield each distribution whose version has a vulnerability by an advisory.
 
-    Raises:
-        AdvisoryError: no advisories can be read there.
+    Raises ``AdvisoryError``: no advisories can be read there.
     """
     advisories = read_advisories(path)
     for each in sorted(installed, key=_name):

@@ -28,9 +28,7 @@ class TableError(Exception):
 def dependency_digest(root: Path) -> str:
     """Return SHA-256, in hex, of the dependency tables and of requirements/build.in; blanks and order do not count.
 
-    Raises:
-        OSError: a file cannot be read.
-        TableError: a table of pyproject.toml is missing.
+    Raises ``OSError``: a file cannot be read. Raises ``TableError``: a table of pyproject.toml is missing.
     """
     text = (root / "pyproject.toml").read_text()
     digest = hashlib.sha256()

@@ -12,8 +12,6 @@ from pathlib import Path
 from packaging.markers import Marker
 from packaging.utils import canonicalize_name
 
-__all__ = ["LockError", "Pin", "pins_here", "read_lock"]
-
 _PIN = re.compile(r"(?P<name>[\w.\-]+)(?:\[[\w,.\- ]+\])?==(?P<version>[\w.!+\-]+)(?: *; *(?P<marker>[^\\]+?))?\Z")
 _HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\Z")
 
@@ -26,10 +24,8 @@ class LockError(Exception):
 class Pin:
     """One version of one package.
 
-    Attributes:
-        name: as PEP 503 writes it.
-        marker: condition; empty: everywhere.
-        hashes: SHA-256 of each archive that may be installed, hex.
+    ``name``: as PEP 503 writes it. ``marker``: condition; empty: everywhere. ``hashes``: SHA-256 of each archive that
+    may be installed, hex.
     """
 
     name: str
@@ -45,9 +41,7 @@ class Pin:
 def read_lock(path: Path) -> list[Pin]:
     """Return the pins of a lock, in order.
 
-    Raises:
-        LockError: a line that is neither a pin with hashes nor a comment.
-        OSError: it cannot be read.
+    Raises ``LockError``: a line that is neither a pin with hashes nor a comment. Raises ``OSError``: it cannot be read.
     """
     pins: list[Pin] = []
     joined = ""

@@ -54,8 +54,7 @@ class ReleaseError(Exception):
 def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
     """Make sdist, wheel, SBOM, lock and SHA256SUMS of a commit in a new or empty folder.
 
-    Raises:
-        ReleaseError: the folder holds something, or a tool failed.
+    Raises ``ReleaseError``: the folder holds something, or a tool failed.
     """
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
@@ -82,9 +81,8 @@ def write_sums(folder: Path) -> None:
 def sign(folder: Path, key: Path) -> None:
     """Sign a folder's SHA256SUMS, after checking it.
 
-    Raises:
-        ReleaseError: SHA256SUMS does not match the folder.
-        LocalError: the key cannot be read, or others may read it.
+    Raises ``ReleaseError``: SHA256SUMS does not match the folder. Raises ``LocalError``: the key cannot be read, or
+    others may read it.
     """
     _check_sums(folder)
     private = SigningKey.from_pem(read_private(key)).private
@@ -94,9 +92,8 @@ def sign(folder: Path, key: Path) -> None:
 def verify(folder: Path, key: Path) -> list[str]:
     """Return the names of the signed files, which are all files of the folder.
 
-    Raises:
-        ReleaseError: the signature, a hash or a name does not match, or a file is there that is not listed.
-        LocalError: the key cannot be read.
+    Raises ``ReleaseError``: the signature, a hash or a name does not match, or a file is there that is not listed.
+    Raises ``LocalError``: the key cannot be read.
     """
     public = load_public_key(key)
     try:
@@ -140,8 +137,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def _check_sums(folder: Path) -> list[str]:
     """Return the names of a folder's files, if SHA256SUMS states each of them correctly, and no other.
 
-    Raises:
-        ReleaseError: otherwise.
+    Raises ``ReleaseError``: otherwise.
     """
     stated: dict[str, str] = {}
     for number, line in enumerate(_read(folder / SUMS).decode(errors="replace").splitlines(), 1):

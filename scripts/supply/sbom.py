@@ -42,9 +42,8 @@ _LICENCE_MAX_CHARS = 200  # some packages put the whole text there
 def bill(pins: Sequence[Pin], name: str, version: str, direct: Sequence[str], epoch_s: int | None) -> dict[str, Any]:
     """Return the document.
 
-    Args:
-        direct: names of the direct requirements of the project.
-        epoch_s: creation time, unix seconds; None: not stated.
+    ``direct``: names of the direct requirements of the project. ``epoch_s``: creation time, unix seconds; None: not
+    stated.
     """
     ordered = sorted(pins, key=lambda pin: (pin.name, pin.version, pin.marker))
     found = {pin: _installed(pin) for pin in ordered}
@@ -100,8 +99,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def project(path: Path) -> tuple[str, str, list[str]]:
     """Return name, version and the required names of a pyproject.toml.
 
-    Raises:
-        ValueError: this Python cannot read TOML (it is in 3.11 and later).
+    Raises ``ValueError``: this Python cannot read TOML (it is in 3.11 and later).
     """
     if tomllib is None:
         raise ValueError("Python 3.11 or later is needed to read pyproject.toml")

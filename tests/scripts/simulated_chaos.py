@@ -13,12 +13,10 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from faults.accounts import Books
-from faults.continuity import Continuity
+from faults.accounts import Books, Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
 from faults.schedule import Fault, FaultKind, broken_by
-from topologies import ends_of
 
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
@@ -28,7 +26,7 @@ from gdp.trust.right import Right
 from lab.network import SimLink
 from lab.process import FailedError
 from lab.simulation import Simulation
-from lab.topology import Attachment, DomainPlan, Topology
+from lab.topology import Attachment, DomainPlan, Topology, ends_of
 
 __all__ = ["SIMULATED", "SimulatedChaos"]
 

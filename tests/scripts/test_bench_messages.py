@@ -27,8 +27,8 @@ from peers.jsonl import EndSettings
 from peers.rounds import CPU, MEDIAN, case_of, targets_of
 from peers.systems import cyclone_xml
 from report import Rounds
-from topologies import LEFT, RIGHT, row
 
+from lab.topology import LEFT, RIGHT, row
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.standard_types import standard_definition

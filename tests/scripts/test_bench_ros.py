@@ -15,11 +15,11 @@ from report import Rounds
 from ros_row import Carried
 from ros_stage import DIRECT, Bench, parse
 from skeleton import Options
-from topologies import LEFT, RIGHT
 
 from gdp.metadata import Metadata
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import OWNER_PUBLIC
+from lab.topology import LEFT, RIGHT
 from proxy.config.rule import Rule
 
 
@@ -57,13 +57,13 @@ def test_every_rule_is_one_that_the_proxy_takes_and_means_what_the_owner_delegat
     owner = tmp_path / "owner" / OWNER_PUBLIC
     for bench in benches(options):
         for each in bench.carried:
-            rule = Rule.model_validate(each.rule(owner))
-            assert rule.metadata_of(each.name, each.type_name) == each.metadata
+            rule = Rule.model_validate(each.at_proxies.rule(owner))
+            assert rule.metadata_of(each.name, each.type_name) == each.at_proxies.metadata
 
 
 def test_a_carried_thing_says_its_kind_name_and_type() -> None:
     lamp = Carried("/lamp", "std_srvs/srv/SetBool", "json", source=RIGHT, kind="service")
-    assert lamp.metadata == Metadata({"kind": "service", "name": "/lamp", "type": "std_srvs/srv/SetBool"})
+    assert lamp.at_proxies.metadata == Metadata({"kind": "service", "name": "/lamp", "type": "std_srvs/srv/SetBool"})
 
 
 def test_every_case_is_measured_directly_too(options: Options) -> None:

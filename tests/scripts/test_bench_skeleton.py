@@ -11,11 +11,10 @@ import pytest
 from machine import machine_state
 from report import Rounds, markdown_table, write_json
 from skeleton import Outcome, command_line, finish, parse
-from topologies import ends_of, flat_topology, make_topology, single
 
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError, LabProcess, figures_of, floats_of
-from lab.topology import Link
+from lab.topology import Link, ends_of, flat_topology, make_topology, single
 
 COMMAND = "import sys; sys.path.insert(0, {!r}); from peers.jsonl import read_order, say; {}"
 BENCH = str(Path(__file__).resolve().parents[2] / "scripts" / "bench")

@@ -14,7 +14,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 import uplink
-from preconditions import data_folder
+from machine import data_folder
 from report import Rounds
 from thin_link import score
 from thin_link.channel import Channel, ConstantRate, Loss, TraceRate

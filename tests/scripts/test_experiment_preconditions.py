@@ -13,8 +13,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import availability
+import machine
 import papers
-import preconditions
 import pytest
 import table1
 import uplink
@@ -73,7 +73,7 @@ def test_a_command_without_its_data_says_which_file_and_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, QUIET)
-    monkeypatch.setattr(preconditions.data_folder, "__defaults__", (tmp_path,))
+    monkeypatch.setattr(machine.data_folder, "__defaults__", (tmp_path,))
     said = ends(lambda: availability.main(["--out", str(tmp_path / "out")]))
     assert f"no {tmp_path}/spot/aws_*.json: git checkout -- scripts/data restores it" in said
     assert not list((tmp_path / "out").iterdir())
@@ -83,8 +83,8 @@ def test_a_command_without_its_data_says_which_file_and_how_to_get_it(
 
 
 def test_problems_that_are_not_here_are_fetched_by_a_command_that_is_named(tmp_path: Path) -> None:
-    with pytest.raises(preconditions.RefusedError, match=r"no .*/planning/Home.cfg: scripts/data/fetch.sh fetches it"):
-        preconditions.data_folder("planning", ["Home.cfg"], tmp_path)
+    with pytest.raises(machine.RefusedError, match=r"no .*/planning/Home.cfg: scripts/data/fetch.sh fetches it"):
+        machine.data_folder("planning", ["Home.cfg"], tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")

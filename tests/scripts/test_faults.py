@@ -8,16 +8,13 @@ from pathlib import Path
 
 import pytest
 from faults.accounts import Books, Timeline
-from faults.disk import snapshot_faults
-from faults.network import VICTIM, random_network
-from faults.oracle import Broken, Oracle
-from faults.plan import Flow, Plan, Service
+from faults.plan import VICTIM, Broken, Flow, Oracle, Plan, Service, random_network
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
-from faults.store import critical_lines
-from topologies import make_topology
+from faults.store import critical_lines, snapshot_faults
 
 from gdp.message.loss import LossReason
+from lab.topology import make_topology
 
 SEEDS = range(1, 9)
 SECOND_NS = 1_000_000_000

@@ -6,9 +6,8 @@ from itertools import product
 
 import pytest
 
-from internet.access import TRAITS, Access, allows_direct
+from internet.access import TRAITS, Access, allows_direct, core_rules, router_rules
 from internet.matrix import batches
-from internet.rules import Fault, core_rules, router_rules
 from tests.pages import ROOT
 
 PAGE = ROOT / "docs/reference/internet-access.md"
@@ -54,14 +53,12 @@ def test_the_page_states_the_traits_of_each_kind() -> None:
 
 
 def test_public_access_has_no_rules() -> None:
-    assert router_rules(Access.PUBLIC, "", hairpin=False) == ""
+    assert router_rules(Access.PUBLIC, "") == ""
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.0, 0), (0.02, 2), (1.0, 2)])
-def test_the_core_drops_in_both_directions_only_where_a_fault_is_set(share: float, expected: int) -> None:
-    text = core_rules({"port0": Fault(loss=share), "port1": Fault()})
-    assert text.count(" drop\n") == expected
-    assert "port1" not in text
+def test_the_core_drops_in_both_directions_only_at_cut_sites() -> None:
+    assert core_rules(["port0"]).count('"port0" drop\n') == 2
+    assert " drop\n" not in core_rules([])
 
 
 def test_seven_batches_of_three_kinds_hold_each_pair() -> None:

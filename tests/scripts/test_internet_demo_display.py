@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from internet_demo import display
+from internet_demo import scenario as display
 from internet_demo.stage import Link
 
 

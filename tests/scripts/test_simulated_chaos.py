@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from faults.network import random_network
+from faults.plan import random_network
 from faults.schedule import make_schedule
 
 from tests.draws import TIMES

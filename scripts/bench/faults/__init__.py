@@ -1,8 +1,8 @@
 """Faults in an overlay of real processes and namespaces, shared by ``survive.py`` and ``chaos.py``.
 
-Sans-I/O: ``plan`` (the nodes), ``network`` (a random one), ``schedule`` (which fault happens when), ``oracle`` (what
-must stay connected), ``accounts`` (evaluation of the records).
+Sans-I/O: ``plan`` (the nodes, also of a random network, and what must stay connected), ``schedule`` (faults in
+time), ``accounts`` (evaluation of the records).
 
-I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``disk``, ``store``
-(servers that RIBs share), ``member`` (the endpoint process), ``records`` (its record files).
+I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``store`` (a
+disk, and servers that RIBs share), ``member`` (the endpoint process), ``records`` (its record files).
 """

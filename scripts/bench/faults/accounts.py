@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from faults.plan import Plan
+from faults.plan import Broken, Oracle, Plan
 from faults.records import Kind, Record
 from gdp.message.loss import LossReason
 
@@ -84,11 +84,7 @@ class Timeline:
 
 
 class Books:
-    """Accounts of all readers, callers and publishers of a run.
-
-    Args:
-        plan: the network.
-    """
+    """Accounts of all readers, callers and publishers of a run. ``plan``: the network."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -153,9 +149,8 @@ class Books:
     def incomplete(self, is_last_life: Callable[[str, int], bool], until_ns: int) -> list[str]:
         """Return unreported losses of reliable flows, in words, and duplicates of any flow.
 
-        Args:
-            is_last_life: whether an incarnation of a member continues to the end of the run.
-            until_ns: messages that were published later may still be in flight.
+        ``is_last_life``: whether an incarnation of a member continues to the end of the run. ``until_ns``: messages
+        that were published later may still be in flight.
         """
         found = []
         of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
@@ -230,9 +225,8 @@ class Books:
     def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without a result, or with more than one.
 
-        Args:
-            until_ns: calls that began later may still be in progress.
-            is_over: whether an incarnation of a member ended before its calls did.
+        ``until_ns``: calls that began later may still be in progress. ``is_over``: whether an incarnation of a member
+        ended before its calls did.
         """
         found = []
         for (channel, client, incarnation_id, number), (since_ns, ends) in self._calls.items():
@@ -247,3 +241,52 @@ class Books:
     def failed_since(self, at_ns: int) -> int:
         """Return how many calls that began after a moment failed."""
         return sum(since_ns >= at_ns for since_ns, _ in self.failed)
+
+
+class Continuity:
+    """Pairs of publisher and reader, with the times in which graph and policy connect them.
+
+    ``plan``: the network. ``books``: with the arrivals at each reader.
+    """
+
+    def __init__(self, plan: Plan, books: Books) -> None:
+        self._plan, self._books, self._oracle = plan, books, Oracle(plan)
+        self._must = {pair: Timeline() for pair in self._oracle.pairs()}
+
+    def note(self, at_ns: int, broken: Broken) -> None:
+        """Record what must be connected from now on."""
+        for (_, publisher, reader), timeline in self._must.items():
+            timeline.note(at_ns, connected=self._oracle.must_talk(publisher, reader, broken))
+
+    def unreached(self) -> list[str]:
+        """Return the flows, in words, of which nothing has come."""
+        return [
+            f"{self._plan.flows[channel].topic} at {reader}"
+            for channel, _, reader in self._must
+            if not self._books.arrivals_ns[channel, reader]
+        ]
+
+    def silences(self, begin_ns: int, end_ns: int, above_s: float) -> list[Silence]:
+        """Return the longer silences of connected readers in a time."""
+        return [
+            silence
+            for (channel, _, reader), must in self._must.items()
+            for silence in self._books.silences(channel, reader, begin_ns, end_ns, must, above_s)
+        ]
+
+    def broken_promises(self, begin_ns: int, last_ns: int, end_ns: int, limit_s: float, well_s: float) -> list[str]:
+        """Return in words the silences that are too long.
+
+        ``last_ns``: end of the last fault. ``limit_s``: longest silence before that. ``well_s``: longest silence after
+        it.
+        """
+        kinds = ("after the last fault", last_ns, end_ns, well_s), ("black hole", begin_ns, last_ns, limit_s)
+        return [
+            f"{kind}: {self._words(silence, begin_ns)}"
+            for kind, from_ns, to_ns, most_s in kinds
+            for silence in self.silences(from_ns, to_ns, most_s)
+        ]
+
+    def _words(self, silence: Silence, begin_ns: int) -> str:
+        topic, at_s = self._plan.flows[silence.channel].topic, (silence.begin_ns - begin_ns) / 1e9
+        return f"{topic} at {silence.reader}: {silence.seconds:.2f} s of silence from {at_s:.2f} s on"

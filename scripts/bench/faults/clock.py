@@ -22,11 +22,7 @@ _OFFSET: Final = struct.Struct("=q")  # offset in nanoseconds
 
 
 class Clock:
-    """Offset of the clock of one process, as the bench sets it; it outlives the process.
-
-    Args:
-        path: a file to create.
-    """
+    """Offset of the clock of one process, as the bench sets it; it outlives the process. ``path``: a file to create."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

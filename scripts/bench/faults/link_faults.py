@@ -77,9 +77,7 @@ class LinkFaults:
     def set(self, namespace: Path, ifname: str, faults: FrameFaults) -> None:
         """Apply faults to frames that a device receives, from now on.
 
-        Raises:
-            LocalError: the kernel refuses.
-            OSError: no such namespace.
+        Raises ``LocalError``: the kernel refuses. Raises ``OSError``: no such namespace.
         """
         end = self._ends.get((namespace, ifname))
         if end is None:

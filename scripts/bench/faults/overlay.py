@@ -17,29 +17,25 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-import yaml
-from devices import received, set_link
 from pyroute2 import IPRoute
-from testbed import Lab
+from testbed import Lab, received, set_link
 
 from faults.clock import Clock
-from faults.disk import Disk
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
-from faults.store import StoreCluster
+from faults.store import Disk, StoreCluster
+from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
+from gdp.stores.keyring import load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.credentials import OverlayCredentials
 from lab.process import FailedError, LabProcess, end_processes
-from ring.credentials import OverlayCredentials
 
 READY_S: Final = 60.0
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
-_OWNER: Final = "owner"
 
 
 class Overlay:
@@ -79,7 +75,7 @@ class Overlay:
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = self._lab.namespaces
-        self._materials = OverlayCredentials(plan.topology, run.directory, metrics=False)
+        self._credentials = OverlayCredentials(plan.topology, run.directory)
         self._clocks: dict[str, Clock] = {}
         if has_clocks:
             (run.directory / "clocks").mkdir()
@@ -138,8 +134,7 @@ class Overlay:
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
 
-        Raises:
-            FailedError: it ended, or reported nothing in time.
+        Raises ``FailedError``: it ended, or reported nothing in time.
         """
         self._processes[who].read(READY_S)
 
@@ -196,8 +191,7 @@ class Overlay:
     def new_records(self, member: str) -> Iterator[Record]:
         """Yield what all incarnations of a member recorded since the last call.
 
-        Raises:
-            FailedError: a process ended by itself.
+        Raises ``FailedError``: a process ended by itself.
         """
         for who in self.died():
             raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
@@ -285,39 +279,30 @@ class Overlay:
     # files
 
     def _switch_file(self, node: str) -> Path:
-        path = self._materials.switch(node, "auto")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
         movers = {mover for mover, homes in self.plan.homes.items() if node in homes}
-        ports = [port for port in content["ports"] if port["iface"] not in movers]
-        content["ports"] = [*ports, *({"iface": mover, "optional": True} for mover in sorted(movers))]
+        ports = [port for port in self._credentials.ports(node) if port["iface"] not in movers]
+        ports += [{"iface": mover, "optional": True} for mover in sorted(movers)]
         revocations = self.directory / "revocations"
         revocations.mkdir(exist_ok=True)
-        content["revocations"] = str(revocations)
-        return self._write(path, {**content, **self._more.get("switch", {})})
+        further = {"ports": ports, "revocations": str(revocations), **self._more.get("switch", {})}
+        return self._credentials.switch(node, "auto", **further)
 
     def _rib_file(self, node: str) -> Path:
         at = next(at for at in self.plan.topology.attached("rib") if at.switch == node)
-        path = self._materials.rib(at)
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
         domain = self.plan.topology.domain_of(node)
-        content["peers"] = [name for at, name in self._rib_names(domain.label) if at != node]
-        content["upper"] = [name for _, name in self._rib_names(domain.upper)]
+        further: dict[str, object] = {"upper": self._rib_names(domain.upper)}
         if self.store is not None and node in self._in_store:
-            del content["peers"]
-            content |= self.store.config
-        elif self.disk is not None:
-            content["snapshot"] = str(self.disk.snapshot(node))
-        return self._write(path, {**content, **self._more.get("rib", {})})
+            further |= self.store.config
+        else:
+            further["peers"] = self._rib_names(domain.label, but=node)
+            if self.disk is not None:
+                further["snapshot"] = str(self.disk.snapshot(node))
+        return self._credentials.rib(at, **{**further, **self._more.get("rib", {})})
 
-    def _rib_names(self, label: str | None) -> list[tuple[str, str]]:
-        """Return the RIBs of a domain: switch, and name as text."""
-        switches = [at for at in self.plan.ribs if self.plan.topology.domain_of(at).label == label]
-        folders = [(at, self.directory / "nodes" / f"rib-{at}") for at in switches]
-        return [(at, load_identity(folder, time.time()).name.to_text()) for at, folder in folders]
-
-    def _write(self, path: Path, content: Mapping[str, object]) -> Path:
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-        return path
+    def _rib_names(self, label: str | None, but: str = "") -> list[str]:
+        """Return the names of the RIBs of a domain, but for the one at a switch."""
+        switches = [at for at in self.plan.ribs if self.plan.topology.domain_of(at).label == label and at != but]
+        return [self._credentials.name(Role.RIB, at).to_text() for at in switches]
 
     def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
         """Return the settings of a member process: its identity, and its flows and services."""
@@ -352,8 +337,6 @@ class Overlay:
 
     def _admit(self, member: str) -> None:
         """Give a member its delegations, and write its configuration."""
-        identity = self.directory / "nodes" / f"proxy-{member}"
-        owner = self.directory / _OWNER
         for _, what in self._parts(member):
             if isinstance(what, Service):
                 right = Right.SERVE if member in what.servers else Right.CALL
@@ -361,16 +344,11 @@ class Overlay:
             else:
                 right = Right.PUBLISH if member == what.publisher else Right.READ
                 metadata = Metadata({"kind": "topic", "name": what.topic})
-            install_delegation(identity, delegate(owner, identity / CARD, metadata, [right]))
-        own = self.plan.topology.domain_of(member).label
-        labels = [domain.label for domain in self.plan.topology.domains]
-        roots = {label: str(self.directory / "domains" / label / ROOT_CERTIFICATE) for label in labels}
-        content = {
-            "identity": str(identity),
-            "domain": {"root": roots.pop(own), "trusts": list(roots.values())},
-            "iface": self.plan.home(member),  # a device has the name of the neighbour it first leads to
-        }
-        self._write(self.directory / f"end-{member}.yaml", content)
+            self._credentials.delegate(member, metadata, right)
+        iface = self.plan.home(member)  # a device has the name of the neighbour it first leads to
+        self._credentials.write(
+            f"end-{member}.yaml", {**self._credentials.node_yaml(Role.PROXY, member), "iface": iface}
+        )
 
 
 def _shape(ifname: str, bits_s: float, fifo_s: float) -> None:

@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from faults.network import VICTIM
-from faults.oracle import Broken, Oracle
-from faults.plan import Plan
+from faults.plan import VICTIM, Broken, Oracle, Plan
 
 
 class FaultKind(Enum):
@@ -62,9 +60,8 @@ _TRIES: Final = 40
 class Fault:
     """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and its new switch.
 
-    Attributes:
-        start_s, end_s: from the start of the run; a fault without an end of its own ends at its start.
-        amount: seconds of a clock step; the index of the server of the store, among those of the role.
+    ``start_s``, ``end_s``: from the start of the run; a fault without an end of its own ends at its start. ``amount``:
+    seconds of a clock step; the index of the server of the store, among those of the role.
     """
 
     kind: FaultKind
@@ -110,11 +107,8 @@ def make_schedule(
 ) -> list[Fault]:
     """Return the faults of a run, in the order of their starts.
 
-    Args:
-        duration_s: when the last fault has ended.
-        pace_s: mean time between two starts.
-        kinds: what may happen; None: everything.
-        has_store: RIBs share a store of several servers, which may fail.
+    ``duration_s``: when the last fault has ended. ``pace_s``: mean time between two starts. ``kinds``: what may happen;
+    None: everything. ``has_store``: RIBs share a store of several servers, which may fail.
     """
     drawn = set(kinds or FaultKind) - (frozenset() if has_store else _OF_STORE)
     return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, drawn))

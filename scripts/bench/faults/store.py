@@ -6,27 +6,28 @@ run's record, and they run in a namespace of the run; its end ends all processes
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 import yaml
-from devices import add_address, add_bridge, set_link
 from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
+from testbed import add_address, add_bridge, set_link
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
+from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
-from lab.namespace import Namespace
-from lab.namespaces import Namespaces
+from lab.namespaces import Namespace, Namespaces
 from lab.process import FailedError, until
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
@@ -49,13 +50,8 @@ def has_server() -> bool:
 class StoreCluster:
     """Cluster of six servers.
 
-    Args:
-        run: run whose folder holds the data.
-        spaces: of the network.
-        ribs: switches in whose namespaces the RIBs run that use the cluster.
-
-    Raises:
-        LocalError: the kernel refuses, or the servers do not start.
+    ``run``: run whose folder holds the data. ``spaces``: of the network. ``ribs``: switches in whose namespaces the
+    RIBs run that use the cluster. Raises ``LocalError``: the kernel refuses, or the servers do not start.
     """
 
     def __init__(self, run: Run, spaces: Namespaces, ribs: Sequence[str]) -> None:
@@ -98,11 +94,7 @@ class StoreCluster:
         return self._take(fault, signal.SIGSTOP, is_primary=True, choice=choice)
 
     def restart(self, fault: str) -> None:
-        """Restart a killed server.
-
-        Raises:
-            FailedError: it does not start.
-        """
+        """Restart a killed server. Raises ``FailedError``: it does not start."""
         number = self._away.pop(fault)
         folder = self._folder / str(number)
         (folder / "server.pid").unlink(missing_ok=True)
@@ -201,3 +193,75 @@ def _role_of(port: int, password: str, folder: Path) -> tuple[bool, bool] | None
         return None
     finally:
         client.close()
+
+
+SIZE_BYTES: Final = 64 << 20  # six snapshots with their logs take 30 MB at most
+NOT_WRITTEN: Final = "snapshot not written"
+_WRITTEN: Final = "snapshot written again"
+_READ: Final = "snapshot read"
+_NOT_READ: Final = "snapshot not read"
+_UP: Final = "rib up"
+BROKEN: Final = ".broken"
+_BLOCKS_BYTES: Final = (1 << 20, 1 << 12)
+
+
+class Disk:
+    """Small file system.
+
+    ``run``: run whose folder holds the mount, and whose end unmounts it. Raises ``LocalError``: the kernel refuses.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._path = run.directory / "disk"
+        run.plan_mount(self._path)
+        mount_tmpfs(self._path, SIZE_BYTES)
+
+    @property
+    def _ballast(self) -> Path:
+        return self._path / "ballast"
+
+    def snapshot(self, node: str) -> Path:
+        """Return the path of the snapshot of the RIB at a switch."""
+        return self._path / f"rib-{node}.sqlite"
+
+    def fill(self) -> None:
+        """Fill every block."""
+        with self._ballast.open("wb", buffering=0) as file:
+            for size in _BLOCKS_BYTES:
+                try:
+                    while True:
+                        file.write(bytes(size))
+                except OSError as error:
+                    if error.errno != errno.ENOSPC:
+                        raise
+
+    def free(self) -> None:
+        """Free the blocks."""
+        self._ballast.unlink(missing_ok=True)
+
+    def broken(self) -> list[str]:
+        """Return the snapshots that a RIB could not read."""
+        return sorted(name for name in os.listdir(self._path) if name.endswith(BROKEN))
+
+
+def snapshot_faults(who: str, log: str, *, is_alive: bool) -> Iterator[str]:
+    """Yield, in words, what an incarnation of a RIB logged wrongly about its snapshot.
+
+    ``log``: its whole log. ``is_alive``: it runs, the disk has free space, and it had enough time to write.
+    """
+    is_failing = has_started = False
+    for line in log.splitlines():
+        if _UP in line and not has_started:
+            yield f"{who} is up and did not say what it read of its snapshot"
+        elif _READ in line or _NOT_READ in line:
+            has_started = True
+            if _READ in line and " unreadable=0 " not in line:
+                yield f"{who} read half an entry: {line}"
+        elif NOT_WRITTEN in line:
+            if is_failing:
+                yield f"{who} said twice that its snapshot is not written"
+            is_failing = True
+        elif _WRITTEN in line:
+            is_failing = False
+    if is_failing and is_alive:
+        yield f"{who} does not write its snapshot again, or does not say so"

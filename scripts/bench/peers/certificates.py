@@ -20,11 +20,7 @@ _BACK = datetime.timedelta(minutes=5)
 
 
 def make_certificates(directory: Path, hosts: Mapping[str, Iterable[str]]) -> None:
-    """Write ``ca.crt`` and, for each host, ``NAME.crt`` and ``NAME.key``.
-
-    Args:
-        hosts: IPv4 addresses by name.
-    """
+    """Write ``ca.crt`` and, for each host, ``NAME.crt`` and ``NAME.key``. ``hosts``: IPv4 addresses by name."""
     directory.mkdir(mode=0o700)
     authority, root = ec.generate_private_key(ec.SECP256R1()), _name("bench root")
     basic = x509.BasicConstraints(ca=True, path_length=0)

@@ -13,13 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from devices import add_address
 from machine import offload_text, offloads, set_offloads
 from pyroute2 import IPRoute
-from testbed import Lab
-from topologies import MIDDLE, ROW, row
+from testbed import Lab, add_address
 
 from gdp.host.run_registry import Run
+from lab.topology import MIDDLE, ROW, row
 
 NODES: Final = ROW
 _LINKS: Final = len(NODES) - 1
@@ -43,11 +42,7 @@ def routes(node: str) -> dict[str, str]:
 
 
 class Chain(Lab):
-    """The five machines, addressed and routed.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """The five machines, addressed and routed. Raises ``LocalError``: the kernel refuses."""
 
     def __init__(self, mtu: int, run: Run) -> None:
         super().__init__(run, row(mtu))

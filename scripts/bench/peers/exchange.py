@@ -61,8 +61,7 @@ class Way(Protocol):
 def image(size: int) -> bytearray:
     """Return a serialised image of exactly ``size`` bytes, with random pixels.
 
-    Raises:
-        ValueError: too small for the number.
+    Raises ``ValueError``: too small for the number.
     """
     pixels = size - _IMAGE_HEAD.size
     if pixels < _NUMBER.size:
@@ -80,12 +79,8 @@ def answer_to(message: bytes) -> bytes:
 def exchange(way: Way, load: Load, pids: Mapping[str, Sequence[int]]) -> list[dict[str, object]]:
     """Measure every size; return for each its ``size``, ``rtt_s`` of every message, and ``cpu_s`` a message by machine.
 
-    Args:
-        pids: of the processes at each machine.
-
-    Raises:
-        TimeoutError: an answer did not come.
-        ValueError: B received other bytes than were sent.
+    ``pids``: of the processes at each machine. Raises ``TimeoutError``: an answer did not come. Raises ``ValueError``:
+    B received other bytes than were sent.
     """
     clocks = {place: [_clock(pid) for pid in each] for place, each in pids.items()}
     numbers = iter(range(1, _CHECKED))

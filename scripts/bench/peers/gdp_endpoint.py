@@ -80,8 +80,7 @@ class LibraryEndpoint:
 class UnicastEndpoint:
     """Client or server of a name: a message is a request to the one server, and an answer its response.
 
-    Args:
-        is_session: a session secret authenticates both, instead of signatures.
+    ``is_session``: a session secret authenticates both, instead of signatures.
     """
 
     def __init__(self, config: Path, *, is_session: bool) -> None:

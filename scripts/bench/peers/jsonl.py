@@ -18,11 +18,8 @@ from peers.exchange import Load
 class EndSettings:
     """Settings of an endpoint, the same for every baseline.
 
-    Attributes:
-        role: ``ping`` (A) or ``pong`` (B).
-        load: what to measure.
-        pids: processes whose CPU counts, by machine; A adds itself.
-        own: further settings of this baseline's endpoint.
+    ``role``: ``ping`` (A) or ``pong`` (B). ``load``: what to measure. ``pids``: processes whose CPU counts, by machine;
+    A adds itself. ``own``: further settings of this baseline's endpoint.
     """
 
     role: str

@@ -46,8 +46,7 @@ _SMALL_CPU_MS: Final = 0.12
 class Plan:
     """Combinations to measure in every round.
 
-    Attributes:
-        loads: whether other processes take half of each core; one value, or both.
+    ``loads``: whether other processes take half of each core; one value, or both.
     """
 
     mtus: tuple[int, ...]
@@ -71,10 +70,8 @@ class Plan:
 class Turns:
     """Rounds in progress.
 
-    Attributes:
-        over: the figures.
-        notes: failures, and retransmissions.
-        offload_states: states that the devices report, by the requested setting.
+    ``over``: the figures. ``notes``: failures, and retransmissions. ``offload_states``: states that the devices report,
+    by the requested setting.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -158,9 +155,7 @@ def targets_of(
 ) -> list[Target]:
     """Return the targets of each of our rows, in the cases that were run.
 
-    Args:
-        cases: bytes, MTU, offloads.
-        loads: whether other processes took half of each core.
+    ``cases``: bytes, MTU, offloads. ``loads``: whether other processes took half of each core.
     """
     targets: list[Target] = []
     for label in (label for label in ours if label.endswith(" cdr")):

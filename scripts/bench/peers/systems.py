@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from testbed import Lab, OverlayNodes
-from topologies import LEFT, MIDDLE, RIGHT
 
 from gdp.trust.right import Right
 from lab.process import FailedError, LabProcess
+from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
 from peers.chain import NODES, Chain, address
 from peers.exchange import Load
@@ -39,8 +39,7 @@ _MEASURED_S: Final = 180.0
 class Measured:
     """One size by one baseline: seconds of every message, CPU seconds a message by machine.
 
-    Attributes:
-        resent: retransmitted parts, over all sizes; known of GDP only.
+    ``resent``: retransmitted parts, over all sizes; known of GDP only.
     """
 
     label: str
@@ -70,8 +69,7 @@ class GdpNet:
     def measure(self, chain: Chain, load: Load) -> list[Measured]:
         """Start switches, RIB, B, A.
 
-        Raises:
-            FailedError: it is not installed, or did not come up, or lost a message.
+        Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
         """
         with ExitStack() as stack:
             nodes = OverlayNodes(chain, MIDDLE, plane=self._plane, label=self.name)
@@ -106,11 +104,7 @@ class ZenohNet:
         self.labels = (self.name,)
 
     def measure(self, chain: Chain, load: Load) -> list[Measured]:
-        """Start routers from the left, then B, then A.
-
-        Raises:
-            FailedError: as ``GdpNet.measure``.
-        """
+        """Start routers from the left, then B, then A. Raises ``FailedError``: as ``GdpNet.measure``."""
         with ExitStack() as stack:
             routers = []
             for before, node in zip(NODES, MIDDLE, strict=False):
@@ -166,11 +160,7 @@ class CycloneNet:
     labels = ("cyclone",)
 
     def measure(self, chain: Chain, load: Load) -> list[Measured]:
-        """Start B, then A.
-
-        Raises:
-            FailedError: as ``GdpNet.measure``.
-        """
+        """Start B, then A. Raises ``FailedError``: as ``GdpNet.measure``."""
         with ExitStack() as stack:
             pong = stack.enter_context(_cyclone_end(chain, RIGHT, load, {}))
             pong.read(_READY_S)
@@ -200,11 +190,7 @@ def start_end(
 def ask_end(ping: LabProcess, labels: Mapping[str, str]) -> list[Measured]:
     """Return the figures of A.
 
-    Args:
-        labels: row by the name that the endpoint uses.
-
-    Raises:
-        FailedError: it failed.
+    ``labels``: row by the name that the endpoint uses. Raises ``FailedError``: it failed.
     """
     found: list[Measured] = []
     for series, label in labels.items():

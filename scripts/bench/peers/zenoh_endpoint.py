@@ -1,22 +1,54 @@
 """Endpoint and router processes of Zenoh; the endpoints are as a user would write them (a callback and an Event).
 
-Process of its own, started by ``systems.py``.
+Process of its own, started by ``systems.py``. Shared memory is off: it would cross namespaces of one host.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
 import zenoh
 
 from peers.exchange import answer_to, exchange
 from peers.jsonl import EndSettings, say
-from peers.zenoh_config import zenoh_config
+
+
+def zenoh_config(
+    mode: str, *, listen: Sequence[str] = (), connect: Sequence[str] = (), certificate: str | None = None
+) -> zenoh.Config:
+    """Return the configuration of a router, client or peer.
+
+    ``certificate``: path without its ending, of a host of ``make_certificates``; None: no TLS.
+    """
+    config: zenoh.Config = zenoh.Config()
+    values: dict[str, object] = {
+        "mode": mode,
+        "transport/shared_memory/enabled": False,
+        "scouting/multicast/enabled": False,
+    }
+    if listen:
+        values["listen/endpoints"] = list(listen)
+    if connect:
+        values["connect/endpoints"] = list(connect)
+    if certificate is not None:
+        values["transport/link/tls"] = {
+            "root_ca_certificate": f"{certificate.rpartition('/')[0]}/ca.crt",
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            **{f"{side}_private_key": f"{certificate}.key" for side in ("listen", "connect")},
+            **{f"{side}_certificate": f"{certificate}.crt" for side in ("listen", "connect")},
+        }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
 
 _PING: Final = "bench/ping"
 _PONG: Final = "bench/pong"

@@ -161,8 +161,7 @@ class Counters:
 class Channel:
     """One direction of a link; moments of successive calls never decrease.
 
-    Args:
-        fifo_bytes: most bytes that wait or leave; a frame that would exceed them is dropped.
+    ``fifo_bytes``: most bytes that wait or leave; a frame that would exceed them is dropped.
     """
 
     def __init__(self, rate: Rate, *, delay_ns: int, fifo_bytes: int, loss: Loss) -> None:

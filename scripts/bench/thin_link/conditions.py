@@ -105,8 +105,7 @@ def mean_bits_s(opportunities_ms: tuple[int, ...]) -> float:
 def load_trace(path: Path) -> tuple[int, ...]:
     """Return the moments of a recording, a millisecond a line, in the format of mahimahi.
 
-    Raises:
-        LocalError: no such file, or another format.
+    Raises ``LocalError``: no such file, or another format.
     """
     try:
         moments = tuple(int(line) for line in path.read_text(encoding="ascii").split())

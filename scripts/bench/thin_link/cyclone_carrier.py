@@ -12,20 +12,16 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from cyclonedds._clayer import ddspy_take, ddspy_write
-from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from peers.cyclone_endpoint import Opaque
+from peers.cyclone_endpoint import PREFIX, Opaque, take, waiting_for, write
 
 from thin_link.exchange import Arrival
 from thin_link.traffic import Stream
 
-_ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
-_PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian
-_AT_ONCE: Final = 16
 _BLOCKING_NS: Final = 10_000_000_000
 _WAIT_NS: Final = 1_000_000_000
 _URGENT: Final = 10
@@ -46,9 +42,7 @@ class CycloneCarrier:
         self._writers.append(writer)
 
         def send(message: bytes) -> None:
-            """Write a message; a reliable writer waits while its cache is full, and then refuses."""
-            if (result := ddspy_write(writer._ref, _PREFIX + message)) < 0:
-                raise OSError(f"Cyclone DDS does not write: {result}")
+            write(writer, PREFIX + message)
 
         return send
 
@@ -62,15 +56,12 @@ class CycloneCarrier:
         return all(writer.get_matched_subscriptions() for writer in self._writers)
 
     def _read(self, stream: Stream, reader: Any) -> None:
-        waiting = WaitSet(self._participant)
-        waiting.attach(ReadCondition(reader, _ANY))
+        waiting = waiting_for(self._participant, reader)
         while True:
             waiting.wait(_WAIT_NS)
-            taken = ddspy_take(reader._ref, _ANY, _AT_ONCE)
-            now_ns = time.monotonic_ns()
-            for message, info in taken if isinstance(taken, list) else []:
-                if info.valid_data:
-                    self._arrived(stream, message[len(_PREFIX) :], now_ns)
+            taken, now_ns = take(reader), time.monotonic_ns()
+            for message in taken:
+                self._arrived(stream, message[len(PREFIX) :], now_ns)
 
     def _topic(self, stream: Stream) -> Any:
         return Topic(self._participant, stream.name.replace(" ", "_"), Opaque)

@@ -67,11 +67,7 @@ class Tally:
 
 
 class Exchange:
-    """One end of the traffic.
-
-    Args:
-        direction: of the streams that this end publishes.
-    """
+    """One end of the traffic. ``direction``: of the streams that this end publishes."""
 
     def __init__(self, mix: Iterable[Stream], direction: Direction) -> None:
         self._mix = tuple(mix)

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from devices import add_address, add_neighbour, mac_addresses
 from machine import set_offloads
-from testbed import Lab
-from topologies import flat_topology
+from testbed import Lab, add_address, add_neighbour, mac_addresses
 
 from gdp.host.run_registry import Run
 from lab.process import FailedError, LabProcess
+from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions
 
 ROBOT: Final = "s1"
@@ -76,8 +75,7 @@ class Line:
     def end(self) -> Used:
         """Return the use of the link since ``begin``.
 
-        Raises:
-            FailedError: the relay lost a frame itself, so that the figures would mean nothing.
+        Raises ``FailedError``: the relay lost a frame itself, so that the figures would mean nothing.
         """
         before, after = self._before, self._ask()
         for what in ("oversized", "refused", "kernel_drops"):
@@ -112,12 +110,8 @@ def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
 def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud.
 
-    Args:
-        tcp_control: congestion control of TCP at robot and cloud; a machine's own default may differ from Linux's.
-
-    Raises:
-        LocalError: the kernel refuses.
-        FailedError: it has no such congestion control.
+    ``tcp_control``: congestion control of TCP at robot and cloud; a machine's own default may differ from Linux's.
+    Raises ``LocalError``: the kernel refuses. Raises ``FailedError``: it has no such congestion control.
     """
     topology = flat_topology(
         _INSIDE, mtu=FRAME_BYTES, rib=CLOUD, members=("a", "b"), switches=("a", ROBOT, LINE, CLOUD, "b")

@@ -67,9 +67,7 @@ def stream_figures(
 ) -> dict[str, float]:
     """Return the figures of one stream, by column.
 
-    Args:
-        could_s: messages a second that the uplink could carry whole, by stream.
-        span_s: of the window.
+    ``could_s``: messages a second that the uplink could carry whole, by stream. ``span_s``: of the window.
     """
     found: dict[str, float] = {
         DUE: report.due,

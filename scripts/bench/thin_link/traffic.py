@@ -28,10 +28,8 @@ _FRAME_OVERHEAD: Final = 100
 class Stream:
     """One topic.
 
-    Attributes:
-        period_s: of its messages; 0: published when a message of ``answers`` arrives.
-        urgent: has the highest priority that a system offers.
-        bulk: fills what the others leave of the link.
+    ``period_s``: of its messages; 0: published when a message of ``answers`` arrives. ``urgent``: has the highest
+    priority that a system offers. ``bulk``: fills what the others leave of the link.
     """
 
     name: str
@@ -82,9 +80,7 @@ def carried_s(mix: Iterable[Stream], bits_s: float, loss: float) -> Mapping[str,
     """Return how many messages a second of each stream the uplink could carry whole.
 
     The small streams come first. The bulk streams share what is left in bytes, max-min fair, and repair what is lost.
-
-    Args:
-        loss: share of lost frames, each of which is sent once more.
+    ``loss``: share of lost frames, each of which is sent once more.
     """
     mine = [each for each in mix if each.direction == "up" and each.period_s]
     left = bits_s / 8 * (1 - loss)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
-from peers.zenoh_config import zenoh_config
+from peers.zenoh_endpoint import zenoh_config
 
 from thin_link.exchange import Arrival
 from thin_link.traffic import Stream

@@ -14,8 +14,7 @@ from functools import partial
 
 from ring.nodes import roles
 from ring.nodes.content import TALKS, take_small_picture
-from ring.nodes.node import Node
-from ring.nodes.orders import Orders
+from ring.nodes.node import Node, Orders
 
 
 def _node(ros: str, name: str) -> Node:

@@ -15,20 +15,6 @@ from functools import cache
 from hashlib import sha256, shake_128
 from typing import Final, NamedTuple, TypeAlias
 
-__all__ = [
-    "CAMERA_HZ",
-    "LAMP",
-    "LAMP_HZ",
-    "LAMP_TYPE",
-    "TALKS",
-    "Fit",
-    "Mark",
-    "Talk",
-    "digest",
-    "lamp_says",
-    "take_small_picture",
-]
-
 Fit: TypeAlias = Callable[["array[int]"], object]  # converts an array to the form of a ROS version
 
 CAMERA_HZ: Final = 15.0  # unless a run asks for another pace

@@ -10,7 +10,7 @@ import sys
 from importlib import import_module
 
 from proxy.endpoints.ros1.install import rospy_folder
-from ring.nodes.orders import say
+from ring.nodes.node import say
 
 
 def main() -> None:

@@ -11,10 +11,7 @@ from typing import Final, NoReturn
 
 from proxy.bridge.core.topic_stats import percentile
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
-from ring.nodes.node import Call, Node
-from ring.nodes.orders import Order, Orders, say
-
-__all__ = ["call", "listen", "serve", "talk"]
+from ring.nodes.node import Call, Node, Order, Orders, say
 
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25

@@ -1,7 +1,4 @@
-"""Node of ROS 1 for the roles of a live ring.
-
-I/O; imports rospy.
-"""
+"""Node of ROS 1 for the roles of a live ring. I/O; imports rospy."""
 
 from __future__ import annotations
 
@@ -14,8 +11,6 @@ from typing import Final
 import rospy
 
 from ring.nodes.node import Call, Caller, Lamp, Publisher
-
-__all__ = ["Ros1Node"]
 
 _QUEUE: Final = 100
 

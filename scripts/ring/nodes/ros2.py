@@ -1,7 +1,4 @@
-"""Node of ROS 2 for the roles of a live ring.
-
-I/O; imports rclpy.
-"""
+"""Node of ROS 2 for the roles of a live ring. I/O; imports rclpy."""
 
 from __future__ import annotations
 
@@ -18,8 +15,6 @@ from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from ring.nodes.node import Call, Caller, Lamp, Publisher
-
-__all__ = ["Ros2Node"]
 
 _DEPTH: Final = 50  # some seconds of pictures: Fast DDS may need three to request a lost sample
 

@@ -8,11 +8,11 @@ import pytest
 
 from gdp.stores.keyring import load_delegations
 from gdp.trust.right import Right
+from lab.credentials import OverlayCredentials
 from lab.topology import ring5
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import DOMAIN_MAX
-from ring.credentials import OverlayCredentials
-from ring.live_plan import CARRIED, Graph, graphs_of, messages_in, paces
+from ring.live_plan import Graph, carried_in, graphs_of, messages_in, paces
 from ring.nodes.content import TALKS
 from ring.options import Live
 
@@ -45,16 +45,16 @@ def test_only_the_camera_follows_the_pace_that_was_asked_for() -> None:
 @pytest.mark.parametrize("ros", [1, 2])
 def test_both_proxies_know_all_by_one_name_and_each_may_do_its_part(ros: int, tmp_path: Path) -> None:
     graph = Graph(1 if ros == 1 else 2, 7)
-    materials = OverlayCredentials(RING, tmp_path, metrics=False)
-    robot = ProxyConfig.load(materials.live(ROBOT, "expose", CARRIED, "json", graph.to_yaml()))
-    server = ProxyConfig.load(materials.live(SERVER, "import", CARRIED, "json", graph.to_yaml()))
+    carried, credentials = carried_in("json"), OverlayCredentials(RING, tmp_path)
+    robot = ProxyConfig.load(credentials.proxy(ROBOT, {"expose": carried}, ros=graph.to_yaml()))
+    server = ProxyConfig.load(credentials.proxy(SERVER, {"import": carried}, ros=graph.to_yaml()))
     assert [end.ros for end in robot.ros] == [ros]
     names = [rule.overlay_name for rule in robot.expose]
     assert names == [rule.overlay_name for rule in server.imports]
-    assert names == [each.metadata.name(robot.expose[0].owner.compressed) for each in CARRIED]
+    assert names == [each.metadata.name(robot.expose[0].owner.compressed) for each in carried]
     topic_rights, service_rights = (Right.PUBLISH, Right.READ), (Right.SERVE, Right.CALL)
     for config, at in ((robot, 0), (server, 1)):
         rights = {each.name: each.rights for each in load_delegations(config.delegations)}
         assert [rights[name] for name in names] == [
-            frozenset({(service_rights if each.kind == "service" else topic_rights)[at]}) for each in CARRIED
+            frozenset({(service_rights if each.kind == "service" else topic_rights)[at]}) for each in carried
         ]

@@ -8,9 +8,8 @@ import pytest
 from rich.console import Console
 
 from lab.events import Event
-from ring.live_result import Heard, rows
 from ring.options import Options
-from ring.result import Result
+from ring.result import Heard, Result, rows
 from ring.table import summary, table
 
 CHATTER = {"topic": "/chatter", "type": "std_msgs/msg/String"}

@@ -14,10 +14,10 @@ from rich.console import Console
 from gdp.host.run_registry import Run, RunRegistry
 from lab.children import Children
 from lab.process import FailedError
-from ring import live_session
-from ring.live_result import Heard
-from ring.live_session import LiveNodes, LiveSession
+from ring import live_run
+from ring.live_run import LiveNodes, LiveSession
 from ring.progress import ProgressReporter
+from ring.result import Heard
 
 HEAD = """
 import json, signal, sys
@@ -71,13 +71,13 @@ def test_every_node_gets_the_start_command_and_is_asked_for_its_report(run: Run)
 
 
 def test_what_does_not_come_is_waited_for_only_while_something_moves(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_session, "QUIET_S", 0.2)
+    monkeypatch.setattr(live_run, "QUIET_S", 0.2)
     heard = play(run, listener=LISTENER.replace("received=2", "received=1"))
     assert heard.listener.name == "done"
 
 
 def test_a_node_that_does_not_report_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_session, "ENDING_S", 0.2)
+    monkeypatch.setattr(live_run, "ENDING_S", 0.2)
     with pytest.raises(FailedError, match=r"lamp did not report within 0\.2 s"):
         play(run, lamp=HEAD + "signal.pause()")
 

@@ -7,18 +7,18 @@ import io
 import sys
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.child import Child
-from lab.children import Children
+from lab.children import Child, Children
 from lab.process import FailedError
-from ring import replay as replay_module
-from ring.injection import Injection
+from ring import run as replay_module
+from ring.overlay import Injection
 from ring.progress import ProgressReporter
-from ring.replay import Replay, Report
+from ring.run import Replay, Report
 
 HEAD = """
 import json, signal, sys
@@ -31,16 +31,6 @@ signal.signal(signal.SIGINT, finish); say(event='ready'); say(event='progress', 
 while True: signal.pause()
 """
 RECEIVER = HEAD + RECEIVER
-
-
-class Nothing:
-    """Overlay without failures."""
-
-    async def cut(self, cut: object) -> None: ...
-    async def heal(self, cut: object) -> None: ...
-    async def kill(self, kill: object) -> None: ...
-    async def restart(self, kill: object) -> None: ...
-    async def roam(self, roam: object) -> None: ...
 
 
 @pytest.fixture
@@ -59,7 +49,7 @@ def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = No
         await children.ready([far])
         near = children.start("sender", [sys.executable, "-c", sender])
         await children.guarded(near.wait_for("ready", 10))
-        return await Replay(children, near, far, 2, reporter).report(lambda: Injection(Nothing(), (), reporter))
+        return await Replay(children, near, far, 2, reporter).report(lambda: Injection(cast(Any, None), (), reporter))
 
     return within(run, both)
 
