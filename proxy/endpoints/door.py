@@ -3,7 +3,7 @@
 I/O. A thread runs the WebSocket server (the library ``websockets``) and the hub; the bridge's thread passes commands to
 it and takes events from it. Each client has a task that sends what its queue holds, so a slow client delays its own
 messages only. Browsers state the origin of the page that connects: only listed origins may. Every user of the host may
-connect, so a client states the token of the door in its URL.
+connect, so a client of another user states the token of the door in its URL.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
 from gdp.ports.listening import listen_tcp
+from gdp.ports.socket_owners import SocketOwners
 from proxy.doors.arrivals import Arrivals
 from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
 from proxy.doors.hub import DoorSession, Hub, Rights
@@ -65,7 +66,7 @@ class DoorSettings:
         listen: ``host:port``.
         origins: values of the header Origin that are accepted; a client without the header is no browser, and accepted.
         subprotocols: WebSocket subprotocols, one of which a client must speak; none: it needs no subprotocol.
-        token: that a client states in its URL; empty: all who reach the address have the rights of the door.
+        token: that a client of another user, or from elsewhere, states in its URL; empty: none states it.
     """
 
     label: str
@@ -128,6 +129,7 @@ class DoorEndpoint:
             raise LocalError(
                 f"cannot listen on {settings.listen}: {error.strerror}; choose another address with --listen"
             ) from error
+        self._owners = SocketOwners()
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._failed: BaseException | None = None
@@ -274,6 +276,7 @@ class DoorEndpoint:
                 self._loop.call_soon_threadsafe(self._stop.set)
             self._thread.join()
         self._socket.close()
+        self._owners.close()
         os.close(self._wake)
 
     # the server's thread
@@ -383,9 +386,12 @@ class DoorEndpoint:
             await server.wait_closed()
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return a refusal; None: the client knows the token."""
+        """Return a refusal; None: the client knows the token, or is a program of this user on this machine."""
         token = self._settings.token
         if not token or is_access_token(query_token(request.path), token):
+            return None
+        client, server = connection.remote_address[:2], connection.local_address[:2]
+        if self._owners.is_mine(client, server):
             return None
         log.info("client without the token refused")
         return connection.respond(HTTPStatus.UNAUTHORIZED, "connect to the URL that the command of this door printed\n")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count
@@ -17,6 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from gdp.errors import GdpError, LocalError
+from gdp.ports.socket_owners import SocketOwners
 from proxy.cli.door_token import door_token
 from proxy.doors.arrivals import Arrivals
 from proxy.doors.client_queue import ClientQueue
@@ -35,8 +38,8 @@ TOKEN = "t&ken of 24 characters/+"
 
 
 @contextmanager
-def door_of(token: str = "") -> Iterator[DoorEndpoint]:
-    settings = DoorSettings(label="rosbridge", listen=f"127.0.0.1:{free_port()}", token=token)
+def door_of(token: str = "", host: str = "127.0.0.1") -> Iterator[DoorEndpoint]:
+    settings = DoorSettings(label="rosbridge", listen=f"{host}:{free_port()}", token=token)
     clock = count(1.0)
     door = DoorEndpoint(
         settings, lambda hub, number, queue: RosbridgeSession(hub, number, queue, lambda: next(clock)), Everything
@@ -63,13 +66,45 @@ def hear_all(client: ClientConnection, request: str = "") -> None:
 @pytest.mark.parametrize(
     "query", ["", "/", "/?token=", "/?token=wrong", "/?token={0}&token={0}", "/?other={0}", "/{0}"]
 )
-def test_z02_another_user_of_the_host_does_not_enter_a_door(query: str) -> None:
+def test_z02_another_user_of_the_host_does_not_enter_a_door(query: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SocketOwners, "uid_of", lambda *_: 65_534)
     with door_of("known") as door:
         address = "ws://{}:{}".format(*door.address) + query.format("known")
         with pytest.raises(InvalidStatus) as caught, connect(address):
             pass
         assert caught.value.response.status_code == 401
         assert b"known" not in (caught.value.response.body or b"")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root is needed to be another user")
+@pytest.mark.parametrize("listen", ["127.0.0.1", "[::1]"])
+def test_z02_the_kernel_says_whose_program_a_client_is(listen: str) -> None:
+    with door_of("known", listen) as door:
+        assert [asked_as(user, door.address) for user in (65_534, 0)] == [b"401", b"101"]
+
+
+def asked_as(user: int, address: tuple[str, int]) -> bytes:
+    """Return the status that a program of another user gets, which asks for a WebSocket without a token."""
+    said, say = os.pipe()
+    child = os.fork()
+    if not child:
+        os.setresuid(user, user, user)
+        with socket.create_connection(address) as client:
+            client.sendall(
+                b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+            )
+            os.write(say, client.recv(64).split()[1])
+        os._exit(0)
+    os.close(say)
+    os.waitpid(child, 0)
+    with os.fdopen(said, "rb") as heard:
+        return heard.read()
+
+
+def test_z02_a_program_of_the_doors_user_needs_no_token() -> None:
+    with door_of("known") as door, connect("ws://{}:{}".format(*door.address)) as client:
+        assert is_served(client)
 
 
 def test_z02_the_printed_url_leads_in_and_no_other_text_shows_the_token(caplog: pytest.LogCaptureFixture) -> None:
