@@ -25,7 +25,7 @@ class Arrivals(Generic[_KeyT]):
         self._held_bytes = 0
         self._begun: dict[_KeyT, int] = {}  # to bytes
 
-    def receive(self, key: _KeyT, size_bytes: int) -> list[_KeyT]:
+    def count(self, key: _KeyT, size_bytes: int) -> list[_KeyT]:
         """Count bytes of a connection; return those to end, so that the sum is within its bound.
 
         They are those whose message began first, of those that hold no less than the mean.

@@ -353,7 +353,7 @@ class DoorEndpoint:
 
             def data_received(self, data: bytes) -> None:
                 """Process bytes of the client."""
-                for each in arrivals.receive(self, len(data)):
+                for each in arrivals.count(self, len(data)):
                     log.info("client disconnected: its message does not end, and those of all exceed their bound")
                     each.transport.abort()
                 super().data_received(data)
