@@ -21,6 +21,7 @@ from fog.plan.duration import duration_text
 from fog.supervisor.core.record import Record, cost_usd, stage
 from fog.supervisor.journal import Cluster, Entry
 from gdp.cli.console import console, folding
+from gdp.printable import escaped
 from gdp.terminal import echo
 
 __all__ = [
@@ -153,7 +154,7 @@ def machines_table(rows: Sequence[Mapping[str, object]], now_s: float) -> Table:
             f"{row['usd_per_hour']:.4f}",
             duration_text(max(round(age), 1)),
             str(row["address"]) or "-",
-            str(row["reason"]),
+            escaped(str(row["reason"])),
         )
     return table
 
@@ -200,7 +201,7 @@ def _detail(entry: Entry) -> Text:
         del words[0]
     elif entry.since_unix_s is not None and entry.what != "reconciled":
         words.append(f"seen after {entry.unix_s - entry.since_unix_s:.2f} s")
-    return Text("; ".join(words))
+    return Text(escaped("; ".join(words)))
 
 
 def a_console(*, stderr: bool = False) -> Console:

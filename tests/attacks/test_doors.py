@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
@@ -15,6 +15,8 @@ import pytest
 
 pytest.importorskip("websockets")
 
+from hypothesis import given
+from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -25,12 +27,14 @@ from proxy.doors.arrivals import Arrivals
 from proxy.doors.client_queue import ClientQueue
 from proxy.doors.foxglove_session import FoxgloveSession
 from proxy.doors.hub import Hub
+from proxy.doors.parameters import GET, LIST, SET
 from proxy.doors.rosbridge_session import IDS_MAX, RosbridgeSession
 from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.door import DoorEndpoint, DoorSettings
 from tests.proxy.doors.rights import Everything
 from tests.proxy.doors.test_foxglove_door import free_port
+from tests.proxy.doors.test_parameters import service
 from tests.waiting import until
 
 PATIENCE_S = 20.0
@@ -184,6 +188,50 @@ def test_z03_an_id_of_32_mib_is_refused_and_not_repeated(request_: dict[str, obj
     assert "id: a text of at most 1024 characters was expected" in said
     assert len(said) < 1_000
     assert site.events == []
+
+
+LEAVES = st.none() | st.booleans() | st.integers() | st.text(max_size=5) | st.sampled_from(["/a", "/n.p", "byte_array"])
+JSON = st.recursive(
+    LEAVES | st.floats(allow_nan=False, allow_infinity=False),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(("data", "id", "name")), inner),
+    max_leaves=8,
+)
+FOXGLOVE_REQUESTS: list[dict[str, object]] = [
+    {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1}]},
+    {"op": "unsubscribe", "subscriptionIds": [1]},
+    {"op": "advertise", "channels": [{"id": 1, "topic": "/a", "encoding": "cdr", "schemaName": "a/msg/B"}]},
+    {"op": "getParameters", "parameterNames": ["/n.p"], "id": "1"},
+    {"op": "setParameters", "parameters": [{"name": "/n.p", "value": 1}]},
+]
+KEYS = sorted({key for each in (*REQUESTS, *FOXGLOVE_REQUESTS) for key in each} | {"id", "args"})
+CHANGES = st.dictionaries(st.sampled_from(KEYS), JSON, max_size=4)
+
+
+@given(st.lists(st.tuples(st.sampled_from(REQUESTS), CHANGES), max_size=4))
+def test_z03_whatever_a_rosbridge_client_sends_is_done_or_one_error(
+    sent: list[tuple[dict[str, object], object]],
+) -> None:
+    site = Site()
+    for request_, changes in sent:
+        assert isinstance(changes, dict)
+        site.say(**{**request_, **changes})
+
+
+@given(st.lists(st.tuples(st.sampled_from(FOXGLOVE_REQUESTS), CHANGES), max_size=4), st.binary(max_size=20))
+def test_z03_whatever_a_foxglove_client_sends_is_done_or_one_error(
+    sent: list[tuple[dict[str, object], object]], raw: bytes
+) -> None:
+    hub = Hub(lambda event: None, Everything, lambda topic, type_name: None)
+    session = FoxgloveSession(hub, 1, "test", ClientQueue())
+    hub.open(session)
+    for handle, each in enumerate((GET, LIST, SET), 1):
+        hub.offer_service(handle, service("/n", each))
+    for request_, changes in sent:
+        assert isinstance(changes, dict)
+        with suppress(GdpError):
+            session.handle_message(json.dumps({**request_, **changes}), 5)
+    with suppress(GdpError):
+        session.handle_message(raw, 5)
 
 
 @pytest.mark.parametrize("key", ["op", "topic", "type", "service", "compression", "level"])
