@@ -20,9 +20,10 @@ from rich.console import Console
 from fog.cli.down import clear, end_cluster
 from fog.cli.market import choices, in_regions, market, reached, refusal
 from fog.cli.options import AsJson, SiteFile, State, opened, peeked
-from fog.cli.robot_nodes import INTERRUPTED, resolved, run
+from fog.cli.robot_nodes import INTERRUPTED, Started, resolved, run
 from fog.cli.views import a_console, event_line, print_json
 from fog.cluster import ClusterPlan
+from fog.launch.load import Loaded
 from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
@@ -117,19 +118,25 @@ def launch(
         show_plan(whole, f"with {ends}, or {BY_HAND}" if ends else BY_HAND, as_json=as_json)
         return whole
 
+    def check_programs(here: Site, loaded: Loaded) -> list[Started]:
+        """Return the commands of the robot's nodes. Raises ``LocalError``: a program of the file does not exist."""
+        for node in loaded.plan.nodes:
+            command_of(here, node)
+        return [] if detach else [resolved(each) for each in loaded.robot_nodes]
+
     if dry_run:
-        with peeked(site, state) as here:
-            priced(_with(here, gateway))
+        with peeked(site, state) as known:
+            here = _with(known, gateway)
+            check_programs(here, priced(here).loaded)
         return
     with opened(site, state) as (known, journal):
         here = _with(known, gateway)
         loaded = priced(here).loaded
         plan = loaded.plan
-        for node in plan.nodes:
-            command_of(here, node)  # raises before anything is started
-        robot = [] if detach else [resolved(each) for each in loaded.robot_nodes]
+        robot = check_programs(here, loaded)
         last = max((each.id for each in journal.events(last=1)), default=0)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # same effect as Ctrl-C
+        for each in (signal.SIGINT, signal.SIGTERM):  # a shell lets programs in its background ignore the first
+            signal.signal(each, signal.default_int_handler)
         try:
             begin(here, journal, plan)
             follow(here, journal, plan, last, wait, as_json=as_json)

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 
 import typer
 
-from fog.bootstrap.bundles import PROXY
+from fog.bootstrap.bundles import PROXY, SWITCH
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened
 from fog.cli.views import print_json, stage
 from fog.supervisor.background import LOG
@@ -30,6 +30,7 @@ _LINES: Final = 50
 _WINDOW: Final = 2_000  # lines in which a poll looks for those that it knows
 _LOOK_S: Final = 0.3
 _SUPERVISOR: Final = "supervisor"
+_PROGRAMS: Final = ("node", PROXY, SWITCH)
 
 Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="such as m3; see fog status")]
 Program = Annotated[str, typer.Argument(metavar="[PROGRAM]", help="node, proxy or switch; empty: the machine itself")]
@@ -89,7 +90,9 @@ def logs(
                     return None
                 return provider.log(record.id, program, _WINDOW if follow else lines).splitlines()
 
-            _show(lines_of_machine, lines, say, max(_LOOK_S, provider.poll_s) if follow else None)
+            is_empty = _show(lines_of_machine, lines, say, max(_LOOK_S, provider.poll_s) if follow else None)
+            if is_empty and program not in ("", *_PROGRAMS):
+                raise LocalError(f"{machine}: no line of {program!r}; programs are {', '.join(_PROGRAMS)}")
         if follow:
             echo(f"{machine} is gone; its last lines: fog logs {machine} {program}", err=True)
 
@@ -108,8 +111,11 @@ def new_lines(known: Sequence[str], now: Sequence[str]) -> Sequence[str]:
 
 def _show(
     read: Callable[[], list[str] | None], lines: int, say: Callable[[Sequence[str]], None], every_s: float | None
-) -> None:
-    """Say the last lines, and with ``every_s`` those that follow, until Ctrl-C or until ``read`` returns None."""
+) -> bool:
+    """Say the last lines, and with ``every_s`` those that follow, until Ctrl-C or until ``read`` returns None.
+
+    Return whether there were none.
+    """
     known = read() or []
     say(known[-lines:])
     try:
@@ -117,11 +123,12 @@ def _show(
             time.sleep(every_s)
             now = read()
             if now is None:
-                return
+                break
             say(new_lines(known, now))
             known = now
     except KeyboardInterrupt:
         raise typer.Exit(0) from None
+    return not known
 
 
 def _final_log(journal: Journal, record: Record, program: str) -> tuple[str, list[str]]:

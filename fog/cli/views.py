@@ -212,8 +212,14 @@ def a_console(*, stderr: bool = False) -> Console:
 def show(*parts: RenderableType) -> None:
     """Print tables."""
     shown = a_console()
-    for part in parts:
-        shown.print(part)
+    if shown.is_terminal:
+        for part in parts:
+            shown.print(part)
+        return
+    with shown.capture() as captured:  # a table fills its last column with blanks
+        for part in parts:
+            shown.print(part)
+    echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
 def print_json(value: object) -> None:

@@ -5,8 +5,10 @@ I/O; executes the file, which is Python, and starts no node.
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import inspect
+import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -159,8 +161,16 @@ def _described(path: Path) -> object:
     except GdpError as error:
         raise ConfigError(_place(path, error), "", str(error)) from error
     except (Exception, SystemExit) as error:  # any error of the user's code is reported with its line
-        raise ConfigError(_place(path, error), "", f"{type(error).__name__}: {error}") from error
+        raise ConfigError(_place(path, error), "", f"{type(error).__name__}: {error}{_near_word(error)}") from error
     return described
+
+
+def _near_word(error: BaseException) -> str:
+    """Return the argument of ``FogCluster`` that an unknown one may mean."""
+    found = re.search(r"FogCluster.*unexpected keyword argument '(\w+)'", str(error))
+    known = inspect.signature(FogCluster).parameters
+    near = difflib.get_close_matches(found[1], known, 1) if found is not None else []
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _module(path: Path) -> ModuleType:
@@ -182,7 +192,8 @@ def _module(path: Path) -> ModuleType:
 
 def _place(path: Path, error: BaseException) -> str:
     """Return ``file:line`` of the last launch-file line in the error's traceback."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
+    if isinstance(error, SyntaxError) and error.filename and Path(error.filename).resolve() == path.resolve():
         return f"{path}:{error.lineno}"
-    lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]
+    whole = path.resolve()  # the importer makes the name absolute
+    lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if Path(at.filename).resolve() == whole]
     return f"{path}:{lines[-1]}" if lines else str(path)

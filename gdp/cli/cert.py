@@ -35,7 +35,16 @@ from gdp.stores.issue import (
     renew_node,
     succeed_owner,
 )
-from gdp.stores.keyring import CARD, NODE_CERTIFICATE, load_delegation, load_domain, load_node_keys, load_root, parsed
+from gdp.stores.keyring import (
+    CARD,
+    NODE_CERTIFICATE,
+    ROOT_CERTIFICATE,
+    load_delegation,
+    load_domain,
+    load_node_keys,
+    load_root,
+    parsed,
+)
 from gdp.stores.ledger import LEDGER, read_ledger
 from gdp.stores.rollover import trust_successor
 from gdp.terminal import echo
@@ -239,13 +248,25 @@ def install(
 
 
 @app.command("show")
-def show_(file: CertificateFile, root: RootFile, as_json: options.Json = False) -> None:
+def show_(
+    file: Annotated[Path, typer.Argument(metavar="NODE_DIR|FILE", help="a node's directory, or a membership")],
+    root: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--root", metavar="FILE", help="the domain's root certificate; default: that of NODE_DIR"),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
     """Verify a membership under a root and print its holder.
 
     \b
-    Example:
+    Examples:
+      gdp cert show robot/rib
       gdp cert show keys/robot/node.crt --root keys/school/root.crt
     """
+    if file.is_dir():
+        file, root = file / NODE_CERTIFICATE, root or file / ROOT_CERTIFICATE
+    if root is None:
+        raise LocalError(f"{file}: state --root FILE, or the directory of a node")
     show(_described(_member(file, root)), as_json=as_json)
 
 

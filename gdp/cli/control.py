@@ -6,6 +6,7 @@ I/O. Exit codes: 0 done, 1 the node refused or ended before it was done, 2 wrong
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
@@ -54,7 +55,11 @@ def reload(
 
 
 def status(
-    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: options.Json = False
+    node: NodeDirectory = None,
+    socket: Socket = None,
+    timeout: Timeout = 10.0,
+    all_: Annotated[bool, typer.Option("--all", help="Counters that are zero, too.")] = False,
+    as_json: options.Json = False,
 ) -> None:
     """Show the identity, the uptime and the counters of a running node.
 
@@ -63,7 +68,7 @@ def status(
       gdp status robot/switch
       gdp status robot/proxy --json
     """
-    _run(Command.STATUS, node, socket, timeout, as_json=as_json)
+    _run(Command.STATUS, node, socket, timeout, as_json=as_json, has_zeros=all_)
 
 
 def drain(
@@ -81,7 +86,9 @@ def drain(
     _run(Command.DRAIN, node, socket, timeout, as_json=as_json)
 
 
-def _run(command: Command, node: Path | None, socket: Path | None, timeout_s: float, *, as_json: bool) -> None:
+def _run(
+    command: Command, node: Path | None, socket: Path | None, timeout_s: float, *, as_json: bool, has_zeros: bool = True
+) -> None:
     if (node is None) == (socket is None):
         raise LocalError(f"{command.value}: name either NODE_DIR or --socket FILE")
     path = socket if socket is not None else find_control_socket(node or Path())
@@ -96,10 +103,22 @@ def _run(command: Command, node: Path | None, socket: Path | None, timeout_s: fl
         _fail(str(error), _NOT_RUNNING, as_json=as_json)
     if not last.is_ok:
         _fail(f"{path}: {last.error}", _FAILED, as_json=as_json)
-    show(last.result, as_json=as_json)
+    show(last.result if as_json else _flat(last.result, has_zeros=has_zeros), as_json=as_json)
     if last.result.get("complete") is False:
         echo(f"gdp: {path}: the node ended with unfinished work", err=True)
         raise typer.Exit(_FAILED)
+
+
+def _flat(fields: Mapping[str, object], *, has_zeros: bool) -> dict[str, object]:
+    """Return nested mappings as one, with keys such as ``drops.no-reader``; zeros in them are left out."""
+    rows: dict[str, object] = {}
+    for key, value in fields.items():
+        if isinstance(value, Mapping):
+            nested = _flat(value, has_zeros=has_zeros)
+            rows |= {f"{key}.{each}": its for each, its in nested.items() if has_zeros or its not in (0, None, "", [])}
+        else:
+            rows[key] = value
+    return rows
 
 
 def _fail(reason: str, code: int, *, as_json: bool) -> None:

@@ -98,7 +98,8 @@ def set_up_logging(
         quiet: log warnings alone unless ``verbose``.
     """
     least = logging.DEBUG if verbose else logging.WARNING if quiet else getattr(logging, level.name)
-    logging.basicConfig(level=least, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    module = " %(name)s" if least <= logging.DEBUG else ""
+    logging.basicConfig(level=least, stream=sys.stderr, format=f"%(asctime)s %(levelname)s{module} %(message)s")
     for handler in logging.getLogger().handlers:
         handler.addFilter(_is_ours_or_serious)
         if form is Format.JSON:

@@ -24,7 +24,7 @@ from gdp.cli.node import (
     set_up_logging,
 )
 from gdp.cli.output import show
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -100,7 +100,7 @@ def _report_ready(identity: Identity, relay: Relay, *, json: bool) -> None:
 def main() -> None:
     """Run the command."""
     allow_completion("gdp-relay")
-    app(prog_name="gdp-relay")
+    versioned(app)(prog_name="gdp-relay")
 
 
 if __name__ == "__main__":

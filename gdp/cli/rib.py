@@ -26,7 +26,7 @@ from gdp.cli.node import (
     member_plane,
     set_up_logging,
 )
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.config.config import RibConfig
 from gdp.crypto.certificates import Role
 from gdp.links.uplink import wait_for_device
@@ -81,7 +81,7 @@ def _report(event: str, text: str, name: Name, *, json: bool) -> None:
 def main() -> None:
     """Run the command."""
     allow_completion("gdp-rib")
-    app(prog_name="gdp-rib")
+    versioned(app)(prog_name="gdp-rib")
 
 
 if __name__ == "__main__":

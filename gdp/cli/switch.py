@@ -29,7 +29,7 @@ from gdp.cli.node import (
     failing_clearly,
     set_up_logging,
 )
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.config.config import DataPlane, SwitchConfig
 from gdp.config.found_config import find_switch_config
 from gdp.crypto.certificates import Role
@@ -135,7 +135,7 @@ def _report_ready(identity: Identity, plane: str, reason: str, *, json: bool) ->
 def main() -> None:
     """Run the command."""
     allow_completion("gdp-switch")
-    app(prog_name="gdp-switch")
+    versioned(app)(prog_name="gdp-switch")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ __all__ = ["cell", "print_table", "select_columns"]
 
 _HEX_DIGITS = 2 * NAME_BYTES
 _LAST = "…"
+_CUT_MIN = 24  # a column is cut only where so much of it is shown
 
 
 def select_columns(rows: Sequence[Mapping[str, object]], columns: str | None) -> list[str]:
@@ -38,15 +39,28 @@ def select_columns(rows: Sequence[Mapping[str, object]], columns: str | None) ->
 def print_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> None:
     """Print rows under their column names.
 
-    On a terminal, names are short and lines end at its width; elsewhere everything is whole.
+    On a terminal, names are short, and columns that do not fit are left out and named; elsewhere everything is whole.
     """
     is_terminal = sys.stdout.isatty()
     cells = [[cell(row.get(column), is_short=is_terminal) for column in columns] for row in rows]
     widths = [max(map(len, (column, *(line[at] for line in cells)))) for at, column in enumerate(columns)]
     width = shutil.get_terminal_size().columns if is_terminal else 0
+    shown = _fitting(widths, width) if width else len(columns)
     for line in [[column.upper() for column in columns], *cells]:
-        text = "  ".join(word.ljust(size) for word, size in zip(line, widths, strict=True)).rstrip()
+        text = "  ".join(word.ljust(size) for word, size in zip(line[:shown], widths[:shown], strict=True)).rstrip()
         echo(text if not width or len(text) <= width else text[: width - 1] + _LAST)
+    if left_out := columns[shown:]:
+        echo(f"gdp: left out, too wide: {', '.join(left_out)}; --columns chooses, a pipe has all", err=True)
+
+
+def _fitting(widths: Sequence[int], width: int) -> int:
+    """Return how many columns fit, the first in any case; one that is long, such as a text, may be cut."""
+    taken = 0
+    for at, size in enumerate(widths):
+        if at and taken + min(size, _CUT_MIN) > width:
+            return at
+        taken += size + len("  ")
+    return len(widths)
 
 
 def cell(value: object, *, is_short: bool) -> str:

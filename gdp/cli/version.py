@@ -1,10 +1,11 @@
-"""Options ``--version`` and ``-h`` of every command and sub-command.
+"""Options ``--version`` and ``-h`` of every command and sub-command, and the form of its help.
 
 I/O.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Final
 
@@ -36,12 +37,21 @@ def versioned(app: typer.Typer) -> Callable[..., Any]:
 
 
 def with_version(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command with the option ``--version`` on it and on all below it that are loaded."""
+    """Return a command with the option ``--version`` on it and on all below it that are loaded.
+
+    The lines of a paragraph of their help are joined, so that they break at the width of the terminal alone.
+    """
     option = _option()
     for each in _all_of(command):
+        each.help = _joined(each.help or "")
         if not any("--version" in param.opts for param in each.params):
             each.params.append(option)
     return command
+
+
+def _joined(text: str) -> str:
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(each if each.startswith("\b") else each.replace("\n", " ") for each in paragraphs)
 
 
 def _option() -> Any:

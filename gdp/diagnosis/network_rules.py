@@ -33,6 +33,7 @@ __all__ = [
 
 Found = tuple[str, str] | None
 
+_START: Final = "gdp up FOLDER"  # on the machine of the node
 _STRANGER: Final = "neighbour-refused"
 _SILENT: Final = ("no-neighbour", "not-heard")
 
@@ -43,7 +44,7 @@ def no_proxy_here(view: View) -> Found:
         return None
     down = next((each for each in view.facts.unreachable if each.role == "proxy"), None)
     where = "this machine" if down is None else down.where
-    return f"No proxy runs on {where}, so nothing crosses.", "gdp-proxy --config proxy.yaml"
+    return f"No proxy runs on {where}, so nothing crosses.", _START
 
 
 def clock(view: View) -> Found:
@@ -126,7 +127,7 @@ def switch_down(view: View) -> Found:
     """A switch that the asker named does not run."""
     for each in view.facts.unreachable:
         if each.role == "switch" and each.is_down:
-            return f"The switch {each.where} does not run.", f"gdp-switch --config {each.where}.yaml"
+            return f"The switch {each.where} does not run.", _START
     return None
 
 
@@ -152,7 +153,7 @@ def link_silent(view: View) -> Found:
             text = f"The neighbour of {view.place_of(node)} on {wait.device} does not hear it, or does not trust it."
             return text, "gdp status NODE_DIR"
         text = f"No switch answers on {wait.device} of {view.place_of(node)}"
-        return f"{text}: it does not run, or something filters EtherType 0x88B5.", "gdp-switch --config switch.yaml"
+        return f"{text}: it does not run, or something filters EtherType 0x88B5.", _START
     return None
 
 
@@ -186,17 +187,15 @@ def rib_down(view: View) -> Found:
     """No RIB answers."""
     for each in view.facts.unreachable:
         if each.role == "rib" and each.is_down:
-            return f"The RIB {each.where} does not run, so no switch learns where names are.", (
-                f"gdp-rib --config {each.where}.yaml"
-            )
+            return f"The RIB {each.where} does not run, so no switch learns where names are.", _START
     cut = {node.name for node, _ in view.waits(*_SILENT, "link-down")}
     if any(each.rib for each in view.facts.switches):
         return None
     for switch in view.facts.switches:
         if switch.name not in cut:
-            return f"{_of(view, switch)} reaches no RIB, so names are not found.", "gdp-rib --config rib.yaml"
+            return f"{_of(view, switch)} reaches no RIB, so names are not found.", _START
     for node, _ in view.waits("no-rib") if not view.facts.switches else ():
-        return f"No RIB answers {view.place_of(node)}, so names are not found.", "gdp-rib --config rib.yaml"
+        return f"No RIB answers {view.place_of(node)}, so names are not found.", _START
     return None
 
 
@@ -205,7 +204,7 @@ def rib_silent(view: View) -> Found:
     for switch in view.facts.switches:
         if switch.is_rib_silent and not view.advertisers:
             text = f"{_of(view, switch)} gets no answer from RIB {short(switch.rib)}, so the name is not found."
-            return text, "gdp-rib --config rib.yaml"
+            return text, _START
     return None
 
 
@@ -213,14 +212,14 @@ def far_proxy_down(view: View) -> Found:
     """The other end's proxy is away: the asker knows that it does not run, or its lease ended."""
     for each in view.facts.unreachable:
         if each.role == "proxy" and each.is_down and view.near is not None:
-            return f"The proxy {each.where} does not run.", f"gdp-proxy --config {each.where}.yaml"
+            return f"The proxy {each.where} does not run.", _START
     lapsed = [each for each in view.lapsed if view.reaches(each.switch, each.domain)]
     if lapsed:
         text = f"Proxy {short(lapsed[-1].advertiser)} advertised the name until its lease ended"
-        return f"{text}: it stopped without a goodbye, or its machine is cut off.", "gdp-proxy --config proxy.yaml"
+        return f"{text}: it stopped without a goodbye, or its machine is cut off.", _START
     is_known = view.exporters or view.facts.ribs
     if not is_known and not view.advertisers and any(each.flow.absent for each in view.importers):
-        return "The proxy that published the name is gone.", "gdp-proxy --config proxy.yaml"
+        return "The proxy that published the name is gone.", _START
     return None
 
 

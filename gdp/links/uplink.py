@@ -71,13 +71,13 @@ def wait_for_device(ifname: str, patience_s: float) -> None:
     """Return when a device of this name exists, or after ``patience_s``; opening it then reports its absence."""
     end_s = time.monotonic() + patience_s
     with contextlib.closing(LinkMonitor()) as links:
-        found, is_reported = links.all(), False
+        found, is_logged = links.all(), False
         while not any(link.ifname == ifname and not link.gone for link in found):
             rest_s = end_s - time.monotonic()
             if rest_s <= 0:
                 return
-            if not is_reported:
+            if not is_logged:
                 log.info("waiting for device ifname=%s timeout_s=%g", ifname, patience_s)
-                is_reported = True
+                is_logged = True
             readable([links], rest_s)
             found = links.poll()

@@ -119,6 +119,11 @@ class Sharing:
             check_accepted(at.files, at.state, at.offers, wanted)
             at.state = at.state.model_copy(update={"accepted": (*at.state.accepted, wanted)})
             self._apply(at, is_required=True)
+            if wanted.source is not None:  # it may join later: an unknown label is reported, not refused
+                try:
+                    resolve_recipients([wanted.source], at.grants.nodes(), {})
+                except GdpError as error:
+                    at.report.add_problem(error)
         return at.report
 
     def stop_accepting(self, side: Side, name: str, unix_s: float) -> ShareReport:

@@ -551,7 +551,7 @@ class Bridge:
         if not self._context.member.is_acknowledged(name):
             count = self._context.member.unacknowledged(name)
             detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
-            self._context.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
+            self._context.faults.report(flow_spec.local, Fault.UNCONFIRMED, detail)
         self._close(flow_spec, flow)
 
     def _close(self, flow_spec: FlowSpec, flow: Flow) -> None:

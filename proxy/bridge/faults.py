@@ -32,6 +32,7 @@ class Fault(str, Enum):
     QOS = "qos"  # a local reader or publisher whose QoS cannot match
     TOO_LARGE = "too-large"
     TOO_FAST = "too-fast"  # the path does not keep up
+    UNCONFIRMED = "unconfirmed"  # readers had not confirmed all when it ended
     MALFORMED = "malformed"  # bytes that do not fit their definition
     NO_GRAPH = "no-graph"  # a master, a domain or a peer is unavailable
     NO_SERVER = "no-server"

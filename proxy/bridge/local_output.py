@@ -137,7 +137,9 @@ class MergedPublisher:
 
     def _offer(self, channel: Channel) -> None:
         """Create the publisher with the remote QoS, within what local readers allow; replace it where they change."""
-        profile = offer(tuple(self._far.values()), self._wants, is_latched=self._flow_spec.rule.wants_latched)
+        rule = self._flow_spec.rule
+        far, latched, reliable = tuple(self._far.values()), rule.wants_latched, rule.wants_reliable
+        profile = offer(far, self._wants, is_latched=latched, is_reliable=reliable)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):

@@ -28,7 +28,7 @@ from gdp.cli.node import (
     member_plane,
     set_up_logging,
 )
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.links.uplink import wait_for_device
 from proxy.config.config import ProxyConfig
 
@@ -107,7 +107,7 @@ def proxy(
 def main() -> None:
     """Run the command."""
     allow_completion("gdp-proxy")
-    app(prog_name="gdp-proxy")
+    versioned(app)(prog_name="gdp-proxy")
 
 
 if __name__ == "__main__":

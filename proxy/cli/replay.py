@@ -33,7 +33,7 @@ from gdp.cli.node import (
     member_plane,
     set_up_logging,
 )
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.errors import LocalError
 from gdp.terminal import echo
 from proxy.check.command import check_proxy
@@ -229,7 +229,7 @@ def _topic_fields(replay: Replay) -> list[dict[str, object]]:
 def main() -> None:
     """Run the command."""
     allow_completion("gdp-replay")
-    app(prog_name="gdp-replay")
+    versioned(app)(prog_name="gdp-replay")
 
 
 if __name__ == "__main__":

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from io import FileIO
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, Protocol
@@ -29,6 +31,8 @@ from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
 
 __all__ = ["PARTIAL", "BagWriter", "refuse_existing"]
+
+log = logging.getLogger(__name__)
 
 PARTIAL: Final = ".partial"
 _STAMPS_NS: Final = {1: (1 << 32) * 1_000_000_000, 2: 1 << 63}
@@ -86,6 +90,7 @@ class BagWriter:
         self.failure = ""
         refuse_existing(self.path)
         try:
+            _put_aside(self.partial)
             self._format: _Format = (
                 _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
             )
@@ -172,7 +177,7 @@ class BagWriter:
         try:
             self._format.finish()
             _sync(self.partial)
-            refuse_existing(self.path, partial=False)
+            refuse_existing(self.path)
             self.partial.rename(self.path)
         except OSError as error:
             why = f"{self.path} cannot be written: {error.strerror}"
@@ -261,17 +266,31 @@ class _Ros1Format:
         self._writer.close()
 
 
-def refuse_existing(path: Path, *, partial: bool = True) -> None:
-    """Refuse to record into an existing file.
-
-    Raises:
-        LocalError: the file exists, or an incomplete one from a run that was killed.
-    """
+def refuse_existing(path: Path) -> None:
+    """Refuse to record into an existing file, with a ``LocalError``."""
     if path.exists():
         raise LocalError(f"{path} exists already")
-    unfinished = path.with_name(path.name + PARTIAL)
-    if partial and unfinished.exists():
-        raise LocalError(f"{unfinished} is of a run that did not end: gdp recording finish {unfinished}")
+
+
+def _put_aside(partial: Path) -> None:
+    """Give the file of a run that was killed another name, so that a new run can record.
+
+    Raises:
+        LocalError: another process writes it.
+    """
+    if not partial.exists():
+        return
+    with partial.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise LocalError(f"{partial} is being written by another process") from error
+        name = partial.name.removesuffix(PARTIAL)
+        stem, suffix = Path(name).stem, Path(name).suffix
+        places = (partial.with_name(f"{stem}-killed{number}{suffix}{PARTIAL}") for number in count(1))
+        place = next(each for each in places if not each.exists() and not each.with_suffix("").exists())
+        partial.rename(place)
+    log.warning("a run that was killed left a recording: gdp recording finish %s", place)
 
 
 def _sync(path: Path) -> None:

@@ -20,6 +20,7 @@ __all__ = ["EVENTS_MAX", "Scene"]
 EVENTS_MAX: Final = 400
 _EVENT_AGE_S: Final = 900.0
 _LISTED_MAX: Final = 4  # names of one node that come or go at once and are listed one by one
+_RATE_S: Final = 4.0  # over which a rate is the mean: a slow topic has few messages a poll
 _DROP_PAUSE_S: Final = 10.0  # between two events about one reason at one node
 
 
@@ -40,6 +41,7 @@ class Scene:
         self._before_s: float | None = None
         self._totals: dict[str, float] = {}  # the last value of each counter
         self._rates: dict[str, float] = {}
+        self._recent = deque[tuple[float, dict[str, float]]]()  # seconds of each poll, and what was counted in it
         self._drop_events: dict[tuple[str, str], float] = {}
         self._reports_seen = 0.0
         self._unix_s = 0.0
@@ -134,11 +136,18 @@ class Scene:
         totals |= graph.counts
         before, self._totals = self._totals, totals
         # A restarted node counts from zero again, which is no negative rate.
-        return {
-            key: (value - before[key]) / elapsed_s
-            for key, value in totals.items()
-            if key in before and value > before[key]
-        }
+        counted = {key: value - before[key] for key, value in totals.items() if key in before and value > before[key]}
+        if not before:
+            return {}
+        self._recent.append((elapsed_s, counted))
+        while sum(each for each, _ in self._recent) - self._recent[0][0] >= _RATE_S:
+            self._recent.popleft()
+        sums: dict[str, float] = {}
+        for _, recent in self._recent:
+            for key, value in recent.items():
+                sums[key] = sums.get(key, 0.0) + value
+        whole_s = sum(each for each, _ in self._recent)
+        return {key: value / whole_s for key, value in sums.items() if key in totals}
 
     def _totals_of(self, graph: Graph) -> dict[str, float]:
         rates = self._rates

@@ -97,17 +97,20 @@ def kept(offers: Sequence[Qos], found: int | None = None) -> int:
     return DEPTH_MAX if len(latched) > 1 else min(depth_of(latched[0]), DEPTH_MAX)
 
 
-def offer(sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | None) -> Qos:
+def offer(
+    sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | None, is_reliable: bool | None = None
+) -> Qos:
     """Return the profile to offer: that of the known remote publishers, and more where a local reader requires it.
 
     Args:
         is_latched: the rule's value; None: unset.
+        is_reliable: likewise; it holds until a remote publisher is known.
     """
     latched = [each for each in sources if each.durability == "transient_local"]
     insisting = [each for each in wants if each.durability == "transient_local"]
     is_latched = bool(latched) if is_latched is None else is_latched
     depth = DEPTH_MAX if len(latched) > 1 else max(map(depth_of, sources or insisting), default=_DEPTH)
-    is_reliable = not sources or any(each.reliability != "best_effort" for each in sources)
+    is_reliable = any(each.reliability != "best_effort" for each in sources) if sources else is_reliable is not False
     return default(
         reliable=is_reliable or any(each.reliability == "reliable" for each in wants),
         latched=is_latched or bool(insisting),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -164,6 +165,26 @@ def test_the_final_log_lines_of_a_machine_that_is_gone_are_shown(fog: Run, journ
     assert "m3 is gone" in fog("ssh", "m3").output
 
 
+def test_of_a_program_that_does_not_exist_the_programs_are_named(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    up(journal)
+    journal.put(serving("m1"), time.time(), "serving", "")
+    provider = SimpleNamespace(poll_s=0.0, log=lambda *_: "", close=lambda: None)
+    monkeypatch.setattr(logs, "open_provider", lambda site: provider)
+    result = fog("logs", "m1", "nod")
+    assert (result.exit_code, "no line of 'nod'; programs are node, proxy, switch" in result.output) == (2, True)
+    assert fog("logs", "m1", "node").exit_code == 0
+
+
+def test_events_in_a_pipe_end_without_blanks(fog: Run, journal: Journal) -> None:
+    up(journal)
+    journal.write_event(time.time(), "c", "m3", "trouble", "it is late")
+    lines = fog("status", "--events").output.splitlines()
+    assert any("it is late" in line for line in lines)
+    assert all(line == line.rstrip() for line in lines)
+
+
 def test_a_log_is_followed_until_its_machine_is_gone(
     fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -279,6 +300,14 @@ def generate_launch_description():
 def launch_file(folder: Path, machine: str = "", more: str = "") -> str:
     (folder / "x.launch.py").write_text(LAUNCH % (machine, more), encoding="utf-8")
     return str(folder / "x.launch.py")
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], []])
+def test_a_program_that_does_not_exist_is_refused_at_once(fog: Run, tmp_path: Path, options: list[str]) -> None:
+    path = Path(launch_file(tmp_path))
+    path.write_text(re.sub(r"executable=['\"][^'\"]*['\"]", "executable='absent_program'", path.read_text()))
+    result = fog("launch", str(path), *options)
+    assert (result.exit_code, "absent_program" in result.output) == (2, True)
 
 
 def test_a_dry_run_makes_neither_a_site_nor_keys(fog: Run, tmp_path: Path) -> None:

@@ -112,6 +112,7 @@ def test_a_word_that_is_no_argument_is_refused() -> None:
     ("text", "says"),
     [
         ("import fog\ndef f(:\n  pass", r"launch\.py:2: SyntaxError"),
+        ("import fog\nfog.FogCluster(cloud_nodes=[], deployment=[])", r"launch\.py:2: .*did you mean deployments\?"),
         ("import fog\n1/0", r"launch\.py:2: ZeroDivisionError"),
         ("import fog\nfog.CloudMachine(hardware='T5')", r"launch\.py:2: hardware 'T5'"),
         ("import fog\nfog.Node(package='a', executable='b', condition=1)", r"launch\.py:2: TypeError: .*'condition'"),
@@ -149,3 +150,12 @@ def test_importing_the_package_loads_nothing_else() -> None:
         "import fog, sys; sys.exit(sum(name.startswith(('fog.', 'gdp', 'yaml', 'pydantic')) for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_an_error_has_its_line_where_the_file_is_named_by_a_relative_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.launch.py").write_text("import fog\n1/0\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"x\.launch\.py:2: ZeroDivisionError"):
+        load(Path("x.launch.py"), {})

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -324,3 +325,40 @@ def test_where_no_node_runs_those_of_the_host_are_asked(capsys: pytest.CaptureFi
     assert gdp("show", "names") == 0
     assert "server-proxy" in capsys.readouterr().out
     assert len(running_nodes.find_running_nodes().nodes) == 1
+
+
+def test_columns_that_do_not_fit_are_left_out_whole_and_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "18")
+    tables.print_table([{"port": "eth0", "loss_out": 0.25, "mtu": 1_500}], ["port", "loss_out", "mtu"])
+    out, err = capsys.readouterr()
+    assert [line.split() for line in out.splitlines()] == [["PORT", "LOSS_OUT"], ["eth0", "0.25"]]
+    assert "left out, too wide: mtu" in err
+
+
+def test_a_status_has_a_line_for_each_count_that_is_not_zero(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    counters = {"drops": {"no-reader": 3, "malformed": 0}, "sent": 0}
+    handlers = ControlHandlers(
+        reload=lambda: None, status=lambda: {"role": "switch", "counters": counters}, drain=lambda: None
+    )
+    with serve_control_in_thread(folder / "one.sock", handlers):
+        assert gdp("status", "--socket", str(folder / "one.sock")) == 0
+        lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+        assert [line for line in lines if line[0].startswith("counters")] == [["counters.drops.no-reader", "3"]]
+        gdp("status", "--socket", str(folder / "one.sock"), "--all")
+        assert ["counters.sent", "0"] in [line.split() for line in capsys.readouterr().out.splitlines()]
+
+
+@pytest.mark.parametrize("words", [("up",), ("trace",), ("explain",)])
+def test_help_breaks_lines_at_the_width_of_the_terminal_alone(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 80)
+    gdp(*words, "--help")
+    prose = [line.strip() for line in capsys.readouterr().out.split("Example")[0].splitlines()]
+    for line, below in pairwise(prose):
+        if line and below:
+            assert len(f"{line} {below.split()[0]}") > 78, line

@@ -98,6 +98,7 @@ def test_the_way_of_a_node_that_is_elsewhere(gdp: Run, keys: None) -> None:
     assert gdp("cert issue --domain school --request far/node.csr --role switch --label far --out far.crt").code == 0
     assert gdp("cert install far --cert far.crt --root school/root.crt").code == 0
     said = json.loads(gdp("cert show far/node.crt --root school/root.crt --json").out)
+    assert json.loads(gdp("cert show far --json").out) == said  # the directory of a node is enough
     assert (said["role"], said["label"]) == ("switch", "far")
 
 

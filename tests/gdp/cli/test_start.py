@@ -31,5 +31,5 @@ def test_a_node_starts_without_large_libraries_that_it_does_not_need(modules: st
 
 
 @pytest.mark.parametrize("command", [rib, proxy])
-def test_a_node_started_with_its_switch_waits_for_the_device(command: Callable[..., None]) -> None:
+def test_a_node_that_starts_with_its_switch_waits_for_the_device(command: Callable[..., None]) -> None:
     assert inspect.signature(command).parameters["await_iface"].default >= 10

@@ -195,6 +195,12 @@ def test_only_the_named_sender_is_accepted(site: Site, robot: Machine, server: M
     assert held.subject.owner_key.hex() == robot.exposing("/x").owner_key
 
 
+def test_a_sender_that_is_not_in_the_domain_is_named_and_may_join_later(site: Site, server: Machine) -> None:
+    report = server.sharing.accept(importing("/state", "robt"), site.now_s)
+    assert any("'robt': no such node" in text and "server" in text for text in report.problems)
+    assert [each.source for each in server.sharing.state().accepted] == ["robt"]
+
+
 def test_of_two_owners_names_the_first_one_stays_in_use(site: Site, robot: Machine, server: Machine) -> None:
     arm = site.add("arm")
     robot.sharing.expose(robot.exposing("/state", "server", type_name=STRING), site.now_s)

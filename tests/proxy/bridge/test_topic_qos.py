@@ -55,6 +55,13 @@ def test_the_virtual_publisher_offers_what_the_far_one_does(sites: Sites, qos: Q
     assert offered(server).reliability == qos.reliability
 
 
+def test_an_importing_rule_states_the_qos_until_a_reader_makes_the_far_one_known(sites: Sites) -> None:
+    sites.add(ROBOT, expose=[CHATTER])
+    server = sites.add(SERVER, imports=[CHATTER + ", reliable: false, latched: true"])
+    sites.run(1)
+    assert (offered(server).reliability, offered(server).durability) == ("best_effort", "transient_local")
+
+
 def test_a_ros_1_publisher_is_not_replaced_because_the_far_qos_differs(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
     ear = Ear(server.graph, "/chatter")

@@ -112,7 +112,7 @@ def test_messages_that_stay_unconfirmed_after_their_publisher_has_gone_are_repor
     sites.run(9)
     assert (len(robot.member.publishers()), robot.faults) == (1, {})
     assert sites.run(2, lambda: not robot.member.publishers())
-    assert robot.faults == {"too-fast": 1}
+    assert robot.faults == {"unconfirmed": 1}
 
 
 def test_a_publisher_that_returns_while_its_last_messages_are_under_way_goes_on(sites: Sites) -> None:
@@ -128,7 +128,7 @@ def test_a_publisher_that_returns_while_its_last_messages_are_under_way_goes_on(
     assert sites.run(10, robot.is_read)
     again.publish(string("again"))
     assert sites.run(2, lambda: ear.texts[-1:] == ["again"])
-    assert robot.faults == {"too-fast": 1}  # what the first one sent last is reported, not confirmed
+    assert robot.faults == {"unconfirmed": 1}  # what the first one sent last is reported, not confirmed
 
 
 def test_a_rule_that_ends_ends_its_flow_at_once(sites: Sites) -> None:

@@ -106,8 +106,6 @@ def test_what_was_flushed_is_read_after_a_kill(ros: RosVersion, name: str, tmp_p
     assert done.returncode == -signal.SIGKILL
     partial = tmp_path / f"{name}.partial"
     assert texts(partial) == [raw(ros, b"%d" % number) for number in range(20)]
-    with pytest.raises(LocalError, match=f"gdp recording finish {partial}"):
-        BagWriter(tmp_path / name, ros)
     said = CliRunner().invoke(app, ["finish", str(partial)])
     assert said.exit_code == 0, said.output
     assert f"20 messages are in {tmp_path / name}" in said.output
@@ -218,6 +216,24 @@ def test_a_part_that_cannot_be_made_ends_the_recording(tmp_path: Path) -> None:
     assert bag.failure.endswith("a_1.mcap exists already")
     bag.close()
     assert (bag.received, bag.written) == (2, 1)
+
+
+def test_a_new_run_records_and_keeps_what_a_killed_one_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for run in range(3):
+        bag = BagWriter(tmp_path / "a.mcap", 2)
+        bag.write(bag.add(string(2)), START_NS, raw(2, b"%d" % run))
+        bag.flush()
+        if run < 2:
+            bag._syncs.shutdown()
+            bag._format.file.close()  # as the kernel does when a process is killed
+    with pytest.raises(LocalError, match="is being written by another process"):
+        BagWriter(tmp_path / "a.mcap", 2)
+    bag.close()
+    left = [tmp_path / f"a-killed{number}.mcap.partial" for number in (1, 2)]
+    assert [texts(path) for path in (*left, bag.path)] == [[raw(2, b"%d" % run)] for run in range(3)]
+    assert f"gdp recording finish {left[1]}" in caplog.text
+    assert CliRunner().invoke(app, ["finish", str(left[0])]).exit_code == 0
+    assert texts(tmp_path / "a-killed1.mcap") == [raw(2, b"0")]
 
 
 def test_a_recording_that_is_being_written_is_not_finished_by_another(tmp_path: Path) -> None:

@@ -40,6 +40,17 @@ def test_two_ends_make_one_link_with_the_rate_of_each_direction() -> None:
     assert figures["links"] == [[1_000.0, 400.0, 0.4, 0.0]]
 
 
+def test_the_rate_of_a_slow_name_is_its_mean_over_some_seconds() -> None:
+    scene = Scene()
+    seen = []
+    for poll in range(24):
+        now_s = 0.75 * poll
+        scene.update([switch("a", link("b", 100 * int(now_s)))], now_s, now_s)  # 100 bytes, once a second
+        figures: Any = scene.figures(0)
+        seen.append(figures["links"][0][0])
+    assert all(70 <= each <= 130 for each in seen[8:])
+
+
 def test_a_restarted_node_shows_no_negative_rate() -> None:
     scene = Scene()
     for at, count in enumerate((5_000, 10)):
