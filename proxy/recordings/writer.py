@@ -95,6 +95,7 @@ class BagWriter:
                 _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
             )
             fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _sync(self.path.parent)
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error
         self._handles: dict[tuple[object, ...], int] = {}  # by the properties that the format can distinguish
@@ -179,6 +180,7 @@ class BagWriter:
             _sync(self.partial)
             refuse_existing(self.path)
             self.partial.rename(self.path)
+            _sync(self.path.parent)
         except OSError as error:
             why = f"{self.path} cannot be written: {error.strerror}"
             raise LocalError(
@@ -294,7 +296,7 @@ def _put_aside(partial: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Put a file on the disk; raises ``OSError`` where that fails."""
+    """Put a file or the names in a folder on the disk; raises ``OSError`` where that fails."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
