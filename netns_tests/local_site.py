@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import select
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +20,7 @@ from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.process import LabProcess, end_processes
 from tests.pages import ROOT
 
 PATIENCE_S: Final = 30.0
@@ -80,7 +79,7 @@ class Domain:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._running: list[subprocess.Popen[str] | subprocess.Popen[bytes]] = []
+        self._running: list[LabProcess] = []
         make_domain(folder / "domain", "test")
 
     def gateway(self, label: str, ifaces: Sequence[str]) -> MachineBundle:
@@ -113,24 +112,20 @@ class Domain:
         self._start("switch", self._switch("robot", [uplink], ["rib0", *attach]))
         self._start("rib", self._node(Role.RIB, "robot", {"iface": "rib0"}))
 
-    def start_client(self, iface: str, service: Metadata, requests: int, size: int) -> subprocess.Popen[bytes]:
+    def start_client(self, iface: str, service: Metadata, requests: int, size: int) -> LabProcess:
         """Start a participant at the robot's switch that calls on command; see ``uplink_child``."""
         keys, name = self._member("client", service, Right.CALL)
         root = self._folder / "domain" / ROOT_CERTIFICATE
         words = [name.to_text(), str(keys), str(root), iface, "call", str(requests), str(size)]
-        client = subprocess.Popen(
-            [sys.executable, "-m", "netns_tests.uplink_child", *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+        argv = [sys.executable, "-m", "netns_tests.uplink_child", *words]
+        client = LabProcess(None, "client", argv, log=self._folder / "client.log", has_orders=True)
         self._running.append(client)
-        assert client.stdout is not None
-        assert client.stdout.readline() == b"up\n"
+        assert client.read_line(PATIENCE_S) == b"up"
         return client
 
     def close(self) -> None:
         """End the robot's side."""
-        for process in reversed(self._running):
-            process.terminate()
-            process.communicate(timeout=PATIENCE_S)
+        end_processes(self._running, PATIENCE_S)
 
     def _member(self, label: str, service: Metadata, right: Right) -> tuple[Path, Name]:
         keys = self._folder / f"member-{label}"
@@ -159,12 +154,8 @@ class Domain:
             (home / path).write_bytes(content)
             (home / path).chmod(0o600)
         argv = [sys.executable, "-m", f"gdp.cli.{role}", "--config", str(home / f"{role}.yaml")]
-        with (home / f"{role}.log").open("wb") as log:
-            process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=log, text=True)
-        self._running.append(process)
-        assert process.stdout is not None
-        assert select.select([process.stdout], [], [], PATIENCE_S)[0], f"{role} says nothing"
-        assert " is up" in process.stdout.readline(), (home / f"{role}.log").read_text()
+        self._running.append(LabProcess(None, role, argv, log=home / f"{role}.log"))
+        assert b" is up" in self._running[-1].read_line(PATIENCE_S)
 
 
 def _command(role: str, module: str, sign: str = " is up") -> Program:

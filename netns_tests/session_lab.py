@@ -20,6 +20,7 @@ from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from lab.credentials import grant
 from lab.namespaces import Namespaces
+from lab.process import LabProcess
 from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
 
@@ -85,12 +86,10 @@ class SessionLab:
         path = self.folder / f"{role.value}.yaml"
         root = str(self.folder / "domain" / ROOT_CERTIFICATE)
         path.write_text(yaml.safe_dump({"identity": str(identity), "domain": {"root": root}, **content}))
-        process = self.start("-m", f"gdp.cli.{role.value}", "--json", "--config", str(path))
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert '"ready"' in line, line + (
-            process.stderr.read() if process.stderr and process.poll() is not None else ""
-        )
+        argv = [sys.executable, "-m", f"gdp.cli.{role.value}", "--json", "--config", str(path)]
+        process = LabProcess(self._run, role.value, self._spaces[_MACHINE].command(argv))
+        self._undo.callback(process.close)
+        assert process.read(PATIENCE_S)["event"] == "ready"
 
 
 def _end(process: subprocess.Popen[str]) -> None:

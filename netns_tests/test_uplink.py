@@ -7,8 +7,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -24,12 +22,13 @@ from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
+from lab.process import LabProcess
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
 
 REPLICAS: Final = ("r0", "r1", "r2", "r3")
+PATIENCE_S: Final = 60.0
 REQUESTS, BYTES = 200, 10_000
 PARTS, MTU_BYTES, OVERHEAD_BYTES = 8, 1_500, 14 + 96  # Ethernet and our header, in each part
 SERVICE: Final = Metadata({"kind": "service", "name": "/plan", "type": "std_srvs/srv/SetBool"})
@@ -51,7 +50,7 @@ class Field:
         self._run = run
         self._undo = undo
         self._spaces = Namespaces(TOPOLOGY, run)
-        self._starting: list[subprocess.Popen[bytes]] = []
+        self._starting: list[LabProcess] = []
         self._credentials = OverlayCredentials(TOPOLOGY, self._folder)
         for name in TOPOLOGY.nodes:
             self._start(name, ["gdp.cli.switch", "--config", str(self._credentials.switch(name, "auto"))])
@@ -62,11 +61,10 @@ class Field:
     def wait(self) -> None:
         """Return when all started participants are up."""
         for process in self._starting:
-            assert process.stdout is not None
-            assert b"up" in process.stdout.readline(), (self._folder / "log").read_text()[-2_000:]
+            assert b"up" in process.read_line(PATIENCE_S)
         self._starting.clear()
 
-    def member(self, switch: str, right: Right, *load: int) -> subprocess.Popen[bytes]:
+    def member(self, switch: str, right: Right, *load: int) -> LabProcess:
         """Start a participant at a switch without waiting for it."""
         credentials = self._credentials
         name = credentials.delegate(switch, SERVICE, right).to_text()
@@ -84,34 +82,18 @@ class Field:
 
         return self._spaces["gateway"].inside(look)
 
-    def _start(self, switch: str, argv: list[str]) -> subprocess.Popen[bytes]:
-        with (self._folder / "log").open("ab") as log:
-            process = subprocess.Popen(
-                self._spaces[switch].command([sys.executable, "-m", *argv]),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-                start_new_session=True,
-            )
-        self._run.note_process(process.pid)
-        self._undo.callback(_end, process)
+    def _start(self, switch: str, argv: list[str]) -> LabProcess:
+        words = self._spaces[switch].command([sys.executable, "-m", *argv])
+        process = LabProcess(self._run, f"{argv[0]} {switch}", words, has_orders=True)
+        self._undo.callback(process.kill_group)
         self._starting.append(process)
         return process
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.communicate()
-
-
-def tell(robot: subprocess.Popen[bytes], word: object) -> None:
+def tell(robot: LabProcess, word: object) -> None:
     """Send the robot a command; return when it is done."""
-    assert robot.stdin is not None
-    assert robot.stdout is not None
-    robot.stdin.write(f"{word}\n".encode())
-    robot.stdin.flush()
-    assert robot.stdout.readline() == b"done\n"
+    robot.tell(word=word)
+    assert robot.read_line(PATIENCE_S) == b"done"
 
 
 @pytest.fixture

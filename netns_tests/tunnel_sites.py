@@ -19,6 +19,7 @@ from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.vxlan import make_vxlan
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from netns_tests.spaces import Space
+from tests import waiting
 
 PATIENCE_S = 30.0
 POLL_S = 1.0
@@ -138,10 +139,10 @@ def two_sites() -> Iterator[tuple[Site, Site]]:
 
 def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = "") -> None:
     """Serve these devices, as a switch does, until this is true."""
-    end_s = time.monotonic() + PATIENCE_S
     poll_s = time.monotonic() + POLL_S
-    while not is_true():
-        assert time.monotonic() < end_s, what or "not in time"
+
+    def serve() -> None:
+        nonlocal poll_s
         if time.monotonic() > poll_s:
             poll_s += POLL_S
             for device in devices:
@@ -149,6 +150,8 @@ def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = ""
         ready, _, _ = select.select(devices, [], [], 0.01)
         for device in ready:
             device.handle_events()
+
+    waiting.until(is_true, what or "it did not come about", PATIENCE_S, meanwhile=serve)
 
 
 def payload(number: int) -> bytes:

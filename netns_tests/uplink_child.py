@@ -3,12 +3,14 @@
 python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE serve
 python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE call REQUESTS BYTES
 
-The robot reads commands on standard input. A number: it prints ``met`` when it has this many peers. ``go``: it prints
-``done`` when all peers have confirmed its requests. ``ask``: the same with requests to one peer.
+The robot reads commands on standard input, each a line of JSON: ``{"word": ...}``. A number: it prints ``met`` when it
+has this many peers. ``go``: it prints ``done`` when all peers have confirmed its requests. ``ask``: the same with
+requests to one peer.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import sys
@@ -82,8 +84,8 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
         return
     robot = Robot(member, runtime, topic, *map(int, load))
     words = os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0)
-    heard: list[str] = []
-    runtime.watch(words, lambda: heard.append(words.readline().decode().strip()))
+    heard: list[object] = []
+    runtime.watch(words, lambda: heard.append(json.loads(words.readline() or "{}").get("word")))
     print("up", flush=True)
     while runtime.run(lambda: bool(heard)) and (word := heard.pop()):
         if word == "go":
@@ -91,7 +93,7 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
         elif word == "ask":
             robot.ask()
         else:
-            robot.meet(int(word))
+            robot.meet(int(str(word)))
         print("done", flush=True)
 
 

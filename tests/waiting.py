@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from lab import process
+
 __all__ = ["PATIENCE_S", "until"]
 
 PATIENCE_S = 60.0
@@ -25,11 +27,12 @@ def until(
         meanwhile: is called between two looks, and should wait a moment; None: a pause of 20 ms.
     """
     begun_s = time.monotonic()
-    while not is_met():
-        if time.monotonic() > begun_s + patience_s:
-            raise AssertionError(f"{what() if callable(what) else what}: not within {patience_s:g} s")
-        if meanwhile is None:
-            time.sleep(_PAUSE_S)
-        else:
-            meanwhile()
+    try:
+        process.until(is_met, lambda: str(what() if callable(what) else what), patience_s, meanwhile or _pause)
+    except process.FailedError as error:
+        raise AssertionError(str(error)) from error
     return time.monotonic() - begun_s
+
+
+def _pause() -> None:
+    time.sleep(_PAUSE_S)

@@ -35,6 +35,8 @@ READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
 _MTU: Final = 1_500
 _HERE: Final = ROOT / "scripts" / "experiments"
+# The relay of the provider ``local`` waits on its standard input for permission to begin.
+_RELAY: Final = "import io, sys; from fog.providers.local.delay import main; sys.stdin = io.StringIO('\\n'); main()"
 _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 
 
@@ -149,7 +151,7 @@ class Field:
         self._lab = Lab(run, self._topology())
         with ExitStack() as undo:
             for machine, seconds in (delays or {}).items():
-                relay = [str(_HERE / "relay.py"), _GATE, machine, str(1e3 * seconds)]
+                relay = ["-c", _RELAY, _GATE, machine, str(1e3 * seconds)]
                 undo.enter_context(self._lab.start(self._relays[machine], "relay", relay)).read_line(READY_S)
             self._nodes = OverlayNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S)
             undo.callback(self._nodes.close)
