@@ -301,7 +301,10 @@ class Hub:
         self.emit(RequestReceived(handle, ticket, raw))
 
     def input(self, topic: str, type_name: str, stamp_ns: int, raw: bytes) -> None:
-        """Pass on a message of a client; the first ones wait until the bridge takes the topic."""
+        """Pass on a message of a client, to the door's other clients too; the first wait until the bridge takes it."""
+        for handle, publication in self.publications.items():
+            if (publication.channel.topic, publication.channel.type_name) == (topic, type_name):
+                self.pass_message(handle, stamp_ns, raw)
         handles = [handle for handle, wanted in self._inputs.items() if wanted == (topic, type_name)]
         for handle in handles:
             self.emit(MessageReceived(handle, stamp_ns, raw))

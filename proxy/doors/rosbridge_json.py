@@ -19,7 +19,7 @@ from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.schema import Array, Number, Record, Sequence, Text, Type, parse
 from proxy.serial.serializer import Codec, native_codec
 
-__all__ = ["RosbridgeCodec", "cbor_raw"]
+__all__ = ["RosbridgeCodec", "both_spellings", "cbor_raw"]
 
 _NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
 _TIME, _DURATION, _HEADER = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "std_msgs/msg/Header"
@@ -107,6 +107,12 @@ class RosbridgeCodec:
             return self._codec.to_raw(_filled(self._record, tree, self._name, now_ns))
         except (ArithmeticError, LookupError, TypeError, ValueError, struct.error, RecursionError) as error:
             raise RemoteError(DropReason.MALFORMED, f"{self._name}: {error}"[:300]) from error
+
+
+def both_spellings(now_ns: int) -> dict[str, int]:
+    """Return a time as clients of ROS 2 and of ROS 1 read it."""
+    time = _time(now_ns)
+    return time | {one: time[two] for two, one in _SPELLINGS}
 
 
 def cbor_raw(topic: str, stamp_ns: int, raw: bytes) -> bytes:

@@ -17,7 +17,7 @@ from gdp.errors import DropReason, GdpError, LocalError, RemoteError
 from gdp.ros_names import resolved
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
-from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
+from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw
 from proxy.doors.throttle import Throttle
 from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.channel import Channel
@@ -325,6 +325,7 @@ class RosbridgeSession:
         services = {each.name: each.type_name for each in self._hub.services.values()}
         wanted = str(args.get("type", ""))
         answers: Mapping[str, Mapping[str, object]] = {
+            "get_time": {"time": both_spellings(self._received_ns)},
             "topics": {"topics": [*topics], "types": [*topics.values()]},
             "topic_type": {"type": topics.get(resolved(str(args.get("topic"))), "")},
             "topics_for_type": {"topics": [topic for topic, each in topics.items() if each == _type(wanted, "msg")]},

@@ -219,6 +219,27 @@ def test_raw_bytes_are_had_as_cbor() -> None:
     assert site.heard() == [{"op": "publish", "topic": "/chat", "msg": message}]
 
 
+def test_what_one_client_publishes_reaches_the_clients_of_the_same_door_that_read_it() -> None:
+    site = Site()
+    site.hub.offer_topic(1, known_channel("/chat", known.STRING))
+    other = RosbridgeSession(site.hub, 2, ClientQueue(), lambda: site.now_s)
+    site.hub.open(other)
+    site.say(op="subscribe", topic="/chat")
+    other.handle_message(json.dumps({"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}), 5)
+    assert site.heard() == [{"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}]
+    assert site.say(op="publish", topic="/chat", msg={"data": "own"}) == [
+        {"op": "publish", "topic": "/chat", "msg": {"data": "own"}}
+    ]
+    site.hub.take_topic(7, "/chat", known.STRING)
+    sent = [known.text_of(each.raw) for each in site.events if isinstance(each, MessageReceived)]
+    assert sent == ["hello", "own"]
+
+
+def test_the_time_is_had_in_the_spelling_of_either_ros() -> None:
+    (heard,) = Site().say(op="call_service", service="/rosapi/get_time")
+    assert heard["values"] == {"time": {"sec": 0, "nanosec": 5, "secs": 0, "nsecs": 5}}
+
+
 def test_a_late_subscription_gets_the_last_latched_message() -> None:
     site = Site()
     channel = replace(known_channel("/map", known.STRING), latched=True, qos=(default(latched=True, depth=1),))
