@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Final, Protocol, TypeAlias
+from typing import Final, Literal, Protocol, TypeAlias
 
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.endpoints.core.endpoint import (
@@ -47,8 +47,8 @@ class Rights(Protocol):
     def may_publish(self, topic: str, type_name: str) -> str:
         """Return why clients may not publish a topic."""
 
-    def may_call(self, service: str) -> str:
-        """Return why clients may not call a service."""
+    def may_call(self, name: str, kind: Literal["service", "action"] = "service") -> str:
+        """Return why clients may not call a service or an action."""
 
     def type_of(self, topic: str) -> str:
         """Return the type of a topic that clients may publish; empty: none."""
@@ -271,6 +271,10 @@ class Hub:
         """Return the description of a topic that clients publish: this machine's, or a client's; None: unknown."""
         theirs = (each.schema_of(topic, type_name) for each in self.sessions.values())
         return self.known(topic, type_name) or next((each for each in theirs if each is not None), None)
+
+    def server_of(self, name: str) -> int | None:
+        """Return the handle of a service that has a server; None: it has none."""
+        return next((handle for handle, each in self.services.items() if each.name == name), None)
 
     @property
     def offered(self) -> list[Publication]:

@@ -12,14 +12,15 @@ from typing import Final
 import cbor2
 import orjson
 
-from gdp.errors import DropReason, RemoteError
+from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.channel import Channel
 from proxy.serial.dialect import MisfitError
 from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.schema import Array, Number, Record, Sequence, Text, Type, parse
 from proxy.serial.serializer import Codec, native_codec
 
-__all__ = ["RosbridgeCodec", "both_spellings", "cbor_raw"]
+__all__ = ["RosbridgeCodec", "both_spellings", "cbor_raw", "codec_of"]
 
 _NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
 _TIME, _DURATION, _HEADER = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "std_msgs/msg/Header"
@@ -107,6 +108,15 @@ class RosbridgeCodec:
             return self._codec.to_raw(_filled(self._record, tree, self._name, now_ns))
         except (ArithmeticError, LookupError, TypeError, ValueError, struct.error, RecursionError) as error:
             raise RemoteError(DropReason.MALFORMED, f"{self._name}: {error}"[:300]) from error
+
+
+_codecs: Final = BoundedCache[RosbridgeCodec](256, LocalError)
+
+
+def codec_of(channel: Channel) -> RosbridgeCodec:
+    """Return the converter of a type. Raises ``LocalError``: it has no usable definition."""
+    key = digest_of("rosbridge", channel.type_name, channel.definition, channel.definition_format, 2)
+    return _codecs.get(key, lambda: RosbridgeCodec(channel))
 
 
 def both_spellings(now_ns: int) -> dict[str, int]:

@@ -22,7 +22,7 @@ from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
-from tests.proxy.doors.rights import Everything
+from tests.proxy.doors.rights import Everything, goal_id
 
 NUMBERS = known.custom("own_msgs/msg/Numbers", "float64 x\nfloat32[] y\nuint8[] octets\nint64 big\nbool on\nstring s\n")
 
@@ -37,7 +37,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.hub = Hub(self.events.append, lambda: self.rights, _known)
-        self.session = RosbridgeSession(self.hub, 1, ClientQueue(), lambda: self.now_s)
+        self.session = RosbridgeSession(self.hub, 1, ClientQueue(), lambda: self.now_s, goal_id)
         self.hub.open(self.session)
 
     def say(self, **fields: object) -> list[dict[str, object]]:
@@ -222,7 +222,7 @@ def test_raw_bytes_are_had_as_cbor() -> None:
 def test_what_one_client_publishes_reaches_the_clients_of_the_same_door_that_read_it() -> None:
     site = Site()
     site.hub.offer_topic(1, known_channel("/chat", known.STRING))
-    other = RosbridgeSession(site.hub, 2, ClientQueue(), lambda: site.now_s)
+    other = RosbridgeSession(site.hub, 2, ClientQueue(), lambda: site.now_s, goal_id)
     site.hub.open(other)
     site.say(op="subscribe", topic="/chat")
     other.handle_message(json.dumps({"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}), 5)
