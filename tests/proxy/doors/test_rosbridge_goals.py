@@ -14,49 +14,13 @@ from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.doors.rules import rules_of
 from proxy.endpoints.core.endpoint import RequestReceived
 from proxy.serial.service import Service
-from tests.proxy.bridge import known
+from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES
 from tests.proxy.doors.rights import goal_id
 from tests.proxy.doors.test_rosbridge import Site
 
-TYPE: Final = "example_interfaces/action/Fibonacci"
 AT: Final = "/fibonacci/_action/"
-_RULE: Final = "=" * 80
-_ID: Final = f"{_RULE}\nMSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
-_INFO: Final = (
-    f"{_RULE}\nMSG: action_msgs/GoalInfo\nunique_identifier_msgs/UUID goal_id\nbuiltin_interfaces/Time stamp\n"
-)
-_TIME: Final = f"{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-
-
-def _nested(part: str, fields: str) -> str:
-    return f"{_RULE}\nMSG: example_interfaces/Fibonacci_{part}\n{fields}\n"
-
-
-SERVICES: Final = {
-    "send_goal": known.service(
-        f"{TYPE}_SendGoal",
-        f"unique_identifier_msgs/UUID goal_id\nexample_interfaces/Fibonacci_Goal goal\n{_ID}"
-        + _nested("Goal", "int32 order"),
-        f"bool accepted\nbuiltin_interfaces/Time stamp\n{_TIME}",
-    ),
-    "cancel_goal": known.service(
-        "action_msgs/srv/CancelGoal",
-        f"action_msgs/GoalInfo goal_info\n{_INFO}{_ID}{_TIME}",
-        f"int8 return_code\naction_msgs/GoalInfo[] goals_canceling\n{_INFO}{_ID}{_TIME}",
-    ),
-    "get_result": known.service(
-        f"{TYPE}_GetResult",
-        f"unique_identifier_msgs/UUID goal_id\n{_ID}",
-        "int8 status\nexample_interfaces/Fibonacci_Result result\n" + _nested("Result", "int32[] sequence"),
-    ),
-}
-FEEDBACK: Final = known.custom(
-    f"{TYPE}_FeedbackMessage",
-    f"unique_identifier_msgs/UUID goal_id\nexample_interfaces/Fibonacci_Feedback feedback\n{_ID}"
-    + _nested("Feedback", "int32[] sequence"),
-)
 UUID: Final = {"uuid": list(goal_id())}
-GOAL: Final = {"op": "send_action_goal", "action": "/fibonacci", "action_type": TYPE, "args": {"order": 2}}
+GOAL: Final = {"op": "send_action_goal", "action": "/fibonacci", "action_type": FIBONACCI, "args": {"order": 2}}
 
 
 class ActionSite(Site):
@@ -134,7 +98,7 @@ def test_a_goal_that_is_not_under_way_cannot_be_cancelled(fields: dict[str, obje
     ("fields", "reason"),
     [
         ({"action": "/other"}, "/other: no server is reachable"),
-        ({"action_type": "a/B"}, f"its type is {TYPE}"),
+        ({"action_type": "a/B"}, f"its type is {FIBONACCI}"),
         ({"args": {"size": 1}}, "there is no field size"),
         ({"args": [2]}, "an object was expected"),
     ],
