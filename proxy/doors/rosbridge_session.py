@@ -20,7 +20,7 @@ from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
 from proxy.doors.rosbridge_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
 from proxy.doors.rosbridge_goals import GoalStep, RosbridgeGoals
-from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of
+from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
 from proxy.doors.throttle import Throttle
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
@@ -32,7 +32,7 @@ CALLS_MAX: Final = 1_024
 _QUEUE_MAX: Final = 1_024
 _PERIOD_MAX_MS: Final = 3_600_000
 _LEVELS: Final = ("none", "error", "warning", "info")
-_COMPRESSIONS: Final = ("none", "cbor-raw")
+_COMPRESSIONS: Final = ("none", "png", "cbor", "cbor-raw")
 _ROSAPI: Final = "/rosapi/"
 
 
@@ -59,8 +59,10 @@ class _Subscription:
         return min(each[1] for each in self.wishes.values())
 
     @property
-    def is_raw(self) -> bool:
-        return all(each[2] == "cbor-raw" for each in self.wishes.values())
+    def compression(self) -> str:
+        """Return that of all ids; of different ones: none."""
+        wanted = {each[2] for each in self.wishes.values()}
+        return wanted.pop() if len(wanted) == 1 else "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,16 +143,20 @@ class RosbridgeSession:
             return feedback
         topic = self._names.get(pending.key, "")
         subscription = self._subscriptions.get(topic)
-        if subscription is not None and subscription.is_raw:
+        compression = "none" if subscription is None else subscription.compression
+        if compression == "cbor-raw":
             return cbor_raw(topic, pending.stamp_ns, pending.raw)
         publication = None if subscription is None else self._offered.get(subscription.topic)
         if publication is None:
             return text_of(op="status", level="warning", msg=f"{topic}: withdrawn; a message was left out")
         try:
+            if compression == "cbor":
+                return codec_of(publication.channel).to_cbor(topic, pending.raw)
             body = publication.encoded(pending.raw, lambda raw: codec_of(publication.channel).to_json(raw))
         except GdpError as error:
             return text_of(op="status", level="error", msg=f"{topic}: {error}")
-        return f'{{"op":"publish","topic":{orjson.dumps(topic).decode()},"msg":{body.decode()}}}'
+        wire = b'{"op":"publish","topic":%b,"msg":%b}' % (orjson.dumps(topic), body)
+        return text_of(op="png", data=png_text(wire)) if compression == "png" else wire.decode()
 
     def get_timer(self) -> float | None:
         """Return when a throttled message is due."""
@@ -234,7 +240,7 @@ class RosbridgeSession:
         queue_length = whole_number(fields, "queue_length", _QUEUE_MAX)
         compression = word(fields, "compression", is_optional=True) or "none"
         if compression not in _COMPRESSIONS:
-            raise LocalError(f"subscribe {topic}: compression {compression} is not supported; use none or cbor-raw")
+            raise LocalError(f"subscribe {topic}: compression {compression} is not one of {', '.join(_COMPRESSIONS)}")
         if reason := self._hub.rights().may_read(topic, type_name):
             raise LocalError(f"subscribe {topic}: {reason}")
         each = self._subscriptions.get(name)
