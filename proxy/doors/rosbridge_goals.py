@@ -21,10 +21,11 @@ from proxy.doors.rosbridge_json import codec_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = ["GoalStep", "RosbridgeGoals"]
+__all__ = ["SENDS", "GoalStep", "RosbridgeGoals"]
 
 GOALS_MAX: Final = 256
 _SEND, _RESULT, _CANCEL = "send_goal", "get_result", "cancel_goal"
+SENDS: Final = f"/_action/{_SEND}"
 _FEEDBACK: Final = "/_action/feedback"
 _ID: Final = slice(4, 20)  # of the goal, behind the encapsulation of its feedback
 _UNKNOWN: Final = 0  # action_msgs/msg/GoalStatus

@@ -162,10 +162,8 @@ def png_text(wire: bytes) -> str:
     rows = b"".join(b"\0" + pixels[at : at + 3 * width] for at in range(0, len(pixels), 3 * width))
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits of red, green and blue
     kinds = ((b"IHDR", head), (b"IDAT", zlib.compress(rows, 1)), (b"IEND", b""))
-    parts = [(data, kind + data) for kind, data in kinds]
-    chunks = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
-    )
+    parts = [(len(data), kind + data) for kind, data in kinds]
+    chunks = [struct.pack(">I", size) + part + struct.pack(">I", zlib.crc32(part)) for size, part in parts]
     return b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(chunks)).decode()
 
 

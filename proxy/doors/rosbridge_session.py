@@ -19,7 +19,7 @@ from gdp.ros_names import resolved
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
 from proxy.doors.rosbridge_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
-from proxy.doors.rosbridge_goals import GoalStep, RosbridgeGoals
+from proxy.doors.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
 from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
 from proxy.doors.throttle import Throttle
 from proxy.serial.channel import Channel
@@ -349,6 +349,12 @@ class RosbridgeSession:
         answers: Mapping[str, Mapping[str, object]] = {
             "get_time": {"time": both_spellings(self._received_ns)},
             "topics": {"topics": [*topics], "types": [*topics.values()]},
+            "topics_and_raw_types": {
+                "topics": [*topics],
+                "types": [*topics.values()],
+                "typedefs_full_text": [each.channel.definition for each in self._offered.values()],
+            },
+            "action_servers": {"action_servers": [each[: -len(SENDS)] for each in services if each.endswith(SENDS)]},
             "topic_type": {"type": topics.get(resolved(str(args.get("topic"))), "")},
             "topics_for_type": {
                 "topics": [topic for topic, each in topics.items() if each == ros2_type(wanted, "msg")]

@@ -86,6 +86,18 @@ def test_a_goal_without_feedback_is_cancelled_by_its_id() -> None:
     assert (heard["op"], heard["status"], heard["result"]) == ("action_result", 5, True)
 
 
+def test_actions_with_a_server_and_definitions_of_topics_are_listed() -> None:
+    site = ActionSite()
+    (heard,) = site.say(op="call_service", service="/rosapi/action_servers")
+    assert heard["values"] == {"action_servers": ["/fibonacci"]}
+    (heard,) = site.say(op="call_service", service="/rosapi/topics_and_raw_types")
+    assert heard["values"] == {
+        "topics": [f"{AT}feedback"],
+        "types": [FEEDBACK.type_name],
+        "typedefs_full_text": [FEEDBACK.definition],
+    }
+
+
 @pytest.mark.parametrize("fields", [{"id": "other"}, {}])
 def test_a_goal_that_is_not_under_way_cannot_be_cancelled(fields: dict[str, object]) -> None:
     site = ActionSite()
