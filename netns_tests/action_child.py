@@ -1,4 +1,4 @@
-"""Proxy node with an action server in a child process: it serves /fibonacci until a signal ends it.
+"""Proxy node with servers in a child process: an action /fibonacci and a service /switch, until a signal ends it.
 
 python -m netns_tests.action_child NODE
 
@@ -87,15 +87,17 @@ class Server:
 def main(node_directory: Path) -> None:
     """Serve until a signal."""
     config, delegations = door_config(node_directory, None, None)
-    graph = FakeGraph(
-        2, {**known.channels(), FEEDBACK.type_name: FEEDBACK}, {each.type_name: each for each in SERVICES.values()}
-    )
+    services = known.services() | {each.type_name: each for each in SERVICES.values()}
+    graph = FakeGraph(2, {**known.channels(), FEEDBACK.type_name: FEEDBACK}, services)
+    graph.serve("/server", "/switch", known.SET_BOOL, lambda raw, done: done(known.switched("done")))
     endpoint, server = FakeEndpoint(graph, "/bridge"), Server(graph)
     with run_node(config) as node:
         held = DelegationStore(delegations, node.identity)
         owner = PublicKey.from_compressed(next(iter(held)).delegation.subject.owner_key)
-        rule = Rule.model_validate({"kind": "action", "name": "/fibonacci", "type": FIBONACCI, "owner": owner})
-        bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), DoorRules([rule], []), [endpoint], held)
+        action = Rule.model_validate({"kind": "action", "name": "/fibonacci", "type": FIBONACCI, "owner": owner})
+        service = Rule.model_validate({"kind": "service", "name": "/switch", "type": known.SET_BOOL, "owner": owner})
+        rules = DoorRules([action, service], [])
+        bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), rules, [endpoint], held)
         node.runtime.watch(endpoint)
         is_ready = False
         while not node.runtime.is_stopped:
