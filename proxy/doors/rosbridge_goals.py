@@ -172,8 +172,8 @@ class RosbridgeGoals:
 
     def _end(self, goal: _Goal, values: object, status: object, *, result: bool) -> None:
         """Send the result, behind the feedback that waits."""
-        for each in self._queue.forget(goal.key):
-            self._queue.put_control(self.encode(each) or "")
+        for each in filter(None, map(self.encode, self._queue.forget(goal.key))):
+            self._queue.put_control(each)
         del self._goals[goal.key]
         self._queue.put_control(
             text_of(goal.number, op="action_result", action=goal.action, values=values, status=status, result=result)
