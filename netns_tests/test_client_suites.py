@@ -52,7 +52,7 @@ RIGHTS: Final = {
     },
 }
 SERVES: Final = "a client of a door serves nothing to others: no delegation names who answers"
-PARAMETERS: Final = "parameters of a ROS 1 master do not cross: a name on the overlay has an owner and a type"
+PARAMETERS: Final = "no master and no rosapi node has parameters: a client calls the services of the node that has them"
 WITHOUT_TYPE: Final = "actionlib's messages are no standard types of ROS 2, and no far node describes them"
 REPUBLISHER: Final = "it needs the node tf2_web_republisher, which serves clients of the same ROS 1 graph"
 NODES: Final = "the overlay has members, not nodes, and shows a client none"
