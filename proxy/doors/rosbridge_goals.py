@@ -80,7 +80,7 @@ class RosbridgeGoals:
         self._new_id = new_id
         self._goals: dict[int, _Goal] = {}  # by key
 
-    def send(self, fields: Fields) -> None:
+    def send(self, fields: Fields, now_ns: int) -> None:
         """Send a goal. Raises ``GdpError``: the message is malformed."""
         action, number = word(fields, "action"), identifier(fields, None)
         type_name = ros2_type(word(fields, "action_type", is_optional=True), "action")
@@ -91,7 +91,7 @@ class RosbridgeGoals:
                 raise LocalError(f"{action}: more than {GOALS_MAX} goals are under way")
             if number is not None and sum(each.number == number for each in self._goals.values()) > 1:
                 raise LocalError(f"{action}: a goal with this id is under way")
-            self._request(goal, _SEND, {"goal_id": goal.uuid, "goal": fields.get("args") or {}}, type_name)
+            self._request(goal, _SEND, {"goal_id": goal.uuid, "goal": fields.get("args") or {}}, type_name, now_ns)
         except GdpError as error:
             self._fail(goal, str(error))
 
@@ -155,7 +155,7 @@ class RosbridgeGoals:
         elif step.goal.key in self._goals:
             self._fail(step.goal, reason)
 
-    def _request(self, goal: _Goal, part: str, fields: Fields, type_name: str = "") -> None:
+    def _request(self, goal: _Goal, part: str, fields: Fields, type_name: str = "", now_ns: int = 0) -> None:
         name = f"{goal.name}/_action/{part}"
         handle = self._hub.server_of(name)
         if handle is None:
@@ -164,7 +164,7 @@ class RosbridgeGoals:
         service = self._hub.services[handle]
         if type_name and service.type_name != f"{type_name}_SendGoal":
             raise LocalError(f"{goal.action}: its type is {service.type_name.removesuffix('_SendGoal')}")
-        raw = codec_of(service.request).to_raw(fields)
+        raw = codec_of(service.request).to_raw(fields, now_ns)
         self._hub.request(self._session, handle, GoalStep(goal, part, service), raw)
 
     def _fail(self, goal: _Goal, reason: str) -> None:

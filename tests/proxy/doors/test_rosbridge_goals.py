@@ -14,7 +14,8 @@ from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.doors.rules import rules_of
 from proxy.endpoints.core.endpoint import RequestReceived
 from proxy.serial.service import Service
-from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES
+from tests.proxy.bridge import known
+from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, ID, RULE, SERVICES, TIME
 from tests.proxy.doors.rights import goal_id
 from tests.proxy.doors.test_rosbridge import Site
 
@@ -96,6 +97,17 @@ def test_actions_with_a_server_and_definitions_of_topics_are_listed() -> None:
         "types": [FEEDBACK.type_name],
         "typedefs_full_text": [FEEDBACK.definition],
     }
+
+
+def test_a_stamp_of_a_goal_may_be_the_present_time() -> None:
+    site = Site()
+    fields = f"unique_identifier_msgs/UUID goal_id\na/Go_Goal goal\n{ID}"
+    text = f"{fields}{RULE}\nMSG: a/Go_Goal\nbuiltin_interfaces/Time at\n{TIME}"
+    go = known.service("a/action/Go_SendGoal", text, "bool accepted\n")
+    site.hub.offer_service(1, replace(go, name="/go/_action/send_goal"))
+    assert site.say(op="send_action_goal", action="/go", action_type="a/Go", args={"at": "now"}) == []
+    (request,) = [each for each in site.events if isinstance(each, RequestReceived)]
+    assert json.loads(RosbridgeCodec(go.request).to_json(request.raw))["goal"] == {"at": {"sec": 0, "nanosec": 5}}
 
 
 @pytest.mark.parametrize("fields", [{"id": "other"}, {}])
