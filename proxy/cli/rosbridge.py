@@ -5,6 +5,7 @@ I/O; ``gdp`` starts it, since the package ``gdp`` does not know ``proxy``.
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Sequence
 from typing import Annotated
@@ -67,7 +68,11 @@ def rosbridge(
         run_door(
             config,
             lambda rights: DoorEndpoint(
-                settings, lambda hub, number, queue: RosbridgeSession(hub, number, queue, time.monotonic), rights
+                settings,
+                lambda hub, number, queue: RosbridgeSession(
+                    hub, number, queue, time.monotonic, lambda: secrets.token_bytes(16)
+                ),
+                rights,
             ),
             json=json,
         )

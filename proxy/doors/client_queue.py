@@ -7,6 +7,7 @@ pile up is to be disconnected.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -92,12 +93,12 @@ class ClientQueue:
         while self._count > 1 and (self._held_bytes > self._max_bytes or self._count > self._max_messages):
             self._drop_oldest(self._largest(key))
 
-    def forget(self, key: int) -> None:
-        """Remove the messages of a subscription that has ended; they do not count as dropped."""
-        lane = self._lanes.pop(key, None)
-        if lane is not None:
-            self._count -= len(lane.messages)
-            self._held_bytes -= lane.held_bytes
+    def forget(self, key: int) -> Sequence[Pending]:
+        """Remove and return the messages of a subscription that has ended; they do not count as dropped."""
+        lane = self._lanes.pop(key, None) or _Lane()
+        self._count -= len(lane.messages)
+        self._held_bytes -= lane.held_bytes
+        return lane.messages
 
     def pop(self) -> str | bytes | Pending | None:
         """Return the next message to send: a control message, or the oldest one of any subscription."""

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Final, Protocol, TypeAlias
+from typing import Final, Literal, Protocol, TypeAlias
 
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.endpoints.core.endpoint import (
@@ -47,8 +47,8 @@ class Rights(Protocol):
     def may_publish(self, topic: str, type_name: str) -> str:
         """Return why clients may not publish a topic."""
 
-    def may_call(self, service: str) -> str:
-        """Return why clients may not call a service."""
+    def may_call(self, name: str, kind: Literal["service", "action"] = "service") -> str:
+        """Return why clients may not call a service or an action."""
 
     def type_of(self, topic: str) -> str:
         """Return the type of a topic that clients may publish; empty: none."""
@@ -272,6 +272,10 @@ class Hub:
         theirs = (each.schema_of(topic, type_name) for each in self.sessions.values())
         return self.known(topic, type_name) or next((each for each in theirs if each is not None), None)
 
+    def server_of(self, name: str) -> int | None:
+        """Return the handle of a service that has a server; None: it has none."""
+        return next((handle for handle, each in self.services.items() if each.name == name), None)
+
     @property
     def offered(self) -> list[Publication]:
         """Return the topics that clients may read now."""
@@ -301,7 +305,10 @@ class Hub:
         self.emit(RequestReceived(handle, ticket, raw))
 
     def input(self, topic: str, type_name: str, stamp_ns: int, raw: bytes) -> None:
-        """Pass on a message of a client; the first ones wait until the bridge takes the topic."""
+        """Pass on a message of a client, to the door's other clients too; the first wait until the bridge takes it."""
+        for handle, publication in self.publications.items():
+            if (publication.channel.topic, publication.channel.type_name) == (topic, type_name):
+                self.pass_message(handle, stamp_ns, raw)
         handles = [handle for handle, wanted in self._inputs.items() if wanted == (topic, type_name)]
         for handle in handles:
             self.emit(MessageReceived(handle, stamp_ns, raw))

@@ -1,4 +1,4 @@
-"""Messages as rosbridge writes them in JSON: octets as base64, and null for a float that JSON cannot express.
+"""Messages as rosbridge writes them: in JSON, with octets as base64 and null for infinities and NaN; in CBOR; in PNG.
 
 Sans-I/O. Source: the rosbridge v2 protocol, section 3 (data encoding); ``message_conversion.py`` of rosbridge_library:
 stamps also as ``secs`` and ``nsecs`` or ``"now"``, and a header without a stamp has the present time.
@@ -7,19 +7,24 @@ stamps also as ``secs`` and ``nsecs`` or ``"now"``, and a header without a stamp
 from __future__ import annotations
 
 import struct
+import zlib
+from base64 import b64encode
+from math import isqrt
 from typing import Final
 
 import cbor2
 import orjson
 
-from gdp.errors import DropReason, RemoteError
+from gdp.errors import DropReason, LocalError, RemoteError
+from proxy.serial.bounded_cache import BoundedCache, digest_of
+from proxy.serial.cbor_dialect import CborDialect
 from proxy.serial.channel import Channel
 from proxy.serial.dialect import MisfitError
 from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.schema import Array, Number, Record, Sequence, Text, Type, parse
 from proxy.serial.serializer import Codec, native_codec
 
-__all__ = ["RosbridgeCodec", "cbor_raw"]
+__all__ = ["RosbridgeCodec", "both_spellings", "cbor_raw", "codec_of", "png_text"]
 
 _NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
 _TIME, _DURATION, _HEADER = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "std_msgs/msg/Header"
@@ -64,6 +69,19 @@ class _Dialect(JsonDialect):
         return super().unarray(item, value)
 
 
+class _Cbor(CborDialect):
+    """CBOR of rosbridge: octets as a byte string, and every float as CBOR's own."""
+
+    def number(self, code: str, value: float, bits: int) -> object:
+        """Return a number."""
+        del code, bits
+        return value
+
+    def array(self, item: Number, raw: memoryview) -> object:
+        """Return a byte string for octets, else a typed array or a list."""
+        return bytes(raw) if item.octet else super().array(item, raw)
+
+
 class RosbridgeCodec:
     """Converter between a channel's CDR and rosbridge's JSON.
 
@@ -75,6 +93,7 @@ class RosbridgeCodec:
         self._name = channel.type_name
         self._record = parse(channel.type_name, channel.definition, channel.definition_format, 2)
         self._codec = Codec(self._record, 2, _Dialect(), native_codec(channel))
+        self._cbor = Codec(self._record, 2, _Cbor(), native_codec(channel))
 
     @property
     def field_names(self) -> list[str]:
@@ -87,12 +106,15 @@ class RosbridgeCodec:
         Raises:
             RemoteError: it does not fit the definition.
         """
-        tree = self._codec.to_tree(raw)
-        if tree is None:
-            raise RemoteError(DropReason.MALFORMED, f"a message that does not fit {self._name}")
-        if isinstance(tree, dict):
-            tree.pop(_DUMMY, None)
-        return orjson.dumps(tree, option=orjson.OPT_SERIALIZE_NUMPY)
+        return orjson.dumps(self._tree(self._codec, raw), option=orjson.OPT_SERIALIZE_NUMPY)
+
+    def to_cbor(self, topic: str, raw: bytes) -> bytes:
+        """Return ``publish`` of a subscription with the compression ``cbor``.
+
+        Raises:
+            RemoteError: the message does not fit the definition.
+        """
+        return cbor2.dumps({"op": "publish", "topic": topic, "msg": self._tree(self._cbor, raw)})
 
     def to_raw(self, tree: object, now_ns: int = 0) -> bytes:
         """Return the CDR of a client's message; fields that it leaves out are zero, empty or false.
@@ -107,6 +129,42 @@ class RosbridgeCodec:
             return self._codec.to_raw(_filled(self._record, tree, self._name, now_ns))
         except (ArithmeticError, LookupError, TypeError, ValueError, struct.error, RecursionError) as error:
             raise RemoteError(DropReason.MALFORMED, f"{self._name}: {error}"[:300]) from error
+
+    def _tree(self, codec: Codec, raw: bytes) -> object:
+        tree = codec.to_tree(raw)
+        if tree is None:
+            raise RemoteError(DropReason.MALFORMED, f"a message that does not fit {self._name}")
+        if isinstance(tree, dict):
+            tree.pop(_DUMMY, None)
+        return tree
+
+
+_codecs: Final = BoundedCache[RosbridgeCodec](256, LocalError)
+
+
+def codec_of(channel: Channel) -> RosbridgeCodec:
+    """Return the converter of a type. Raises ``LocalError``: it has no usable definition."""
+    key = digest_of("rosbridge", channel.type_name, channel.definition, channel.definition_format, 2)
+    return _codecs.get(key, lambda: RosbridgeCodec(channel))
+
+
+def both_spellings(now_ns: int) -> dict[str, int]:
+    """Return a time as clients of ROS 2 and of ROS 1 read it."""
+    time = _time(now_ns)
+    return time | {one: time[two] for two, one in _SPELLINGS}
+
+
+def png_text(wire: bytes) -> str:
+    """Return a text as the pixels of a PNG image, filled up with newlines, in base64."""
+    width = max(isqrt(len(wire) // 3), 1)
+    height = -(-len(wire) // (3 * width))
+    pixels = wire.ljust(3 * width * height, b"\n")
+    rows = b"".join(b"\0" + pixels[at : at + 3 * width] for at in range(0, len(pixels), 3 * width))
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits of red, green and blue
+    kinds = ((b"IHDR", head), (b"IDAT", zlib.compress(rows, 1)), (b"IEND", b""))
+    parts = [(len(data), kind + data) for kind, data in kinds]
+    chunks = [struct.pack(">I", size) + part + struct.pack(">I", zlib.crc32(part)) for size, part in parts]
+    return b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(chunks)).decode()
 
 
 def cbor_raw(topic: str, stamp_ns: int, raw: bytes) -> bytes:

@@ -9,17 +9,19 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Final
 
 import orjson
 
-from gdp.errors import DropReason, GdpError, LocalError, RemoteError
+from gdp.errors import GdpError, LocalError
 from gdp.ros_names import resolved
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
-from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
+from proxy.doors.rosbridge_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
+from proxy.doors.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
+from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
 from proxy.doors.throttle import Throttle
-from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
@@ -27,11 +29,10 @@ __all__ = ["RosbridgeSession"]
 
 IDS_MAX: Final = 4_096  # of all subscriptions and advertised topics
 CALLS_MAX: Final = 1_024
-_TEXT_MAX: Final = 1_024
 _QUEUE_MAX: Final = 1_024
 _PERIOD_MAX_MS: Final = 3_600_000
 _LEVELS: Final = ("none", "error", "warning", "info")
-_COMPRESSIONS: Final = ("none", "cbor-raw")
+_COMPRESSIONS: Final = ("none", "png", "cbor", "cbor-raw")
 _ROSAPI: Final = "/rosapi/"
 
 
@@ -58,8 +59,10 @@ class _Subscription:
         return min(each[1] for each in self.wishes.values())
 
     @property
-    def is_raw(self) -> bool:
-        return all(each[2] == "cbor-raw" for each in self.wishes.values())
+    def compression(self) -> str:
+        """Return that of all ids; of different ones: none."""
+        wanted = {each[2] for each in self.wishes.values()}
+        return wanted.pop() if len(wanted) == 1 else "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +73,15 @@ class _Call:
 
 
 class RosbridgeSession:
-    """State of one connection."""
+    """State of one connection.
 
-    def __init__(self, hub: Hub, number: int, queue: ClientQueue, now_s: Callable[[], float]) -> None:
+    Args:
+        goal_id: returns 16 random bytes.
+    """
+
+    def __init__(
+        self, hub: Hub, number: int, queue: ClientQueue, now_s: Callable[[], float], goal_id: Callable[[], bytes]
+    ) -> None:
         self._hub = hub
         self.number = number
         self.queue = queue
@@ -83,16 +92,19 @@ class RosbridgeSession:
         self._names: dict[int, str] = {}  # that, of keys
         self._readers: defaultdict[str, list[_Subscription]] = defaultdict(list)  # by topic
         self._published: dict[str, tuple[str, set[str]]] = {}  # topic to type and ids
-        self._keys = 0
+        self._keys = count(1)
         self._ids = 0  # of subscriptions and advertised topics
         self._calls = 0
-        self._operations: Mapping[str, Callable[[dict[str, object]], None]] = {
+        self._goals = RosbridgeGoals(hub, self, queue, self._keys.__next__, goal_id)
+        self._operations: Mapping[str, Callable[[Fields], None]] = {
             "subscribe": self._subscribe,
             "unsubscribe": self._unsubscribe,
             "advertise": self._advertise,
             "unadvertise": self._unadvertise,
             "publish": self._publish,
             "call_service": self._call,
+            "send_action_goal": lambda fields: self._goals.send(fields, self._received_ns),
+            "cancel_action_goal": self._goals.cancel,
             "set_level": self._set_level,
             "status": self._set_level,
         }
@@ -103,14 +115,14 @@ class RosbridgeSession:
         try:
             fields = orjson.loads(data)
         except orjson.JSONDecodeError as error:
-            raise _wrong("a message that is not JSON") from error
+            raise wrong("a message that is not JSON") from error
         if not isinstance(fields, dict):
-            raise _wrong("a message is a JSON object")
-        name, number = _word(fields, "op"), _id(fields, None)
+            raise wrong("a message is a JSON object")
+        name, number = word(fields, "op"), identifier(fields, None)
         operation = self._operations.get(name)
         if operation is None:
             known = ", ".join(self._operations)
-            raise _wrong(f"operation {name!r} is not supported; supported are {known}"[:300])
+            raise wrong(f"operation {name!r} is not supported; supported are {known}"[:300])
         try:
             operation(fields)
         except GdpError as error:
@@ -127,18 +139,24 @@ class RosbridgeSession:
 
     def encode(self, pending: Pending) -> str | bytes:
         """Return ``publish`` with a message of a subscription; clients share the JSON of the latest message."""
+        if (feedback := self._goals.encode(pending)) is not None:
+            return feedback
         topic = self._names.get(pending.key, "")
         subscription = self._subscriptions.get(topic)
-        if subscription is not None and subscription.is_raw:
+        compression = "none" if subscription is None else subscription.compression
+        if compression == "cbor-raw":
             return cbor_raw(topic, pending.stamp_ns, pending.raw)
         publication = None if subscription is None else self._offered.get(subscription.topic)
         if publication is None:
-            return _text(op="status", level="warning", msg=f"{topic}: withdrawn; a message was left out")
+            return text_of(op="status", level="warning", msg=f"{topic}: withdrawn; a message was left out")
         try:
-            body = publication.encoded(pending.raw, lambda raw: _codec(publication.channel).to_json(raw))
+            if compression == "cbor":
+                return codec_of(publication.channel).to_cbor(topic, pending.raw)
+            body = publication.encoded(pending.raw, lambda raw: codec_of(publication.channel).to_json(raw))
         except GdpError as error:
-            return _text(op="status", level="error", msg=f"{topic}: {error}")
-        return f'{{"op":"publish","topic":{orjson.dumps(topic).decode()},"msg":{body.decode()}}}'
+            return text_of(op="status", level="error", msg=f"{topic}: {error}")
+        wire = b'{"op":"publish","topic":%b,"msg":%b}' % (orjson.dumps(topic), body)
+        return text_of(op="png", data=png_text(wire)) if compression == "png" else wire.decode()
 
     def get_timer(self) -> float | None:
         """Return when a throttled message is due."""
@@ -182,6 +200,7 @@ class RosbridgeSession:
 
     def queue_message(self, publication: Publication, stamp_ns: int, raw: bytes) -> None:
         """Queue a message for the client's subscription."""
+        self._goals.queue_feedback(publication, stamp_ns, raw)
         for each in self._readers.get(publication.channel.topic, ()):
             if each.throttle.offer(stamp_ns, raw, self._now_s()):
                 self.queue.put(each.key, stamp_ns, raw, depth=each.queue_length)
@@ -194,10 +213,12 @@ class RosbridgeSession:
 
     def pass_answer(self, context: object, raw: bytes) -> None:
         """Send a response."""
-        if isinstance(context, _Call):
+        if isinstance(context, GoalStep):
+            self._goals.pass_answer(context, raw)
+        elif isinstance(context, _Call):
             self._calls -= 1
             try:
-                body = _codec(context.service.response).to_json(raw)
+                body = codec_of(context.service.response).to_json(raw)
             except GdpError as error:
                 self._respond(context.name, context.number, str(error), result=False)
                 return
@@ -205,27 +226,28 @@ class RosbridgeSession:
 
     def pass_refusal(self, context: object, reason: str) -> None:
         """Send the reason of a failed call."""
-        if isinstance(context, _Call):
+        if isinstance(context, GoalStep):
+            self._goals.pass_refusal(context, reason)
+        elif isinstance(context, _Call):
             self._calls -= 1
             self._respond(context.name, context.number, reason, result=False)
 
-    def _subscribe(self, fields: dict[str, object]) -> None:
-        name, number = _word(fields, "topic"), str(_id(fields))
+    def _subscribe(self, fields: Fields) -> None:
+        name, number = word(fields, "topic"), str(identifier(fields))
         topic = resolved(name)
-        type_name = _type(_word(fields, "type", is_optional=True), "msg")
-        period_s = _number(fields, "throttle_rate", _PERIOD_MAX_MS) / 1e3
-        queue_length = _number(fields, "queue_length", _QUEUE_MAX)
-        compression = _word(fields, "compression", is_optional=True) or "none"
+        type_name = ros2_type(word(fields, "type", is_optional=True), "msg")
+        period_s = whole_number(fields, "throttle_rate", _PERIOD_MAX_MS) / 1e3
+        queue_length = whole_number(fields, "queue_length", _QUEUE_MAX)
+        compression = word(fields, "compression", is_optional=True) or "none"
         if compression not in _COMPRESSIONS:
-            raise LocalError(f"subscribe {topic}: compression {compression} is not supported; use none or cbor-raw")
+            raise LocalError(f"subscribe {topic}: compression {compression} is not one of {', '.join(_COMPRESSIONS)}")
         if reason := self._hub.rights().may_read(topic, type_name):
             raise LocalError(f"subscribe {topic}: {reason}")
         each = self._subscriptions.get(name)
         if each is None or number not in each.wishes:
             self._take_id(f"subscribe {topic}")
         if each is None:
-            self._keys += 1
-            each = self._subscriptions[name] = _Subscription(self._keys, topic, type_name)
+            each = self._subscriptions[name] = _Subscription(next(self._keys), topic, type_name)
             self._names[each.key] = name
             self._readers[topic].append(each)
         is_new = not each.wishes
@@ -236,14 +258,14 @@ class RosbridgeSession:
                 self.queue.put(each.key, stamp_ns, raw)
         self._hub.update_graph()
 
-    def _unsubscribe(self, fields: dict[str, object]) -> None:
-        name = _word(fields, "topic")
+    def _unsubscribe(self, fields: Fields) -> None:
+        name = word(fields, "topic")
         each = self._subscriptions.get(name)
         if each is None:
             raise LocalError(f"unsubscribe {name}: it is not subscribed")
         before = len(each.wishes)
         if "id" in fields:
-            each.wishes.pop(str(_id(fields)), None)
+            each.wishes.pop(str(identifier(fields)), None)
         else:
             each.wishes.clear()
         self._ids -= before - len(each.wishes)
@@ -257,23 +279,23 @@ class RosbridgeSession:
         self.queue.forget(each.key)
         self._hub.update_graph()
 
-    def _advertise(self, fields: dict[str, object]) -> None:
-        topic, type_name = resolved(_word(fields, "topic")), _type(_word(fields, "type"), "msg")
+    def _advertise(self, fields: Fields) -> None:
+        topic, type_name = resolved(word(fields, "topic")), ros2_type(word(fields, "type"), "msg")
         if reason := self._hub.rights().may_publish(topic, type_name):
             raise LocalError(f"advertise {topic}: {reason}")
-        number = str(_id(fields))
+        number = str(identifier(fields))
         if topic not in self._published or number not in self._published[topic][1]:
             self._take_id(f"advertise {topic}")
         _, numbers = self._published.setdefault(topic, (type_name, set()))
         numbers.add(number)
         self._hub.update_graph()
 
-    def _unadvertise(self, fields: dict[str, object]) -> None:
-        topic = resolved(_word(fields, "topic"))
+    def _unadvertise(self, fields: Fields) -> None:
+        topic = resolved(word(fields, "topic"))
         if topic not in self._published:
             raise LocalError(f"unadvertise {topic}: it is not advertised")
         numbers = self._published[topic][1]
-        gone = {str(_id(fields))} & numbers if "id" in fields else set(numbers)
+        gone = {str(identifier(fields))} & numbers if "id" in fields else set(numbers)
         numbers -= gone
         self._ids -= len(gone)
         if not numbers:
@@ -286,25 +308,25 @@ class RosbridgeSession:
             raise LocalError(f"{what}: more than {IDS_MAX} ids")
         self._ids += 1
 
-    def _publish(self, fields: dict[str, object]) -> None:
-        topic = resolved(_word(fields, "topic"))
+    def _publish(self, fields: Fields) -> None:
+        topic = resolved(word(fields, "topic"))
         if topic not in self._published:
-            type_name = _type(_word(fields, "type", is_optional=True), "msg") or self._hub.rights().type_of(topic)
+            type_name = ros2_type(word(fields, "type", is_optional=True), "msg") or self._hub.rights().type_of(topic)
             self._advertise({"topic": topic, "type": type_name or "unknown"})
         type_name = self._published[topic][0]
         channel = self._hub.channel_of(topic, type_name)
         if channel is None:
             raise LocalError(f"publish {topic}: the definition of {type_name} is not known here")
-        raw = _codec(channel).to_raw(fields.get("msg", {}), self._received_ns)
+        raw = codec_of(channel).to_raw(fields.get("msg", {}), self._received_ns)
         self._hub.input(topic, type_name, self._received_ns, raw)
 
-    def _call(self, fields: dict[str, object]) -> None:
-        name, number = _word(fields, "service"), _id(fields, None)
+    def _call(self, fields: Fields) -> None:
+        name, number = word(fields, "service"), identifier(fields, None)
         full, args = resolved(name), fields.get("args", {})
         if full.startswith(_ROSAPI):
             self._rosapi(name, full.removeprefix(_ROSAPI), number, args if isinstance(args, dict) else {})
             return
-        handle = next((handle for handle, each in self._hub.services.items() if each.name == full), None)
+        handle = self._hub.server_of(full)
         if handle is None or self._calls >= CALLS_MAX:
             reason = self._hub.rights().may_call(full) or f"{name}: no server is reachable"
             reason = reason if handle is None else f"{name}: more than {CALLS_MAX} calls are under way"
@@ -312,7 +334,7 @@ class RosbridgeSession:
             return
         service = self._hub.services[handle]
         try:
-            raw = _codec(service.request).to_raw(_named_arguments(service.request, args), self._received_ns)
+            raw = codec_of(service.request).to_raw(_named_arguments(service.request, args), self._received_ns)
         except GdpError as error:
             self._respond(name, number, str(error), result=False)
             return
@@ -325,13 +347,22 @@ class RosbridgeSession:
         services = {each.name: each.type_name for each in self._hub.services.values()}
         wanted = str(args.get("type", ""))
         answers: Mapping[str, Mapping[str, object]] = {
+            "get_time": {"time": both_spellings(self._received_ns)},
             "topics": {"topics": [*topics], "types": [*topics.values()]},
+            "topics_and_raw_types": {
+                "topics": [*topics],
+                "types": [*topics.values()],
+                "typedefs_full_text": [each.channel.definition for each in self._offered.values()],
+            },
+            "action_servers": {"action_servers": [each[: -len(SENDS)] for each in services if each.endswith(SENDS)]},
             "topic_type": {"type": topics.get(resolved(str(args.get("topic"))), "")},
-            "topics_for_type": {"topics": [topic for topic, each in topics.items() if each == _type(wanted, "msg")]},
+            "topics_for_type": {
+                "topics": [topic for topic, each in topics.items() if each == ros2_type(wanted, "msg")]
+            },
             "services": {"services": [*services]},
             "service_type": {"type": services.get(resolved(str(args.get("service"))), "")},
             "services_for_type": {
-                "services": [each for each, kind in services.items() if kind == _type(wanted, "srv")]
+                "services": [each for each, kind in services.items() if kind == ros2_type(wanted, "srv")]
             },
         }
         values = answers.get(query)
@@ -340,30 +371,19 @@ class RosbridgeSession:
         else:
             self._respond(name, number, values, result=True)
 
-    def _set_level(self, fields: dict[str, object]) -> None:
-        level = _word(fields, "level")
+    def _set_level(self, fields: Fields) -> None:
+        level = word(fields, "level")
         if level not in _LEVELS:
             raise LocalError(f"set_level: the level is one of {', '.join(_LEVELS)}")
         self._level = _LEVELS.index(level)
 
     def _tell(self, level: str, text: str, number: object) -> None:
         if _LEVELS.index(level) <= self._level:
-            named = {} if number is None else {"id": number}
-            self.queue.put_control(_text(op="status", level=level, msg=text[:REASON_MAX], **named))
+            self.queue.put_control(text_of(number, op="status", level=level, msg=text[:REASON_MAX]))
 
     def _respond(self, service: str, number: object, values: object, *, result: bool) -> None:
-        named = {} if number is None else {"id": number}
         values = values[:REASON_MAX] if isinstance(values, str) else values
-        self.queue.put_control(_text(op="service_response", service=service, values=values, result=result, **named))
-
-
-_codecs: Final = BoundedCache[RosbridgeCodec](256, LocalError)
-
-
-def _codec(channel: Channel) -> RosbridgeCodec:
-    """Return the converter of a type; raises ``LocalError``: it has no usable definition."""
-    key = digest_of("rosbridge", channel.type_name, channel.definition, channel.definition_format, 2)
-    return _codecs.get(key, lambda: RosbridgeCodec(channel))
+        self.queue.put_control(text_of(number, op="service_response", service=service, values=values, result=result))
 
 
 def _named_arguments(request: Channel, args: object) -> object:
@@ -372,43 +392,5 @@ def _named_arguments(request: Channel, args: object) -> object:
         return {} if args is None else args
     names = RosbridgeCodec(request).field_names
     if len(args) > len(names):
-        raise _wrong(f"{len(args)} arguments; {request.type_name} has {len(names)}")
+        raise wrong(f"{len(args)} arguments; {request.type_name} has {len(names)}")
     return dict(zip(names, args, strict=False))
-
-
-def _type(text: str, part: str) -> str:
-    """Return a type as ROS 2 writes it."""
-    package, slash, name = text.partition("/")
-    return f"{package}/{part}/{name}" if slash and "/" not in name else text
-
-
-def _text(**fields: object) -> str:
-    return orjson.dumps(fields).decode()
-
-
-def _word(fields: dict[str, object], key: str, *, is_optional: bool = False) -> str:
-    value = fields.get(key)
-    if value is None and is_optional:
-        return ""
-    if not isinstance(value, str) or len(value) > _TEXT_MAX:
-        raise _wrong(f"{key}: a text of at most {_TEXT_MAX} characters was expected")
-    return value
-
-
-def _id(fields: dict[str, object], default: object = "") -> object:
-    """Return the client's id of a request, as it is to be repeated. Raises ``RemoteError``: it is no text or number."""
-    value = fields.get("id", default)
-    if value is None or isinstance(value, bool | int | float):
-        return value
-    return _word(fields, "id") if "id" in fields else value
-
-
-def _number(fields: dict[str, object], key: str, limit: int) -> int:
-    value = fields.get(key, 0)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
-        raise _wrong(f"{key}: a whole number from 0 to {limit} was expected")
-    return value
-
-
-def _wrong(detail: str) -> RemoteError:
-    return RemoteError(DropReason.MALFORMED, detail)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from pydantic import ValidationError
 
@@ -46,9 +47,9 @@ class DoorRules:
         """Return why clients may not read a topic; an empty type fits any."""
         return _missing(self.imports, "read", "topic", topic, type_name)
 
-    def may_call(self, service: str) -> str:
-        """Return why clients may not call a service."""
-        return _missing(self.imports, "call", "service", service, "")
+    def may_call(self, name: str, kind: Literal["service", "action"] = "service") -> str:
+        """Return why clients may not call a service or an action."""
+        return _missing(self.imports, "call", kind, name, "")
 
     def type_of(self, topic: str) -> str:
         """Return the type of a topic that clients may publish; empty: none."""

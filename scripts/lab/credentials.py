@@ -199,7 +199,9 @@ def grant(
 ) -> None:
     """Let a node act on names; ``types``: ROS types of names."""
     for name, given in rights.items():
-        kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-        typed = {"type": types[name]} if types and name in types else {}
+        type_name = (types or {}).get(name, "")
+        calls = "action" if "/action/" in type_name else "service"
+        kind = calls if {Right.SERVE, Right.CALL} & set(given) else "topic"
+        typed = {"type": type_name} if type_name else {}
         metadata = Metadata({"kind": kind, "name": name, **typed})
         install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))

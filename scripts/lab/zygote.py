@@ -330,7 +330,7 @@ def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Prog
     first = str(Path(program.file).resolve().parent) if program.file else request.cwd
     paths = filter(None, request.environment.get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = [first, *paths, *birth.path]
-    _name(program.argv)
+    _show(program.argv, request.environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     _open_streams(is_unbuffered=bool(request.environment.get("PYTHONUNBUFFERED")))
     os.closerange(_FIRST_FD, waiting[-1] + 1)
@@ -365,12 +365,18 @@ def _prctl(option: int, value: int) -> None:
         raise OSError(ctypes.get_errno(), "prctl")
 
 
-def _name(argv: Sequence[str]) -> None:
-    """Let ``/proc/PID/cmdline`` say what runs here: write over the zygote's own arguments, which were long enough."""
+def _show(argv: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Let ``/proc`` say what runs here, and the variables that the zygote has not: written over the zygote's own.
+
+    The arguments were long enough for that. Variables of the zygote that do not fit are left out.
+    """
     fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    start, end = int(fields[45]), int(fields[46])
-    words = b"\0".join(map(os.fsencode, argv))[: end - start - 1]
-    ctypes.memmove(start, words.ljust(end - start, b"\0"), end - start)
+    started = set(Path("/proc/self/environ").read_text(encoding="utf-8", errors="replace").split("\0"))
+    variables = sorted((f"{name}={value}" for name, value in environment.items()), key=lambda each: each in started)
+    for at, words in ((45, argv), (47, variables)):
+        start, end = int(fields[at]), int(fields[at + 1])
+        text = b"\0".join(map(os.fsencode, words))[: end - start - 1]
+        ctypes.memmove(start, text.ljust(end - start, b"\0"), end - start)
 
 
 def _settings(environment: Mapping[str, str]) -> dict[str, str]:

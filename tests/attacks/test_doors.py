@@ -32,7 +32,7 @@ from proxy.doors.rosbridge_session import IDS_MAX, RosbridgeSession
 from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.door import DoorEndpoint, DoorSettings
-from tests.proxy.doors.rights import Everything
+from tests.proxy.doors.rights import Everything, goal_id
 from tests.proxy.doors.test_foxglove_door import free_port
 from tests.proxy.doors.test_parameters import service
 from tests.waiting import until
@@ -46,7 +46,9 @@ def door_of(token: str = "", host: str = "127.0.0.1") -> Iterator[DoorEndpoint]:
     settings = DoorSettings(label="rosbridge", listen=f"{host}:{free_port()}", token=token)
     clock = count(1.0)
     door = DoorEndpoint(
-        settings, lambda hub, number, queue: RosbridgeSession(hub, number, queue, lambda: next(clock)), Everything
+        settings,
+        lambda hub, number, queue: RosbridgeSession(hub, number, queue, lambda: next(clock), goal_id),
+        Everything,
     )
     try:
         yield door
@@ -152,6 +154,8 @@ REQUESTS: list[dict[str, object]] = [
     {"op": "publish", "topic": "/a", **STRING, "msg": {"data": "x"}},
     {"op": "call_service", "service": "/add"},
     {"op": "call_service", "service": "/rosapi/topics"},
+    {"op": "send_action_goal", "action": "/a", "action_type": "a/action/B"},
+    {"op": "cancel_action_goal", "action": "/a"},
     {"op": "set_level", "level": "info"},
     {"op": "nothing"},
 ]
@@ -164,7 +168,7 @@ class Site:
         self.events: list[Event] = []
         self.hub = Hub(self.events.append, Everything, known_channel)
         self.queue = ClientQueue()
-        self.session = RosbridgeSession(self.hub, 1, self.queue, lambda: 1.0)
+        self.session = RosbridgeSession(self.hub, 1, self.queue, lambda: 1.0, goal_id)
         self.hub.open(self.session)
 
     def say(self, **fields: object) -> str:
@@ -234,7 +238,7 @@ def test_z03_whatever_a_foxglove_client_sends_is_done_or_one_error(
         session.handle_message(raw, 5)
 
 
-@pytest.mark.parametrize("key", ["op", "topic", "type", "service", "compression", "level"])
+@pytest.mark.parametrize("key", ["op", "topic", "type", "service", "action", "action_type", "compression", "level"])
 def test_z03_no_text_of_a_client_is_repeated_at_length(key: str) -> None:
     site = Site()
     for each in REQUESTS:

@@ -108,6 +108,7 @@ class _Endpoint:
         channel = self._channels[handle]
         if channel.ros == 2:
             _outcome(lambda: RosbridgeCodec(channel).to_json(raw))
+            _outcome(lambda: RosbridgeCodec(channel).to_cbor("/t", raw))
             _outcome(lambda: cbor_raw("/t", 0, raw))
         text = MessageText(channel)
         _outcome(lambda: text.to_yaml(raw).encode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.proxy.bridge import known
 
-__all__ = ["Everything"]
+__all__ = ["Everything", "goal_id"]
 
 
 class Everything:
@@ -16,8 +16,13 @@ class Everything:
     def may_publish(self, topic: str, type_name: str) -> str:
         return ""
 
-    def may_call(self, service: str) -> str:
+    def may_call(self, name: str, kind: str = "service") -> str:
         return ""
 
     def type_of(self, topic: str) -> str:
         return known.STRING
+
+
+def goal_id() -> bytes:
+    """Return the id of every goal."""
+    return bytes(range(16))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import itertools
 import json
 import math
@@ -22,7 +24,7 @@ from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
-from tests.proxy.doors.rights import Everything
+from tests.proxy.doors.rights import Everything, goal_id
 
 NUMBERS = known.custom("own_msgs/msg/Numbers", "float64 x\nfloat32[] y\nuint8[] octets\nint64 big\nbool on\nstring s\n")
 
@@ -37,7 +39,7 @@ class Site:
 
     def __post_init__(self) -> None:
         self.hub = Hub(self.events.append, lambda: self.rights, _known)
-        self.session = RosbridgeSession(self.hub, 1, ClientQueue(), lambda: self.now_s)
+        self.session = RosbridgeSession(self.hub, 1, ClientQueue(), lambda: self.now_s, goal_id)
         self.hub.open(self.session)
 
     def say(self, **fields: object) -> list[dict[str, object]]:
@@ -219,6 +221,53 @@ def test_raw_bytes_are_had_as_cbor() -> None:
     assert site.heard() == [{"op": "publish", "topic": "/chat", "msg": message}]
 
 
+def test_what_one_client_publishes_reaches_the_clients_of_the_same_door_that_read_it() -> None:
+    site = Site()
+    site.hub.offer_topic(1, known_channel("/chat", known.STRING))
+    other = RosbridgeSession(site.hub, 2, ClientQueue(), lambda: site.now_s, goal_id)
+    site.hub.open(other)
+    site.say(op="subscribe", topic="/chat")
+    other.handle_message(json.dumps({"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}), 5)
+    assert site.heard() == [{"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}]
+    assert site.say(op="publish", topic="/chat", msg={"data": "own"}) == [
+        {"op": "publish", "topic": "/chat", "msg": {"data": "own"}}
+    ]
+    site.hub.take_topic(7, "/chat", known.STRING)
+    sent = [known.text_of(each.raw) for each in site.events if isinstance(each, MessageReceived)]
+    assert sent == ["hello", "own"]
+
+
+def test_the_time_is_had_in_the_spelling_of_either_ros() -> None:
+    (heard,) = Site().say(op="call_service", service="/rosapi/get_time")
+    assert heard["values"] == {"time": {"sec": 0, "nanosec": 5, "secs": 0, "nsecs": 5}}
+
+
+def test_cbor_has_octets_as_bytes_and_numbers_as_typed_arrays() -> None:
+    site = Site()
+    site.hub.offer_topic(1, replace(NUMBERS, topic="/n"))
+    site.say(op="subscribe", topic="/n", compression="cbor")
+    sent = {"x": math.inf, "y": [1.0, 2.0], "octets": [1, 2], "big": 1 << 60, "on": True, "s": "é"}
+    site.hub.pass_message(1, 5, RosbridgeCodec(NUMBERS).to_raw(sent))
+    (heard,) = site.heard()
+    typed = cbor2.CBORTag(85, struct.pack("<2f", 1.0, 2.0))  # RFC 8746: float32, little-endian
+    assert heard == {"op": "publish", "topic": "/n", "msg": sent | {"y": typed, "octets": b"\1\2"}}
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3, 100, 5_000])
+def test_png_has_the_text_in_its_pixels(size: int) -> None:
+    image = pytest.importorskip("PIL.Image")
+    site = Site()
+    site.hub.offer_topic(1, known_channel("/chat", known.STRING))
+    site.say(op="subscribe", topic="/chat", compression="png")
+    site.hub.pass_message(1, 5, known.string("é" * size))
+    (heard,) = site.heard()
+    assert heard["op"] == "png"
+    picture = image.open(io.BytesIO(base64.b64decode(str(heard["data"]))))
+    assert (picture.format, picture.mode, picture.text) == ("PNG", "RGB", {})
+    text = picture.tobytes().decode()
+    assert json.loads(text) == {"op": "publish", "topic": "/chat", "msg": {"data": "é" * size}}
+
+
 def test_a_late_subscription_gets_the_last_latched_message() -> None:
     site = Site()
     channel = replace(known_channel("/map", known.STRING), latched=True, qos=(default(latched=True, depth=1),))
@@ -300,7 +349,7 @@ def test_another_message_is_refused(data: str) -> None:
         {"op": "subscribe"},
         {"op": "subscribe", "topic": 5},
         {"op": "subscribe", "topic": "/a", "throttle_rate": -1},
-        {"op": "subscribe", "topic": "/a", "compression": "png"},
+        {"op": "subscribe", "topic": "/a", "compression": "zip"},
         {"op": "unsubscribe", "topic": "/a"},
         {"op": "unadvertise", "topic": "/a"},
         {"op": "set_level", "level": "loud"},
