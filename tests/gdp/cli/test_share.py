@@ -110,6 +110,22 @@ def test_lists_show_offers_and_what_is_shared(robot: Machine, server: Machine, r
     assert "/goal  std_msgs/msg/String  robot  publish" in run("import", "server", "--list")[1]
 
 
+def test_a_second_robots_equal_name_is_listed_as_not_used_with_what_to_do(
+    site: Site, robot: Machine, server: Machine, run: Run
+) -> None:
+    arm = site.add("arm")
+    FolderExchange(site.folder / "common", load_card(arm.folder / "proxy" / CARD))
+    run("expose", "robot", "/state", "--type", STRING, "--to", "server")
+    run("import", "server", "/*")
+    run("expose", "arm", "/state", "--type", STRING, "--to", "server")
+    code, text, errors = run("import", "server", "/state")
+    assert f"  /state [{STRING}] from robot\n  /state [{STRING}] from arm: not used\n" in text
+    assert (code, "state prefix: in the proxy.yaml of arm" in errors) == (0, True)
+    states = [line.split()[-2:] for line in run("import", "server", "--list")[1].splitlines()]
+    assert [each[-1] for each in states] == ["state", "used", "used"]
+    assert states[2] == ["not", "used"]
+
+
 def test_a_name_is_taken_back_through_the_switch_of_the_machine(robot: Machine, server: Machine, run: Run) -> None:
     run("share", "robot", "/goal", "--type", STRING, "--with", "server")
     (robot.folder / "revoked").mkdir()
