@@ -5,16 +5,20 @@ I/O: it searches the installed packages.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-__all__ = ["MissingExtraError", "find_entry_point", "require_extra"]
+__all__ = ["MissingExtraError", "find_entry_point", "install_command", "require_extra"]
+
+_ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 class MissingExtraError(LocalError, ImportError):
@@ -32,7 +36,14 @@ def require_extra(extra: str, modules: Iterable[str], user: str) -> None:
     """
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        raise MissingExtraError(f"{user} needs {', '.join(missing)} (run: pip install 'gdp-ros[{extra}]')")
+        raise MissingExtraError(f"{user} needs {', '.join(missing)} (run: {install_command(extra)})")
+
+
+def install_command(extras: str) -> str:
+    """Return the command that installs extras: from the package index, or into a clone, by its own Python."""
+    if (_ROOT / "pyproject.toml").is_file():
+        return f"{sys.executable} -m pip install -e '{_ROOT}[{extras}]'"
+    return f"pip install 'gdp-ros[{extras}]'"
 
 
 def find_entry_point(group: str, name: str) -> EntryPoint | None:

@@ -22,9 +22,6 @@ def test_the_tutorial_of_the_library_does_what_it_says() -> None:
     make, delegate, nodes = (block.text for block in shown if block.language == "bash")
     subscribe, publish, serve, call, subscribe_async = (block.text for block in shown if block.language == "python")
     with session_lab({}) as lab:
-        for block in shown:
-            if block.language == "yaml":
-                (lab.folder / block.title).write_text(block.text)
         for script in (make, delegate):
             lab.output(lab.start_command(["bash", "-e", "-c", script]))
         for line in nodes.splitlines():

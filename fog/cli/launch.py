@@ -11,6 +11,7 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
@@ -26,11 +27,12 @@ from fog.cluster import ClusterPlan
 from fog.launch.load import Loaded
 from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
-from fog.supervisor.infrastructure import command_of, open_provider, set_up
+from fog.supervisor.infrastructure import command_of, is_up, open_provider, set_up
 from fog.supervisor.journal import Entry, Journal
 from gdp.cli.console import Columns
 from gdp.errors import LocalError
 from gdp.stores.keyring import load_salt
+from gdp.terminal import echo
 
 __all__ = ["GatewayKind", "begin", "follow", "launch"]
 
@@ -148,7 +150,7 @@ def launch(
         if detach or not loaded.robot_nodes:
             return
         try:
-            code = run(robot, here.state / "nodes")
+            code = run(robot, here.state / "nodes", partial(_check_wanted, journal, plan.name))
         finally:
             if not (keep or loaded.keep):
                 end_cluster(here, journal, plan.name, "its launch has ended", as_json=as_json)
@@ -160,8 +162,16 @@ def _with(site: Site, gateway: GatewayKind | None) -> Site:
     return site if gateway is None else with_gateway(site, is_replica=gateway is GatewayKind.REPLICA)
 
 
+def _check_wanted(journal: Journal, name: str) -> None:
+    """Raise ``LocalError`` once a cluster is given back, such as by another shell."""
+    if not (now := journal.cluster(name)).is_up:
+        raise LocalError(f"the cluster {name} was given back: {now.why}")
+
+
 def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
     """Store a cluster's plan in the journal, and ensure that a supervisor runs."""
+    if site.robot is not None and not is_up(site):
+        echo("making keys, and starting the network and the robot's switch, RIB and proxy", err=True)
     set_up(site)
     save_topology(site)
     journal.put_cluster(plan.salted(load_salt(site.authority.owner)), time.time())
@@ -192,8 +202,7 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
             after, trouble = news()
             if serving >= wanted:
                 break
-            if not (now := journal.cluster(plan.name)).is_up:
-                raise LocalError(f"cluster {plan.name} is given up: {now.why}")
+            _check_wanted(journal, plan.name)
             if time.monotonic() >= end_s:
                 why = f"; last trouble: {trouble}" if trouble else ""
                 raise LocalError(

@@ -5,11 +5,14 @@ I/O.
 
 from __future__ import annotations
 
+import difflib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 from fog.catalog.measured import measured
+from fog.catalog.prices import PROVIDERS, regions_of
 from fog.cluster import ClusterPlan, MachineRequest
 from fog.hardware import Hardware
 from fog.latency.known import Latencies, Latency
@@ -20,6 +23,8 @@ from fog.providers.provider import Provider
 from gdp.errors import GdpError, LocalError
 
 __all__ = ["Market", "choices", "in_regions", "market", "reached", "refusal"]
+
+_MISSPELLED: Final = 0.9  # of the letters are the same; me-central-1 is not eu-central-1
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +56,25 @@ def _is_asked(wanted: MachineRequest, is_spot: bool) -> bool:
 
 
 def in_regions(machines: Sequence[MachineRequest], regions: Sequence[str]) -> tuple[MachineRequest, ...]:
-    """Return the machines in these regions, in turn, whatever the launch file says; unchanged if there are none."""
-    if not regions:
-        return tuple(machines)
-    return tuple(replace(each, region=regions[at % len(regions)]) for at, each in enumerate(machines))
+    """Return the machines in these regions, in turn, whatever the launch file says; unchanged if there are none.
+
+    Raises:
+        LocalError: a region is misspelled; ``local`` simulates any that is not close to a known one.
+    """
+    if regions:
+        machines = [replace(each, region=regions[at % len(regions)]) for at, each in enumerate(machines)]
+    known = [region for provider in PROVIDERS for region in regions_of(provider)]
+    for name in dict.fromkeys(each.region for each in machines):
+        near = difflib.get_close_matches(letters := _letters(name), map(_letters, known), 1, _MISSPELLED)
+        if near and near[0] != letters:  # another number is another region
+            meant = difflib.get_close_matches(name, (each for each in known if _letters(each) == near[0]), 1, 0)
+            raise LocalError(f"no region is called {name}; did you mean {meant[0]}?")
+    return tuple(machines)
+
+
+def _letters(region: str) -> str:
+    """Return a region's name without its provider and numbers."""
+    return "".join(filter(str.isalpha, region.rpartition("/")[2]))
 
 
 def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:

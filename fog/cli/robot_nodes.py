@@ -9,7 +9,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -27,6 +27,7 @@ __all__ = ["INTERRUPTED", "Started", "resolved", "run"]
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
 _OWN_S: Final = 1.0  # at a terminal Ctrl-C reaches the nodes as well; a second signal would interrupt their shutdown
 _END_S: Final = 5.0
+_CHECK_S: Final = 1.0  # the journal of clusters has no change notification
 
 Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"
 
@@ -37,18 +38,21 @@ def resolved(each: RobotNode) -> Started:
     return each, tuple(sys.executable if word == PYTHON else word for word in words)
 
 
-def run(nodes: Sequence[Started], logs: Path) -> int:
+def run(nodes: Sequence[Started], logs: Path, check: Callable[[], None] = lambda: None) -> int:
     """Run nodes until all have ended, or Ctrl-C ends them; return the highest exit code.
 
     Args:
         logs: folder for the output of nodes that do not print to the terminal. Their errors appear in the terminal, as
             with ``ros2 launch``.
+        check: called about once a second; what it raises ends the nodes.
     """
     processes: list[subprocess.Popen[bytes]] = []
     try:
         for index, (each, words) in enumerate(nodes):
             processes.append(_start(each, words, logs / f"{index}-{each.node.executable.rpartition('/')[2]}.log"))
-        return max((abs(process.wait()) for process in processes), default=0)
+        while not _await(processes, _CHECK_S):
+            check()
+        return max((abs(process.returncode) for process in processes), default=0)
     except KeyboardInterrupt:
         return INTERRUPTED
     except OSError as error:

@@ -21,6 +21,7 @@ from fog.cluster import CloudNode
 from fog.launch.resolve import PYTHON, command_line, file_of
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
+from gdp.terminal import echo
 
 __all__ = ["cache_file", "free_domain", "kept", "offered"]
 
@@ -39,6 +40,7 @@ def offered(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found:
     cache = cache or cache_file()
     if (before := kept(nodes, cache=cache)) is not None:
         return before
+    echo("starting the nodes once, to see what they offer", err=True)
     found = _found(nodes)
     known = {**_read(cache), _key(nodes): found}
     cache.parent.mkdir(parents=True, exist_ok=True)

@@ -213,5 +213,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp-delegate")
     except GdpError as error:
-        echo(f"gdp-delegate: {error}", err=True)
+        echo(f"error: {error}", err=True)
         sys.exit(2)

@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp")
     except GdpError as error:
-        echo(f"gdp: {error}", err=True)
+        echo(f"error: {error}", err=True)
         sys.exit(2)
 
 

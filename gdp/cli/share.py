@@ -193,17 +193,17 @@ def import_names(
     with _sharing(directory, exchange, None) as sharing:
         if show_list:
             report = sharing.work(time.time())
-            offers = [_offer_fields(offer, is_accepted=is_accepted) for offer, is_accepted in sharing.offers()]
+            offers = [_offer_fields(*each) for each in sharing.offers()]
             accepted = [each.model_dump() for each in sharing.state().accepted]
             fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
-            show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "accepted")))
+            show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "state")))
         elif name is None:
             raise LocalError("import: state a NAME, or --list")
         elif remove:
             _show_change(name, sharing.stop_accepting("import", name, time.time()), as_json=as_json)
         else:
             report = sharing.accept(AcceptedName(side="import", name=name, source=source), time.time())
-            found = [each for each, is_accepted in sharing.offers() if is_accepted and fits(name, each.ros_name)]
+            found = [each for each in sharing.offers() if each[1] != "offered" and fits(name, each[0].ros_name)]
             _show_change(name, report, as_json=as_json, offers=found, awaited="as soon as a node offers it")
 
 
@@ -328,11 +328,16 @@ def _sharing(directory: Path, folder: Path | None, owner: Path | None) -> Iterat
 
 
 def _show_change(
-    name: str, report: ShareReport, *, as_json: bool, offers: Sequence[Offer] | None = None, awaited: str = ""
+    name: str,
+    report: ShareReport,
+    *,
+    as_json: bool,
+    offers: Sequence[tuple[Offer, str]] | None = None,
+    awaited: str = "",
 ) -> None:
     """Print what a change did; problems go to stderr."""
     delegated = [_issued_fields(each) for each in report.granted]
-    given = {} if offers is None else {"offers": [_offer_fields(each, is_accepted=True) for each in offers]}
+    given = {} if offers is None else {"offers": [_offer_fields(*each) for each in offers]}
     applied = {True: "now", False: "at the next start of the proxy", None: "nothing to apply"}[report.is_running]
     if awaited and not delegated and not offers and report.is_running is not False:
         applied = awaited
@@ -346,7 +351,9 @@ def _show_change(
     }
     lines = [f"{name}: {applied}"]
     lines += [f"  {each['name']} [{each['type']}] to {each['node']} until {each['until']}" for each in delegated]
-    lines += [f"  {each.ros_name} [{each.type_name}] from {each.sender}" for each in offers or ()]
+    for each, state in offers or ():
+        more = "" if state == "used" else f": {state}"
+        lines.append(f"  {each.ros_name} [{each.type_name}] from {each.sender}{more}")
     show(fields, as_json=as_json, plain="\n".join(lines))
     for text in report.problems:
         echo(f"gdp: {text}", err=True)
@@ -366,7 +373,7 @@ def _issued_fields(issued: IssuedDelegation) -> dict[str, object]:
     }
 
 
-def _offer_fields(offer: Offer, *, is_accepted: bool) -> dict[str, object]:
+def _offer_fields(offer: Offer, state: str) -> dict[str, object]:
     return {
         "kind": offer.kind,
         "name": offer.ros_name,
@@ -375,7 +382,8 @@ def _offer_fields(offer: Offer, *, is_accepted: bool) -> dict[str, object]:
         "rights": sorted(right.value for right in offer.delegation.rights),
         "until": moment(offer.until_unix_s),
         "owner": offer.owner.compressed.hex(),
-        "accepted": is_accepted,
+        "accepted": state != "offered",
+        "state": state,
     }
 
 

@@ -34,11 +34,13 @@ __all__ = [
     "StateFolder",
     "TokenFolders",
     "Unique",
+    "first_fault",
     "load",
     "read_name",
     "relative",
 ]
 
+_VALUE_ERROR: Final = "Value error, "  # prefix of pydantic for what our validators say
 _SHOULD_BE: Final = "Input should be "  # prefix of pydantic for a value of the wrong kind or out of bounds
 _PATH_SHOWN: Final = 200  # characters
 _IFNAME_MAX: Final = 15  # IFNAMSIZ - 1; Linux, include/uapi/linux/if.h
@@ -208,6 +210,13 @@ def load(
         raise ConfigError(str(path), "", str(error)) from error
 
 
+def first_fault(invalid: ValidationError) -> str:
+    """Return the first finding of pydantic about data that have no lines: the key, and what is wrong."""
+    first = invalid.errors(include_url=False)[0]
+    key = ".".join(map(str, first["loc"]))
+    return f"{key}: {first['msg'].removeprefix(_VALUE_ERROR)}".removeprefix(": ")
+
+
 def _line_and_column(where: str) -> tuple[int, int]:
     _, line, column = where.rsplit(":", 2)
     return int(line), int(column)
@@ -227,7 +236,7 @@ def _translated(model: type[Section], source: YamlSource, details: list[ErrorDet
             wanted = message.removeprefix(_SHOULD_BE).removeprefix("a valid ")
             wrong_kind.setdefault(_shown(source, key), ([], detail["input"]))[0].append(_WORDS.get(wanted, wanted))
         else:
-            yield source.error(_shown(source, key), message.removeprefix("Value error, "))
+            yield source.error(_shown(source, key), message.removeprefix(_VALUE_ERROR))
     for key, (wanted_each, found) in wrong_kind.items():
         instead = f", not {found!r}" if isinstance(found, str | int | float | None) else ""
         yield source.error(key, f"expected {' or '.join(wanted_each)}{instead}")

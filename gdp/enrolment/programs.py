@@ -15,7 +15,7 @@ from typing import Final
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE
 from gdp.errors import LocalError
-from gdp.extras import find_entry_point
+from gdp.extras import find_entry_point, install_command
 
 __all__ = ["MachineProgram", "missing_ros", "node_program", "programs_of"]
 
@@ -117,7 +117,7 @@ def missing_ros() -> str:
     if find_entry_point("console_scripts", "gdp-proxy") is None:
         return "the package of the proxy is not installed"
     if all(importlib.util.find_spec(each) is None for each in _ROS):
-        return "neither rclpy nor cyclonedds is installed: pip install 'gdp-ros[dds]', then run gdp up again"
+        return f"neither rclpy nor cyclonedds is installed: {install_command('dds')}, then run gdp up again"
     return ""
 
 

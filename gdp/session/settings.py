@@ -16,7 +16,7 @@ import orjson
 from pydantic import Field, ValidationError
 
 from gdp.config.config import LeaseSeconds
-from gdp.config.schema import Directory, Domain, Ifname, Section, load
+from gdp.config.schema import Directory, Domain, Ifname, Section, first_fault, load
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
@@ -100,9 +100,7 @@ def settings_of(
     try:
         return SessionConfig.model_validate_json(orjson.dumps(values, default=os.fspath), strict=True)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise LocalError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from error
+        raise LocalError(f"{path}: {first_fault(error)}") from error
 
 
 def _values(config: SessionConfig) -> dict[str, object]:

@@ -14,7 +14,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
-from gdp.config.schema import Section
+from gdp.config.schema import Section, first_fault
 from gdp.errors import LocalError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.metadata import Metadata
@@ -212,4 +212,4 @@ class IssuedStore:
         try:
             return IssuedDelegation.model_validate_json(read_private(file))
         except ValidationError as error:
-            raise LocalError(f"{file}: not a record of a delegation: {error.errors()[0]['msg']}") from error
+            raise LocalError(f"{file}: not a record of a delegation: {first_fault(error)}") from error

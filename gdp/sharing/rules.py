@@ -91,7 +91,8 @@ def usable(
         sides = {each.side for each in state.accepted if offer.fits(each)}
         for side in sides:
             if key in taken:
-                problems.append(f"{offer.ros_name} from {offer.sender}: another owner's {offer.ros_name} is in use")
+                why = f"another owner's {offer.ros_name} is in use; state prefix: in the proxy.yaml of {offer.sender}"
+                problems.append(f"{offer.ros_name} from {offer.sender}: {why}")
                 continue
             try:
                 _refuse_direction(files, state, (), side, *key)

@@ -205,10 +205,20 @@ class Sharing:
             at.report.granted = [each for each, _ in statements]
         return at.report
 
-    def offers(self) -> list[tuple[Offer, bool]]:
-        """Return the offers, each with whether it is accepted. Raises ``LocalError``: a file is invalid."""
+    def offers(self) -> list[tuple[Offer, str]]:
+        """Return the offers, each with its state: ``offered``, or if accepted ``used`` or ``not used``.
+
+        Raises:
+            LocalError: a file is invalid.
+        """
         state = self._folder.read_state()
-        return [(each, any(each.fits(name) for name in state.accepted)) for each in self._folder.offers(state)]
+        offers = list(self._folder.offers(state))
+        used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, [])]
+        accepted = [any(each.fits(name) for name in state.accepted) for each in offers]
+        return [
+            (each, ("used" if each in used else "not used") if is_accepted else "offered")
+            for each, is_accepted in zip(offers, accepted, strict=True)
+        ]
 
     def state(self) -> ShareState:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""

@@ -16,7 +16,7 @@ from typing import Final, Literal
 
 from pydantic import Field, ValidationError
 
-from gdp.config.schema import Section
+from gdp.config.schema import Section, first_fault
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError, StatementError
@@ -184,9 +184,7 @@ class StateFolder:
         try:
             return ShareState.model_validate_json(read_private(file))
         except ValidationError as error:
-            raise LocalError(
-                f"{file}: not the state of a node that shares names: {error.errors()[0]['msg']}"
-            ) from error
+            raise LocalError(f"{file}: not the state of a node that shares names: {first_fault(error)}") from error
 
     def save(self, state: ShareState) -> None:
         """Replace the state. Raises ``LocalError``: the folder cannot be written."""

@@ -75,6 +75,6 @@ def _copy(file: Path, whole: Path) -> tuple[int, str]:
         with BagWriter(made, ros) as writer:
             handles = [writer.add(channel) for channel in reader.channels]
             for message in reader.messages():
-                writer.write(handles[message.channel], message.stamp_ns, message.raw)
+                writer.write(handles[message.channel], message.stamp_ns, message.raw, message.origin)
         made.rename(whole)
         return writer.written, reader.unread

@@ -165,5 +165,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp rule")
     except GdpError as error:
-        echo(f"gdp: {error}", err=True)
+        echo(f"error: {error}", err=True)
         sys.exit(2)

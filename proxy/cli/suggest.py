@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import LocalError
+from gdp.extras import install_command
 from gdp.ports.readiness import readable
 from gdp.printable import printable
 from gdp.stores.files import public, write_all
@@ -42,7 +43,7 @@ def suggest(directory: Path) -> Path:
     """
     has_rclpy = importlib.util.find_spec("rclpy") is not None
     if not has_rclpy and importlib.util.find_spec("cyclonedds") is None:
-        raise LocalError("gdp up: neither rclpy nor cyclonedds is installed; run: pip install 'gdp-ros[dds]'")
+        raise LocalError(f"gdp up: neither rclpy nor cyclonedds is installed; run: {install_command('dds')}")
     end = RosGraphConfig(endpoint="ros2" if has_rclpy else "dds")
     endpoint = open_endpoint(end, proxy_node_name("0" * 12, "suggest"))
     try:

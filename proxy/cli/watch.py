@@ -83,7 +83,7 @@ def watch(
         with contextlib.suppress(KeyboardInterrupt):
             _follow(name, socket, deadline, duration, count, as_json=as_json)
     except NotRunningError as error:
-        echo(f"gdp: {error}", err=True)
+        echo(f"error: {error}", err=True)
         raise typer.Exit(_NOT_RUNNING) from error
 
 
@@ -139,5 +139,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp watch")
     except GdpError as error:
-        echo(f"gdp: {error}", err=True)
+        echo(f"error: {error}", err=True)
         sys.exit(2)

@@ -12,6 +12,7 @@ from typing import Literal
 from pydantic import ValidationError
 
 from gdp.client.participant import Topic
+from gdp.config.schema import first_fault
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError
 from gdp.trust.right import Right
@@ -88,7 +89,7 @@ def rules_of(held: Sequence[Topic]) -> DoorRules:
                 }
             )
         except (KeyError, ValidationError, GdpError) as error:
-            first = error.errors()[0]["msg"] if isinstance(error, ValidationError) else f"no {error}"
+            first = first_fault(error) if isinstance(error, ValidationError) else f"no {error}"
             left_out.append((str(metadata.get("name", topic.name.short)), first))
             continue
         if rule.kind == "topic" and Right.PUBLISH in rights:

@@ -17,6 +17,7 @@ import orjson
 from pydantic import ValidationError
 
 from gdp.cli.node import emit, emit_wait
+from gdp.config.schema import first_fault
 from gdp.errors import LocalError
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.session.settings import SessionConfig, settings_of
@@ -58,8 +59,7 @@ def door_config(node: Path, iface: str | None, delegations: Path | None) -> tupl
     try:
         return ProxyConfig.model_validate_json(orjson.dumps(_values(settings, directory), default=os.fspath)), directory
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise LocalError(f"{node}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        raise LocalError(f"{node}: {first_fault(error)}") from error
 
 
 def _values(settings: SessionConfig, directory: Path) -> dict[str, object]:

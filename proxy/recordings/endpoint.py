@@ -168,10 +168,10 @@ class ReplayEndpoint(_TopicsEndpoint):
 
     def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
         """Yield the messages of subscribed topics in time order; ``waiting``: as for ``BagReader.messages``."""
-        for index, stamp_ns, raw in self._reader.messages(waiting):
-            subscribed = self._subscribed.get(index)
+        for message in self._reader.messages(waiting):
+            subscribed = self._subscribed.get(message.channel)
             if subscribed is not None:
-                yield RecordedMessage(*subscribed, stamp_ns, raw)
+                yield RecordedMessage(*subscribed, message.stamp_ns, message.raw)
 
     def deliver(self, message: RecordedMessage) -> None:
         """Publish a message now; its stamp is the present time."""

@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.channels import from_ros2, offered_qos
 from proxy.recordings.salvage_ros1 import channel_of
-from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
+from proxy.recordings.source import Chunk, Heads, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import DefinitionFormat
 
@@ -69,8 +70,14 @@ def scan(path: Path) -> ScannedSource:
     return _Found().source(path, MAGIC)
 
 
+def _origin(head: bytes) -> Origin:
+    _, sequence, _, published_ns = _MESSAGE_HEAD.unpack(head)
+    return Origin(published_ns, sequence)
+
+
 class _Found(Scan):
     form = "an MCAP file"
+    heads = Heads(_MESSAGE_HEAD.size, _origin)
 
     def __init__(self) -> None:
         super().__init__()

@@ -10,16 +10,18 @@ import heapq
 import os
 from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol
 
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
 __all__ = [
     "ZSTD",
     "Chunk",
+    "Heads",
     "JoinedSource",
     "Message",
     "Place",
@@ -40,6 +42,7 @@ class Message(NamedTuple):
     channel: int  # index into the source's channels
     stamp_ns: int  # when it was recorded, Unix time
     raw: bytes
+    origin: Origin | None = None  # what its publisher said of it, where that is recorded
 
 
 class Source(Protocol):
@@ -86,6 +89,13 @@ class Place(NamedTuple):
     size: int
 
 
+class Heads(NamedTuple):
+    """What lies before each message in the file: so many bytes, and the origin in them."""
+
+    size: int
+    origin: Callable[[bytes], Origin]
+
+
 class Tally:
     """Amount of a file that was found, to estimate the amount that is missing."""
 
@@ -106,9 +116,12 @@ class Tally:
 class ScannedSource:
     """Messages found by scanning a file from its beginning; yielded in time order."""
 
-    def __init__(self, path: Path, channels: list[Channel], chunks: list[Chunk], places: list[Place]) -> None:
+    def __init__(
+        self, path: Path, channels: list[Channel], chunks: list[Chunk], places: list[Place], heads: Heads | None = None
+    ) -> None:
         self.channels = channels
         self.unread = ""
+        self._heads = heads
         self._chunks = chunks
         self._places = sorted(places)
         self._file: BinaryIO = path.open("rb")
@@ -128,26 +141,34 @@ class ScannedSource:
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for place in self._places:
-            yield Message(place.channel, place.stamp_ns, self._raw(place))
+            raw = self._read(place.chunk, place.at, place.size)
+            yield Message(place.channel, place.stamp_ns, raw, self._origin(place))
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _raw(self, place: Place) -> bytes:
-        if place.chunk < 0:
-            self._file.seek(place.at)
-            return self._file.read(place.size)
-        if place.chunk not in self._unpacked:
-            chunk = self._chunks[place.chunk]
+    def _origin(self, place: Place) -> Origin | None:
+        if self._heads is None:
+            return None
+        size = self._heads.size
+        return self._heads.origin(self._read(place.chunk, place.at - size, size))
+
+    def _read(self, number: int, at: int, size: int) -> bytes:
+        """Return bytes of a chunk, or of the file itself."""
+        if number < 0:
+            self._file.seek(at)
+            return self._file.read(size)
+        if number not in self._unpacked:
+            chunk = self._chunks[number]
             self._file.seek(chunk.at)
-            self._unpacked[place.chunk] = unpack(chunk.compression, self._file.read(chunk.size), chunk.unpacked)
+            self._unpacked[number] = unpack(chunk.compression, self._file.read(chunk.size), chunk.unpacked)
             while len(self._unpacked) > 1 and (
                 len(self._unpacked) > _CHUNKS_KEPT or sum(map(len, self._unpacked.values())) > CHUNK_MAX_BYTES
             ):
                 self._unpacked.popitem(last=False)
-        self._unpacked.move_to_end(place.chunk)
-        return self._unpacked[place.chunk][place.at : place.at + place.size]
+        self._unpacked.move_to_end(number)
+        return self._unpacked[number][at : at + size]
 
 
 class Scan(ABC):
@@ -155,6 +176,7 @@ class Scan(ABC):
 
     form: str
     empty = "no channel in it"
+    heads: Heads | None = None
 
     def __init__(self) -> None:
         self.channels: list[Channel] = []
@@ -185,7 +207,7 @@ class Scan(ABC):
             reason = self.traverse(file, size)
         if not self.channels:
             raise SalvageError(reason or "; ".join(self.left_out) or self.empty)
-        source = ScannedSource(path, self.channels, self.chunks, self.places)
+        source = ScannedSource(path, self.channels, self.chunks, self.places, self.heads)
         lacking = [self.stats.text(reason or self.unclosed)] if reason or self.unclosed else []
         source.unread = "; ".join([*lacking, *self.left_out])
         return source

@@ -6,7 +6,8 @@ input: it checks each length and number.
 ```
  CHANNEL   one description, as peers send it           one for each channel, before OPENED
  OPENED    messages (8), has_counts (1), counts (8 each)
- BLOCK     {channel (4), stamp in ns (8), size (4), bytes} ...   above 128 KiB: exactly one message
+ BLOCK     {channel (4), stamp in ns (8), size (4), publish time in ns (8), number (4), bytes} ...
+           above 128 KiB: exactly one message; a time and number of 0: none are recorded
  END       why some messages could not be read, UTF-8
  REFUSED   why it is no recording, UTF-8               the last frame
  FAILED    the decoder's error, UTF-8; empty: out of memory   the last frame
@@ -21,6 +22,7 @@ from enum import IntEnum
 from typing import Final, TypeAlias
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.source import Message
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 
@@ -47,7 +49,8 @@ MESSAGE_MAX_BYTES: Final = 256 << 20
 _TEXT_MAX: Final = 4_096
 
 _HEAD: Final = struct.Struct("<BI")
-_MESSAGE: Final = struct.Struct("<IqI")
+_MESSAGE: Final = struct.Struct("<IqIQI")
+_NO_ORIGIN: Final = Origin(0, 0)
 _OPENED: Final = struct.Struct("<Q?")
 _COUNT: Final = struct.Struct("<Q")
 
@@ -99,7 +102,7 @@ def message_head(message: Message) -> bytes:
     if size > MESSAGE_MAX_BYTES:
         raise LocalError(f"a message of {size} bytes; at most {MESSAGE_MAX_BYTES} are read")
     try:
-        return _MESSAGE.pack(message.channel, message.stamp_ns, size)
+        return _MESSAGE.pack(message.channel, message.stamp_ns, size, *(message.origin or _NO_ORIGIN))
     except struct.error as error:
         raise LocalError(f"a message with the stamp {message.stamp_ns}") from error
 
@@ -205,21 +208,21 @@ class FrameReader:
         return count, [number for (number,) in _COUNT.iter_unpack(rest)] if has_counts else None
 
     def _large(self, take: Take, size: int) -> Message:
-        channel, stamp_ns, said = _MESSAGE.unpack(take(_MESSAGE.size))
+        channel, stamp_ns, said, *origin = _MESSAGE.unpack(take(_MESSAGE.size))
         if channel >= len(self.channels) or said != size:
             raise LocalError("a block that does not hold together")
-        return Message(channel, stamp_ns, take(size))
+        return Message(channel, stamp_ns, take(size), Origin(*origin) if any(origin) else None)
 
     def _small(self, block: bytes) -> Iterator[Message]:
         at = 0
         while at < len(block):
             if at + _MESSAGE.size > len(block):
                 raise LocalError("a block that ends in a head")
-            channel, stamp_ns, size = _MESSAGE.unpack_from(block, at)
+            channel, stamp_ns, size, *origin = _MESSAGE.unpack_from(block, at)
             at += _MESSAGE.size
             if channel >= len(self.channels) or at + size > len(block):
                 raise LocalError("a block that does not hold together")
-            yield Message(channel, stamp_ns, block[at : at + size])
+            yield Message(channel, stamp_ns, block[at : at + size], Origin(*origin) if any(origin) else None)
             at += size
 
 

@@ -246,7 +246,7 @@ def topics_of(channels: Iterable[Channel], encoding: Encoding) -> tuple[Carried,
 
 
 def _recorded_s(reader: BagReader) -> float:
-    stamps_ns = [stamp_ns for _, stamp_ns, _ in reader.messages()]
+    stamps_ns = [message.stamp_ns for message in reader.messages()]
     return max((max(stamps_ns) - min(stamps_ns)) / 1e9, 1e-3) if stamps_ns else 1.0
 
 

@@ -274,9 +274,9 @@ DESCRIPTION = (Kind.CHANNEL, TOPIC.to_wire())
         frames(DESCRIPTION, (Kind.OPENED, struct.pack("<Q?Q", 1, True, 1) + bytes(8))),
         frames(DESCRIPTION, NUMBERS, (Kind.OPENED, NUMBERS[1])),
         frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, b"x")),
-        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqI", 1, 0, 0))),
-        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqI", 0, 0, 1))),
-        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqI", 0, 0, 1) + bytes(BLOCK_BYTES))),
+        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqIQI", 1, 0, 0, 0, 0))),
+        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqIQI", 0, 0, 1, 0, 0))),
+        frames(DESCRIPTION, NUMBERS, (Kind.BLOCK, struct.pack("<IqIQI", 0, 0, 1, 0, 0) + bytes(BLOCK_BYTES))),
     ],
 )
 def test_b02_what_a_decoder_says_wrongly_is_refused(said: bytes) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from gdp.extras import MissingExtraError, require_extra
+from gdp.extras import MissingExtraError, install_command, require_extra
 from tests.pages import ROOT
 
 _BLOCKER = """
@@ -49,8 +50,21 @@ def test_switches_in_memory_forward_without_the_extras() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_scapy_data_plane_names_its_extra_when_scapy_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clone_names_what_installs_an_extra_without_an_index_that_has_this_project(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("gdp.extras.find_spec", lambda module: None)
+    with pytest.raises(MissingExtraError) as caught:
+        require_extra("dashboard", ["websockets"], "gdp dashboard")
+    command = f"{sys.executable} -m pip install -e '{ROOT}[dashboard]'"
+    assert str(caught.value) == f"gdp dashboard needs websockets (run: {command})"
+
+
+def test_the_scapy_data_plane_names_its_extra_when_scapy_is_missing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("gdp.extras.find_spec", lambda module: None)
+    monkeypatch.setattr("gdp.extras._ROOT", tmp_path)
     with pytest.raises(MissingExtraError, match=r"needs scapy \(run: pip install 'gdp-ros\[scapy\]'\)"):
         require_extra("scapy", ("scapy",), "data plane scapy")
 
@@ -59,4 +73,4 @@ def test_the_scapy_data_plane_names_its_extra_when_scapy_is_missing(monkeypatch:
 def test_a_package_names_its_extra_when_it_is_missing(package: str, module: str) -> None:
     code = "import importlib.util\nimportlib.util.find_spec = lambda name: None\n"
     done = run_without_extras(code + f"import {module}")
-    assert f"pip install 'gdp-ros[{package}]'" in done.stderr
+    assert install_command(package) in done.stderr

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from fog.providers.aws.errors import asking
 from gdp.errors import LocalError
+from gdp.extras import install_command
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
@@ -35,7 +36,7 @@ class Clients:
         try:
             import boto3
         except ModuleNotFoundError as missing:
-            raise LocalError("provider aws needs boto3: pip install 'gdp-ros[aws]'") from missing
+            raise LocalError(f"provider aws needs boto3: {install_command('aws')}") from missing
         with asking("credentials"):
             self._session = boto3.session.Session()
         self._regions = chosen

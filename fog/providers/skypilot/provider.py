@@ -23,6 +23,7 @@ from fog.providers.cloud_init import lines_of, shell_script
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.providers.skypilot.record import being_made, cluster_name, labels_of, machine_of
 from gdp.errors import LocalError, StoreError
+from gdp.extras import install_command
 
 __all__ = ["SkyPilotProvider"]
 
@@ -55,7 +56,7 @@ class SkyPilotProvider:
         try:
             self._sky = sky or import_module("sky")
         except ModuleNotFoundError as missing:
-            raise LocalError("provider skypilot needs SkyPilot: pip install 'gdp-ros[skypilot]'") from missing
+            raise LocalError(f"provider skypilot needs SkyPilot: {install_command('skypilot')}") from missing
         if sky is None:  # this process is a client; in a server SkyPilot prints progress as lines of a protocol
             import_module("sky.utils.annotations").client_api(lambda: None)()
 

@@ -7,12 +7,13 @@ implement ROS's conventions in DDS.
 """
 
 from gdp.errors import LocalError
+from gdp.extras import install_command
 
 try:
     from proxy.endpoints.dds.endpoint import DdsEndpoint
 except ModuleNotFoundError as error:
     if not (error.name or "").startswith("cyclonedds"):
         raise
-    raise LocalError("endpoint dds needs Cyclone DDS's Python binding: pip install 'gdp-ros[dds]'") from error
+    raise LocalError(f"endpoint dds needs Cyclone DDS's Python binding: {install_command('dds')}") from error
 
 __all__ = ["DdsEndpoint"]

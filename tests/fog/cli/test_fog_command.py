@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,8 +19,8 @@ from fog.bootstrap.members import metadata_of
 from fog.cli import launch, logs, options, status
 from fog.cli.app import app
 from fog.cli.views import stage
-from fog.cluster import ClusterPlan
-from fog.site import open_site
+from fog.cluster import CloudNode, ClusterPlan, RobotNode
+from fog.site import Site, open_site
 from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from gdp.stores.keyring import OWNER_SALT, load_salt
@@ -308,6 +309,42 @@ def test_a_program_that_does_not_exist_is_refused_at_once(fog: Run, tmp_path: Pa
     path.write_text(re.sub(r"executable=['\"][^'\"]*['\"]", "executable='absent_program'", path.read_text()))
     result = fog("launch", str(path), *options)
     assert (result.exit_code, "absent_program" in result.output) == (2, True)
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], []])
+def test_a_misspelled_region_is_refused_at_once(fog: Run, tmp_path: Path, options: list[str]) -> None:
+    result = fog("launch", launch_file(tmp_path), "--region", "us-wst-1", *options)
+    assert (result.exit_code, "did you mean us-west-1?" in result.output) == (2, True)
+
+
+def test_a_launch_says_what_it_does_before_its_cluster_is_wanted(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for each in ("set_up", "ensure"):
+        monkeypatch.setattr(launch, each, lambda site: None)
+    launch.begin(open_site(None), journal, PLAN)
+    assert capsys.readouterr().err.startswith("making keys, and starting ")
+
+
+def test_a_launch_whose_cluster_is_given_back_ends_its_nodes_and_says_so(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sleep = RobotNode(CloudNode("p", "lib/client")), (sys.executable, "-c", "import time; time.sleep(60)")
+    for each in ("set_up", "ensure", "end_cluster", "clear"):
+        monkeypatch.setattr(launch, each, lambda *_, **__: None)
+    monkeypatch.setattr(launch, "resolved", lambda node: sleep)
+
+    def given_back(site: Site, journal: Journal, plan: ClusterPlan, *_: object, **__: object) -> None:
+        journal.unwant(plan.name, "fog down", time.time())
+
+    monkeypatch.setattr(launch, "follow", given_back)
+    path = Path(launch_file(tmp_path))
+    path.write_text(
+        path.read_text().replace("LaunchDescription()", "LaunchDescription([Node(package='p', executable='e')])")
+    )
+    result = fog("launch", str(path))
+    assert result.exit_code == 2
+    assert re.search(r"^error: the cluster \S+ was given back: fog down$", result.output, re.MULTILINE)
 
 
 def test_a_dry_run_makes_neither_a_site_nor_keys(fog: Run, tmp_path: Path) -> None:

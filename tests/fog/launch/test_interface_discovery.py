@@ -15,13 +15,15 @@ from proxy.endpoints.core.endpoint import GraphEntity, Role
 ECHO = (CloudNode("fog_demo", "echo"),)
 
 
-def test_what_a_node_offers_is_found_out_and_kept(tmp_path: Path) -> None:
+def test_what_a_node_offers_is_found_out_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2's rclpy")
     cache = tmp_path / "deep" / "offered.json"
     assert kept(ECHO, cache=cache) is None
     assert offered(ECHO, cache=cache) == (("service", "/echo", "std_srvs/srv/SetBool"),)
     assert kept(ECHO, cache=cache) == (("service", "/echo", "std_srvs/srv/SetBool"),)
     assert kept((*ECHO, *ECHO), cache=cache) is None
+    offered(ECHO, cache=cache)
+    assert capsys.readouterr().err.count("starting the nodes once, to see what they offer") == 1
 
 
 def test_a_node_that_ends_is_reported_with_its_last_output(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ def test_files_with_secrets_are_private(gdp: Run, keys: None) -> None:
 def test_wrong_input_is_named_and_exits_with_2(gdp: Run, keys: None, line: str, complaint: str) -> None:
     done = gdp(line)
     assert (done.code, done.out) == (2, "")
-    assert re.search(rf"^gdp: .*{re.escape(complaint)}", done.err, re.MULTILINE), done.err
+    assert re.search(rf"^error: .*{re.escape(complaint)}", done.err, re.MULTILINE), done.err
 
 
 @pytest.mark.parametrize("right", ["serve", "call"])

@@ -12,6 +12,7 @@ from gdp.cli.switch import app as switch
 from gdp.config.config import RibConfig, SwitchConfig
 from gdp.crypto.certificates import Role
 from gdp.nodes.membership import load_member
+from gdp.session.settings import settings_of
 
 
 @pytest.fixture(autouse=True)
@@ -101,3 +102,21 @@ def test_a_machine_with_a_leaf_gets_files_of_a_switch_that_carries_no_transit(
     with pytest.raises(SystemExit):
         switch(["--config", "robot/switch.yaml", "--check"])
     assert capsys.readouterr().out.startswith(f"configuration good: leaf {identities[1].name.short}, 1 ports")
+
+
+def test_programs_of_one_machine_get_nodes_next_to_one_switch_and_its_rib() -> None:
+    assert _lab("--program robot server") == 0
+    assert (_switch(".").ports, _switch(".").attach) == ((), ("rib0", "robot0", "server0"))
+    rib = RibConfig.load(Path("rib.yaml"))
+    load_member(rib.identity, rib.domain, Role.RIB)
+    for program in ("robot", "server"):
+        settings = settings_of(Path(program))
+        assert settings.iface == f"{program}0"
+        load_member(settings.identity, settings.domain, Role.PROXY)
+
+
+@pytest.mark.parametrize("there", ["lab", "switch", "rib", "robot"])
+def test_programs_need_a_directory_without_a_lab(there: str) -> None:
+    Path(there).mkdir()
+    assert _lab("--program robot") == 2
+    assert [path.name for path in Path().iterdir()] == [there]

@@ -110,6 +110,22 @@ def test_lists_show_offers_and_what_is_shared(robot: Machine, server: Machine, r
     assert "/goal  std_msgs/msg/String  robot  publish" in run("import", "server", "--list")[1]
 
 
+def test_a_second_robots_equal_name_is_listed_as_not_used_with_what_to_do(
+    site: Site, robot: Machine, server: Machine, run: Run
+) -> None:
+    arm = site.add("arm")
+    FolderExchange(site.folder / "common", load_card(arm.folder / "proxy" / CARD))
+    run("expose", "robot", "/state", "--type", STRING, "--to", "server")
+    run("import", "server", "/*")
+    run("expose", "arm", "/state", "--type", STRING, "--to", "server")
+    code, text, errors = run("import", "server", "/state")
+    assert f"  /state [{STRING}] from robot\n  /state [{STRING}] from arm: not used\n" in text
+    assert (code, "state prefix: in the proxy.yaml of arm" in errors) == (0, True)
+    states = [line.split()[-2:] for line in run("import", "server", "--list")[1].splitlines()]
+    assert [each[-1] for each in states] == ["state", "used", "used"]
+    assert states[2] == ["not", "used"]
+
+
 def test_a_name_is_taken_back_through_the_switch_of_the_machine(robot: Machine, server: Machine, run: Run) -> None:
     run("share", "robot", "/goal", "--type", STRING, "--with", "server")
     (robot.folder / "revoked").mkdir()
@@ -140,18 +156,24 @@ def test_a_machine_without_an_owner_makes_one_unless_the_command_fails(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["expose", "robot", "/x"], "gdp: expose: state --to NODE, or --from NODE for a name"),
-        (["expose", "robot", "/x", "--to", "nowhere"], "gdp: 'nowhere': no such node or group in the domain; there"),
-        (["expose", "robot", "/x", "--to", "server", "--kind", "param"], "gdp: 'param': expected topic, service or"),
-        (["expose", "robot", "/x", "--remove"], "gdp: /x is not exposed by 'gdp expose'"),
-        (["expose", "nowhere", "/x", "--to", "server"], "gdp: nowhere: no proxy.yaml is here; name the machine's"),
-        (["import", "robot"], "gdp: import: state a NAME, or --list"),
-        (["import", "robot", "x"], "gdp: 'x': expected a full ROS name, such as /camera/image, or a pattern"),
-        (["import", "robot", "/x", "--remove"], "gdp: /x is not accepted; 'gdp import --list' shows what is"),
-        (["share", "robot", "/x"], "gdp: share: state a NAME and --with NODE or --revoke NODE; or --list"),
-        (["share", "robot", "/x", "--with", "server"], "gdp: /x: its type is not known here: state --type"),
-        (["share", "robot", "/x", "--with", "server", "--serve"], "gdp: share: --publish is for a topic, --serve for"),
-        (["share", "robot", "/x", "--revoke", "server"], "gdp: /x is not shared with server; 'gdp share --list' shows"),
+        (["expose", "robot", "/x"], "error: expose: state --to NODE, or --from NODE for a name"),
+        (["expose", "robot", "/x", "--to", "nowhere"], "error: 'nowhere': no such node or group in the domain; there"),
+        (["expose", "robot", "/x", "--to", "server", "--kind", "param"], "error: 'param': expected topic, service or"),
+        (["expose", "robot", "/x", "--remove"], "error: /x is not exposed by 'gdp expose'"),
+        (["expose", "nowhere", "/x", "--to", "server"], "error: nowhere: no proxy.yaml is here; name the machine's"),
+        (["import", "robot"], "error: import: state a NAME, or --list"),
+        (["import", "robot", "x"], "error: 'x': expected a full ROS name, such as /camera/image, or a pattern"),
+        (["import", "robot", "/x", "--remove"], "error: /x is not accepted; 'gdp import --list' shows what is"),
+        (["share", "robot", "/x"], "error: share: state a NAME and --with NODE or --revoke NODE; or --list"),
+        (["share", "robot", "/x", "--with", "server"], "error: /x: its type is not known here: state --type"),
+        (
+            ["share", "robot", "/x", "--with", "server", "--serve"],
+            "error: share: --publish is for a topic, --serve for",
+        ),
+        (
+            ["share", "robot", "/x", "--revoke", "server"],
+            "error: /x is not shared with server; 'gdp share --list' shows",
+        ),
     ],
 )
 def test_a_wrong_command_is_refused_with_one_sentence(

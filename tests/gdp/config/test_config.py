@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+from pydantic import ValidationError
 
 from gdp.config.config import PortConfig, RibConfig, SwitchConfig
-from gdp.config.schema import Section, load
+from gdp.config.schema import Section, first_fault, load
 from gdp.config.yaml_source import ConfigFileError
 from gdp.errors import ConfigError
 from gdp.limits import COST_AUTO, COST_DEFAULT, DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
 from gdp.names import Name
+from proxy.config.rule import Rule
 
 SWITCH = """\
 identity: id
@@ -191,3 +193,18 @@ def test_a_key_that_never_existed_is_still_refused_with_the_known_keys(tmp_path:
     path.write_text("speed: 1\n")
     with pytest.raises(ConfigError, match="unknown key; expected one of timeout_s, inner"):
         load(_Outer, path)
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        ({"name": "nope"}, "name: expected a full ROS name, such as /camera/image"),
+        ({"kind": "param", "name": "/x"}, "kind: Input should be 'topic', 'service' or 'action'"),
+    ],
+)
+def test_a_fault_of_data_without_lines_has_its_key_and_no_word_of_the_validator(
+    values: dict[str, str], fault: str
+) -> None:
+    with pytest.raises(ValidationError) as caught:
+        Rule.model_validate({"kind": "topic", "owner": "key", **values})
+    assert first_fault(caught.value).startswith(fault)

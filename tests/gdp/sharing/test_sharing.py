@@ -180,8 +180,8 @@ def test_an_upkeep_without_news_reloads_no_proxy(site: Site, robot: Machine, ser
 def test_an_offer_is_not_used_before_it_is_accepted(site: Site, robot: Machine, server: Machine) -> None:
     robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
     site.upkeep()
-    ((offer, is_accepted),) = server.sharing.offers()
-    assert (offer.ros_name, offer.type_name, offer.sender, is_accepted) == ("/camera/image", IMAGE, "robot", False)
+    ((offer, state),) = server.sharing.offers()
+    assert (offer.ros_name, offer.type_name, offer.sender, state) == ("/camera/image", IMAGE, "robot", "offered")
     assert (server.rules("import"), server.held) == ([], [])
 
 
@@ -206,7 +206,14 @@ def test_of_two_owners_names_the_first_one_stays_in_use(site: Site, robot: Machi
     robot.sharing.expose(robot.exposing("/state", "server", type_name=STRING), site.now_s)
     server.sharing.accept(importing("/state"), site.now_s)
     arm.sharing.expose(arm.exposing("/state", "server", type_name=STRING), site.now_s + 1)
-    assert site.upkeep() == ["/state from arm: another owner's /state is in use"]
+    (problem,) = site.upkeep()
+    assert problem.startswith(
+        "/state from arm: another owner's /state is in use; state prefix: in the proxy.yaml of arm"
+    )
+    assert [(offer.sender, state) for offer, state in server.sharing.offers()] == [
+        ("robot", "used"),
+        ("arm", "not used"),
+    ]
     assert (len(server.held), server.rules("import")) == (1, [("/state", STRING)])
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
+from gdp.extras import install_command
 from proxy.endpoints.core.endpoint import Role
 from proxy.endpoints.core.qos import default
 from proxy.endpoints.dds.graph_cache import GraphCache, Peer
@@ -91,4 +92,4 @@ def test_without_the_binding_one_sentence_says_what_to_install() -> None:
         "except LocalError as error:\n    print(error)\n"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said == "endpoint dds needs Cyclone DDS's Python binding: pip install 'gdp-ros[dds]'\n"
+    assert said == f"endpoint dds needs Cyclone DDS's Python binding: {install_command('dds')}\n"

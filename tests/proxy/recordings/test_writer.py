@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import SeekingReader
+from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from typer.testing import CliRunner
 
@@ -261,3 +262,25 @@ def test_a_damaged_recording_of_others_is_finished_next_to_it(tmp_path: Path) ->
     assert cut.exists()
     with AnyReader([tmp_path / "whole.mcap"]) as whole:
         assert whole.message_count == len(texts(cut)) > 0
+
+
+@pytest.mark.parametrize("options", [{"use_chunking": False}, {"compression": CompressionType.ZSTD}])
+def test_a_finished_recording_keeps_the_publishers_time_and_number_of_each_message(
+    tmp_path: Path, options: dict[str, object]
+) -> None:
+    sent = [(START_NS, START_NS - 5, 7, 10), (START_NS, 1, 2**32 - 1, 200_000), (START_NS + 1, 2**64 - 1, 0, 10)]
+    with (tmp_path / "a.mcap.partial").open("wb") as file:
+        made = Writer(file, **options)  # type: ignore[arg-type]
+        made.start("ros2")
+        schema = made.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = made.register_channel("/a", "cdr", schema)
+        for log_ns, published_ns, sequence, size in sent:
+            made.add_message(channel, log_ns, raw(2, b"x" * size), published_ns, sequence)
+        made.finish()  # type: ignore[no-untyped-call]
+    assert CliRunner().invoke(app, ["finish", str(tmp_path / "a.mcap.partial")]).exit_code == 0
+    with (tmp_path / "a.mcap").open("rb") as file:
+        found = [
+            (each.log_time, each.publish_time, each.sequence, each.data)
+            for _, _, each in SeekingReader(file).iter_messages()
+        ]
+    assert found == [(*head, raw(2, b"x" * size)) for *head, size in sent]
