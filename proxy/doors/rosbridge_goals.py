@@ -80,7 +80,7 @@ class RosbridgeGoals:
         self._new_id = new_id
         self._goals: dict[int, _Goal] = {}  # by key
 
-    def send(self, fields: Fields, now_ns: int) -> None:
+    def call(self, fields: Fields, now_ns: int) -> None:
         """Send a goal. Raises ``GdpError``: the message is malformed."""
         action, number = word(fields, "action"), identifier(fields, None)
         type_name = ros2_type(word(fields, "action_type", is_optional=True), "action")

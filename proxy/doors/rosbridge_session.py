@@ -103,7 +103,7 @@ class RosbridgeSession:
             "unadvertise": self._unadvertise,
             "publish": self._publish,
             "call_service": self._call,
-            "send_action_goal": lambda fields: self._goals.send(fields, self._received_ns),
+            "send_action_goal": lambda fields: self._goals.call(fields, self._received_ns),
             "cancel_action_goal": self._goals.cancel,
             "set_level": self._set_level,
             "status": self._set_level,
