@@ -151,6 +151,8 @@ class Zygote:
             if _born:
                 if (pid := os.fork()) == 0:
                     ours.close()
+                    os.closerange(3, theirs.fileno())  # a lock that the program inherits ends with the program
+                    os.closerange(theirs.fileno() + 1, os.sysconf("SC_OPEN_MAX"))
                     _live(theirs, _born[0])
                     sys.exit()
                 return cls(pid, ours)
