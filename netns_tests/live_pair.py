@@ -149,7 +149,7 @@ class Proxy:
 
     def warnings(self, name: str) -> list[str]:
         """Return its warnings about a local name: fault and detail."""
-        return re.findall(rf" WARNING \S+ {re.escape(name)}: (.*)", self.said)
+        return re.findall(rf" WARNING {re.escape(name)}: (.*)", self.said)
 
     def faults(self, fault: str) -> int:
         """Return the metric of a fault."""

@@ -22,7 +22,6 @@ from proxy.node.node import ProxyNode, run_node
 from proxy.node.recording_bridge import open_recording_bridge
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.split import SplitWriter, first_part
-from proxy.recordings.writer import refuse_existing
 from proxy.serial.channel import RosVersion
 
 __all__ = ["record", "refuse_existing_file"]
@@ -74,8 +73,11 @@ def refuse_existing_file(settings: ProxyConfig) -> None:
     Raises:
         LocalError: the file exists.
     """
-    if settings.record is not None:
-        refuse_existing(first_part(settings.record.path, is_split=settings.record.is_split))
+    if settings.record is None:
+        return
+    path = first_part(settings.record.path, is_split=settings.record.is_split)
+    if path.exists():
+        raise LocalError(f"{path} exists already; move or delete it, or change record.path")
 
 
 def _writer(record: Record | None) -> SplitWriter | None:

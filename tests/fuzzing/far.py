@@ -154,7 +154,7 @@ def _receive(data: bytes) -> object:
     wire = RosMessage(0, 1, body, steps).to_wire()
     for is_live in (True, False):
         member = SimpleNamespace(losses_of=lambda _: Losses())
-        rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None)
+        rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None, wants_reliable=None)
         context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
         dispatcher = EndpointDispatcher(cast(RosEndpoint, _Endpoint(is_live=is_live)))
         flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, cast(Rule, rule))
