@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 
 import pytest
 
-from gdp.metadata import Metadata
 from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
 from tests.waiting import until
@@ -32,17 +31,9 @@ def read(topic):
 """
 
 
-class PrefixedCrossing(Crossing):
-    """Topic of the robot; the other machine takes the prefix away by the same rule."""
-
-    @property
-    def metadata(self) -> Metadata:
-        return Metadata({"kind": self.kind, "name": f"/{PREFIX}{self.name}", "type": self.type_name})
-
-
 @pytest.fixture(scope="module")
 def pair() -> Iterator[Pair]:
-    with pair_of(PrefixedCrossing("/chat", STRING, "a", "b", options={"prefix": PREFIX})) as made:
+    with pair_of(Crossing("/chat", STRING, "a", "b", options={"prefix": PREFIX})) as made:
         yield made
 
 

@@ -548,8 +548,7 @@ class Bridge:
 
     def _close_finishing(self, name: Name) -> None:
         flow_spec, flow, _ = self._finishing.pop(name)
-        if not self._context.member.is_acknowledged(name):
-            count = self._context.member.unacknowledged(name)
+        if not self._context.member.is_acknowledged(name) and (count := self._context.member.unacknowledged(name)):
             detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
             self._context.faults.report(flow_spec.local, Fault.UNCONFIRMED, detail)
         self._close(flow_spec, flow)

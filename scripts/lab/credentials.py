@@ -50,7 +50,9 @@ class Carried:
     @property
     def metadata(self) -> Metadata:
         """Return the metadata that its overlay name digests."""
-        return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name, **self._further})
+        prefix = self.options.get("prefix")
+        name = f"/{prefix}{self.name}" if prefix else self.name
+        return Metadata({"kind": self.kind, "name": name, "type": self.type_name, **self._further})
 
     def right(self, side: Side) -> Right:
         """Return the right that the proxy of one side needs."""
