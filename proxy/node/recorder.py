@@ -73,10 +73,8 @@ def refuse_existing_file(settings: ProxyConfig) -> None:
     Raises:
         LocalError: the file exists.
     """
-    if settings.record is None:
-        return
-    path = first_part(settings.record.path, is_split=settings.record.is_split)
-    if path.exists():
+    record = settings.record
+    if record is not None and (path := first_part(record.path, is_split=record.is_split)).exists():
         raise LocalError(f"{path} exists already; move or delete it, or change record.path")
 
 

@@ -50,8 +50,7 @@ class Carried:
     @property
     def metadata(self) -> Metadata:
         """Return the metadata that its overlay name digests."""
-        prefix = self.options.get("prefix")
-        name = f"/{prefix}{self.name}" if prefix else self.name
+        name = f"/{self.options['prefix']}{self.name}" if "prefix" in self.options else self.name
         return Metadata({"kind": self.kind, "name": name, "type": self.type_name, **self._further})
 
     def right(self, side: Side) -> Right:

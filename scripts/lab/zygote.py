@@ -368,10 +368,7 @@ def _prctl(option: int, value: int) -> None:
 
 
 def _show(argv: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Let ``/proc`` say what runs here, and the variables that the zygote has not: written over the zygote's own.
-
-    The arguments were long enough for that. Variables of the zygote that do not fit are left out.
-    """
+    """Let ``/proc`` show these arguments and variables, written over the zygote's, which may be cut."""
     fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     started = set(Path("/proc/self/environ").read_text(encoding="utf-8", errors="replace").split("\0"))
     variables = sorted((f"{name}={value}" for name, value in environment.items()), key=lambda each: each in started)

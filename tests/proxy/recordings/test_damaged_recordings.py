@@ -176,7 +176,7 @@ def harmed(data: bytes, kind: str, place: float, value: int) -> bytes:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-@draws(12)
+@draws(6)
 @given(sent=messages, damage=st.none() | harm)
 def test_no_message_that_a_plain_reader_gives_is_left_out_silently(
     tmp_path_factory: pytest.TempPathFactory, name: str, sent: list[Sent], damage: tuple[str, float, int] | None

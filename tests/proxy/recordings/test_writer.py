@@ -116,7 +116,7 @@ def test_what_was_flushed_is_read_after_a_kill(ros: RosVersion, name: str, tmp_p
     assert read(tmp_path / name)[1] == ""
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(sizes=st.lists(st.tuples(st.integers(0, 5_000), st.booleans()), min_size=1, max_size=30), cut=st.floats(0, 1))
 @pytest.mark.parametrize(("ros", "name"), FILES)
 def test_a_file_that_is_cut_anywhere_gives_all_complete_chunks(
