@@ -5,6 +5,7 @@ I/O: the private key reaches the TLS library through a file in memory, never one
 
 from __future__ import annotations
 
+import contextlib
 import os
 import ssl
 
@@ -39,6 +40,8 @@ def tls_context(identity: Identity, policy: Policy, *, is_server: bool) -> ssl.S
     context.options |= ssl.OP_NO_RENEGOTIATION | ssl.OP_NO_TICKET
     if is_server:
         context.num_tickets = 0  # no resumption: each connection verifies the certificate
+    with contextlib.suppress(ssl.SSLError):  # clears an error that a token's library left in this thread's queue
+        context.load_verify_locations(cadata=b"\0")
     for root in policy.roots.values():
         for each in root.lineage:
             context.load_verify_locations(cadata=each.wire)

@@ -87,17 +87,14 @@ class ExposedTopic:
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local publishers."""
         self.local_publishers = len(ends)
-        keys = {end.key for end in ends}
-        is_found = self._depth_probe is not None and self._depth_probe.depth is not None
-        if keys != self._keys and self._depth_probe is not None:
-            self._depth_probe.close()
+        probe, keys = self._depth_probe, {end.key for end in ends}
+        is_other, self._keys = keys != self._keys, keys
+        if is_other and probe is not None:
+            probe.close()
             self._depth_probe = None
             self._qos.set_depth(None)
         change = self._qos.receive_publishers(ends)
-        if change is Change.NONE and keys != self._keys and is_found:
-            change = Change.DESCRIPTION
-        self._keys = keys
-        if change is Change.NONE:
+        if change is Change.NONE and not (is_other and probe is not None and probe.depth is not None):
             return
         if change is Change.SUBSCRIPTION:
             self._dispatcher.close(self.handle)
