@@ -14,9 +14,10 @@ import cbor2
 from gdp.errors import LocalError
 from gdp.names import Name, name_of
 
-__all__ = ["KINDS", "Metadata"]
+__all__ = ["KINDS", "SALT", "Metadata", "hidden"]
 
 KINDS: Final = frozenset({"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "enrolment"})
+SALT: Final = "salt"  # key of the unguessable part
 _VALUE_MAX_CHARS: Final = 4_096
 
 
@@ -66,3 +67,8 @@ class Metadata(Mapping[str, "str | int"]):
     def name(self, owner_key: bytes = b"") -> Name:
         """Return the name under this owner (33-byte compressed P-256 point; empty: unowned)."""
         return name_of(self.digest(), owner_key)
+
+
+def hidden(metadata: Mapping[str, str | int]) -> dict[str, str | int]:
+    """Return metadata for display, without the salt's text."""
+    return {key: "(hidden)" if key == SALT else value for key, value in metadata.items()}

@@ -12,8 +12,9 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import metadata_from_options, show
-from gdp.cli.salt import SaltFile, hidden
+from gdp.cli.salt import SaltFile
 from gdp.crypto.subject import Subject
+from gdp.metadata import hidden
 from gdp.stores.keyring import load_public_key
 
 __all__ = ["name"]

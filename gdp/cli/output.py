@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-from gdp.cli.salt import NAME_SALT, SALT, read_salt
+from gdp.cli.salt import NAME_SALT, read_salt
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
-from gdp.metadata import Metadata
+from gdp.metadata import SALT, Metadata
 from gdp.terminal import echo
 from gdp.trust.grants import EPOCH_MAX
 from gdp.trust.right import Right

@@ -5,17 +5,16 @@ I/O.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
 import typer
 
 from gdp.cli.secret import Secret
+from gdp.metadata import SALT
 
-__all__ = ["NAME_SALT", "SALT", "SaltFile", "hidden", "read_salt"]
+__all__ = ["NAME_SALT", "SaltFile", "read_salt"]
 
-SALT: Final = "salt"  # the salt's key in the metadata
 NAME_SALT: Final = Secret("salt", "--salt-file", "GDP_SALT")
 
 SaltFile = Annotated[
@@ -39,8 +38,3 @@ def read_salt(file: Path | None) -> dict[str, str]:
     """
     text = NAME_SALT.read(file)
     return {} if text is None else {SALT: text}
-
-
-def hidden(metadata: Mapping[str, str | int]) -> dict[str, str | int]:
-    """Return metadata for display, without the salt's text."""
-    return {key: "(hidden)" if key == SALT else value for key, value in metadata.items()}

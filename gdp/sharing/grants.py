@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.crypto.certificates import Root
 from gdp.errors import GdpError
-from gdp.metadata import Metadata
+from gdp.metadata import SALT, Metadata
 from gdp.names import Name
 from gdp.sharing.exchange import Exchange, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
@@ -25,10 +25,9 @@ from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["GIVING", "SALT", "TAKING", "Grants", "described"]
+__all__ = ["GIVING", "TAKING", "Grants", "described"]
 
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
-SALT: Final = "salt"  # its key in the metadata
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
 
 

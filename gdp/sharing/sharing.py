@@ -15,9 +15,9 @@ from typing import Final, TypeAlias
 from gdp.config.drop_in import locked, read_drop_in
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
-from gdp.metadata import Metadata
+from gdp.metadata import SALT, Metadata
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
-from gdp.sharing.grants import GIVING, SALT, TAKING, Grants, described
+from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Side, StatedRule, fits
 from gdp.sharing.report import ShareReport

@@ -163,6 +163,8 @@ class ChannelPublishers:
         self._owner = owner
         self._flow_spec = flow_spec
         self._handles: dict[bytes, set[int]] = {}  # of each remote publisher
+        endpoint = dispatcher.endpoint
+        self._recorder = endpoint if isinstance(endpoint, MessageRecorder) else None
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return a decoder by the remote definition alone."""
@@ -184,11 +186,10 @@ class ChannelPublishers:
 
     def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Record one message of a channel."""
-        endpoint = self._dispatcher.endpoint
-        if isinstance(endpoint, MessageRecorder):
-            endpoint.record(handle, raw, origin)
+        if self._recorder is not None:
+            self._recorder.record(handle, raw, origin)
         else:
-            endpoint.publish(handle, raw)
+            self._dispatcher.endpoint.publish(handle, raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Ignore the readers: a recording reads everything."""

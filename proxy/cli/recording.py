@@ -68,13 +68,18 @@ def _refuse_used(file: Path, descriptor: int) -> None:
 def _copy(file: Path, whole: Path) -> tuple[int, str]:
     """Write a complete file; return its messages, and why others could not be read."""
     made = whole.with_name(f".{whole.name}.finishing")
-    made.unlink(missing_ok=True)
-    made.with_name(made.name + PARTIAL).unlink(missing_ok=True)
-    with BagReader(file) as reader:
-        ros = reader.channels[0].ros if reader.channels else 2
-        with BagWriter(made, ros) as writer:
-            handles = [writer.add(channel) for channel in reader.channels]
-            for message in reader.messages():
-                writer.write(handles[message.channel], message.stamp_ns, message.raw, message.origin)
-        made.rename(whole)
-        return writer.written, reader.unread
+    copies = made, made.with_name(made.name + PARTIAL)
+    for each in copies:
+        each.unlink(missing_ok=True)
+    try:
+        with BagReader(file) as reader:
+            ros = reader.channels[0].ros if reader.channels else 2
+            with BagWriter(made, ros) as writer:
+                handles = [writer.add(channel) for channel in reader.channels]
+                for message in reader.messages():
+                    writer.write(handles[message.channel], message.stamp_ns, message.raw, message.origin)
+            made.rename(whole)
+            return writer.written, reader.unread
+    finally:  # nothing of a copy that failed stays
+        for each in copies:
+            each.unlink(missing_ok=True)

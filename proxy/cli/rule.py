@@ -16,10 +16,11 @@ import yaml
 
 from gdp.cli import options
 from gdp.cli.output import show
-from gdp.cli.salt import NAME_SALT, SALT
+from gdp.cli.salt import NAME_SALT
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
+from gdp.metadata import SALT
 from gdp.terminal import echo
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 

@@ -28,7 +28,7 @@ from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
 from gdp.limits import MESSAGE_MAX_BYTES
-from gdp.metadata import Metadata
+from gdp.metadata import SALT, Metadata
 from gdp.names import Name
 from gdp.ros_names import (
     NAME_FORM,
@@ -54,7 +54,7 @@ from proxy.reduce.image import IMAGE
 from proxy.reduce.picture import QUALITY, PictureFormat
 from proxy.serial.serializer import Encoding
 
-__all__ = ["DOMAIN_MAX", "REDUCTIONS", "SALT", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
+__all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
 
 _OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
@@ -65,7 +65,6 @@ RATE_MAX_HZ: Final = 1e6
 VOXEL_MAX_M: Final = 1e3
 DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTPS 2.5, section 9.6.2
 
-SALT: Final = "salt"  # the key of the unguessable part
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)

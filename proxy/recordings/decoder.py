@@ -29,7 +29,7 @@ from rosbags.rosbag2 import metadata as rosbag2_metadata
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import ConfigError, LocalError
-from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
+from proxy.recordings import mcap_format, salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
 from proxy.recordings.source import ZSTD, JoinedSource, Message, Source, UnpackedSource
@@ -161,7 +161,7 @@ def _open(path: Path) -> Source:
         raise LocalError("the file is empty")
     if magic.startswith(b"#ROSBAG"):
         return _open_ros1(path)
-    if magic.startswith(salvage_mcap.MAGIC):
+    if magic.startswith(mcap_format.MAGIC):
         return UnpackedSource(_open_mcap(path))
     if magic.startswith(salvage_sqlite.MAGIC):
         return UnpackedSource(salvage_sqlite.SqliteSource(path))

@@ -17,16 +17,12 @@ from ruamel.yaml import YAML
 
 from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.channels import to_qos
-from proxy.recordings.salvage_mcap import MAGIC
+from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD, RECORD, Opcode
 from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["CHUNK_BYTES", "McapWriter"]
 
 CHUNK_BYTES: Final = 1 << 20  # a chunk is written when it has more
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
-_STATISTICS, _SUMMARY_OFFSET, _DATA_END = 0x0B, 0x0E, 0x0F
-_RECORD: Final = struct.Struct("<BQ")
-_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 _ENCODINGS: Final[dict[DefinitionFormat, str]] = {"msg": "ros2msg", "idl": "ros2idl", "": ""}
 
 
@@ -45,14 +41,16 @@ class McapWriter:
         self._end = 0  # of what is complete in the file
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels = 0
-        self._described = {_SCHEMA: BytesIO(), _CHANNEL: BytesIO()}  # their records, for the summary
+        self._described = {Opcode.SCHEMA: BytesIO(), Opcode.CHANNEL: BytesIO()}  # their records, for the summary
         self._chunk = BytesIO()
         self._index: dict[int, list[tuple[int, int]]] = {}  # of the chunk: by channel, stamp and offset
-        self._chunks: list[bytes] = []  # their index records
+        self._pending = 0  # messages of the chunk
+        self._chunks = BytesIO()  # index records of those before it
+        self._chunk_count = 0
         self._counts: dict[int, int] = {}
         self._span = (1 << 63, 0)
         self.written = 0
-        self._append(MAGIC + _record(_HEADER, _text("ros2") + _text("gdp")))
+        self._append(MAGIC + _record(Opcode.HEADER, _text("ros2") + _text("gdp")))
 
     def connect(self, channel: Channel) -> None:
         """Add a channel; the first has number 0.
@@ -65,10 +63,10 @@ class McapWriter:
             self._schemas[key] = len(self._schemas) + 1  # 0: no schema
             definition = channel.definition.encode("utf-8", "replace")
             words = _text(channel.type_name) + _text(_ENCODINGS[channel.definition_format])
-            self._describe(_SCHEMA, struct.pack("<H", self._schemas[key]) + words + _sized(definition))
+            self._describe(Opcode.SCHEMA, struct.pack("<H", self._schemas[key]) + words + _sized(definition))
         about = {"offered_qos_profiles": _offered(channel), "topic_type_hash": channel.hash}
         head = struct.pack("<HH", self._channels, self._schemas[key])
-        self._describe(_CHANNEL, head + _text(channel.topic) + _text("cdr") + _map(about))
+        self._describe(Opcode.CHANNEL, head + _text(channel.topic) + _text("cdr") + _map(about))
         self._counts[self._channels] = 0
         self._channels += 1
 
@@ -79,20 +77,20 @@ class McapWriter:
             OSError: the chunk is full, and cannot be written.
         """
         self._index.setdefault(number, []).append((stamp_ns, self._chunk.tell()))
-        self._chunk.write(_RECORD.pack(_MESSAGE, _MESSAGE_HEAD.size + len(raw)))
+        self._chunk.write(RECORD.pack(Opcode.MESSAGE, MESSAGE_HEAD.size + len(raw)))
         sequence = origin.sequence & 0xFFFFFFFF
-        self._chunk.write(_MESSAGE_HEAD.pack(number, sequence, stamp_ns, origin.published_ns))
+        self._chunk.write(MESSAGE_HEAD.pack(number, sequence, stamp_ns, origin.published_ns))
         self._chunk.write(raw)
+        self._pending += 1
         if self._chunk.tell() > CHUNK_BYTES:
             self.flush()
 
     @property
     def unwritten_bytes(self) -> int:
         """Return about the most bytes that the file still takes until it is complete."""
-        indexed = sum(16 * len(each) + 64 for each in self._index.values())
-        summary = sum(each.tell() for each in self._described.values()) + sum(map(len, self._chunks))
-        summary += 10 * len(self._counts)
-        return self._chunk.tell() + 2 * indexed + summary + 1_024
+        described = sum(each.tell() for each in self._described.values())
+        indexed = 32 * self._pending + 138 * self._channels
+        return self._chunk.tell() + indexed + described + self._chunks.tell() + 1_024
 
     def flush(self) -> None:
         """Write the chunk and its index.
@@ -103,20 +101,21 @@ class McapWriter:
         records = self._chunk.getvalue()
         if not records:
             return
-        index, self._index, self._chunk = self._index, {}, BytesIO()
+        index, self._index, self._chunk, self._pending = self._index, {}, BytesIO(), 0
         stamps = [stamp_ns for each in index.values() for stamp_ns, _ in each] or [0]
         span = min(stamps), max(stamps)
-        head = struct.pack("<QQQI", *span, len(records), zlib.crc32(records)) + _text("")
-        chunk = _record(_CHUNK, head + struct.pack("<Q", len(records)) + records)
+        head = CHUNK_HEAD.pack(*span, len(records), zlib.crc32(records)) + _text("")
+        chunk = _record(Opcode.CHUNK, head + struct.pack("<Q", len(records)) + records)
         places, offsets = b"", b""
         for number, pairs in index.items():
             offsets += struct.pack("<HQ", number, self._end + len(chunk) + len(places))
             packed = b"".join(struct.pack("<QQ", *each) for each in pairs)
-            places += _record(_MESSAGE_INDEX, struct.pack("<H", number) + _sized(packed))
+            places += _record(Opcode.MESSAGE_INDEX, struct.pack("<H", number) + _sized(packed))
         about = struct.pack("<QQQQ", *span, self._end, len(chunk)) + _sized(offsets)
         about += struct.pack("<Q", len(places)) + _text("") + struct.pack("<QQ", len(records), len(records))
         self._append(chunk + places)
-        self._chunks.append(_record(_CHUNK_INDEX, about))
+        self._chunks.write(_record(Opcode.CHUNK_INDEX, about))
+        self._chunk_count += 1
         for number, pairs in index.items():
             self._counts[number] += len(pairs)
         if index:
@@ -130,23 +129,23 @@ class McapWriter:
             OSError: it cannot be written.
         """
         self.flush()
-        data_end = _record(_DATA_END, bytes(4))
+        data_end = _record(Opcode.DATA_END, bytes(4))
         start = self._end + len(data_end)
         first, last = self._span if self.written else (0, 0)
-        counts = (len(self._schemas), len(self._counts), 0, 0, len(self._chunks))
+        counts = (len(self._schemas), len(self._counts), 0, 0, self._chunk_count)
         statistics = struct.pack("<QHIIIIQQ", self.written, *counts, first, last)
         statistics += _sized(b"".join(struct.pack("<HQ", *each) for each in self._counts.items()))
         groups = (
             *((code, records.getvalue()) for code, records in self._described.items()),
-            (_CHUNK_INDEX, b"".join(self._chunks)),
-            (_STATISTICS, _record(_STATISTICS, statistics)),
+            (Opcode.CHUNK_INDEX, self._chunks.getvalue()),
+            (Opcode.STATISTICS, _record(Opcode.STATISTICS, statistics)),
         )
         summary, offsets = b"", b""
         for code, records in groups:
             if records:
-                offsets += _record(_SUMMARY_OFFSET, struct.pack("<BQQ", code, start + len(summary), len(records)))
+                offsets += _record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", code, start + len(summary), len(records)))
             summary += records
-        footer = _RECORD.pack(_FOOTER, 20) + struct.pack("<QQ", start, start + len(summary))
+        footer = RECORD.pack(Opcode.FOOTER, FOOTER.size) + struct.pack("<QQ", start, start + len(summary))
         crc = zlib.crc32(summary + offsets + footer)
         self._append(data_end + summary + offsets + footer + struct.pack("<I", crc) + MAGIC)
 
@@ -168,7 +167,7 @@ class McapWriter:
 
 
 def _record(code: int, content: bytes) -> bytes:
-    return _RECORD.pack(code, len(content)) + content
+    return RECORD.pack(code, len(content)) + content
 
 
 def _sized(content: bytes) -> bytes:

@@ -15,26 +15,20 @@ from typing import BinaryIO, Final
 
 from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.channels import from_ros2, offered_qos
+from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD, RECORD, Opcode
 from proxy.recordings.salvage_ros1 import channel_of
 from proxy.recordings.source import Chunk, Heads, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import DefinitionFormat
 
-__all__ = ["MAGIC", "is_indexed", "scan"]
+__all__ = ["is_indexed", "scan"]
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-_FOOTER_BYTES: Final = 37  # the record and the closing magic
-_FOOTER: Final = b"\x02\x14" + bytes(7)
+_FOOTER_BYTES: Final = RECORD.size + FOOTER.size + len(MAGIC)
 
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _DATA_END, _END = 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x02
-_RECORD: Final = struct.Struct("<BQ")
 _ID: Final = struct.Struct("<H")
 _IDS: Final = struct.Struct("<HH")
 _COUNT: Final = struct.Struct("<I")
-_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK_HEAD: Final = struct.Struct("<QQQI")  # first time, last time, unpacked bytes, crc
 _LENGTH: Final = struct.Struct("<Q")
-_FOOTER_FIELDS: Final = struct.Struct("<QQI")  # start of the summary, of its offsets, crc
 _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "msg"}
 
 
@@ -45,24 +39,24 @@ def is_indexed(path: Path) -> bool:
             return False
         end = file.seek(-_FOOTER_BYTES, os.SEEK_END)
         footer = file.read()
-        if not (footer.endswith(MAGIC) and footer.startswith(_FOOTER)):
+        if not (footer.endswith(MAGIC) and footer.startswith(RECORD.pack(Opcode.FOOTER, FOOTER.size))):
             return False
-        start, _, crc = _FOOTER_FIELDS.unpack_from(footer, _RECORD.size)
+        start, _, crc = FOOTER.unpack_from(footer, RECORD.size)
         if not 0 < start < end:
             return False
         file.seek(start)
         summary = file.read(end - start)
-    covered = summary + footer[: _RECORD.size + _FOOTER_FIELDS.size - _COUNT.size]
-    return crc in (0, zlib.crc32(covered)) and any(code == _CHUNK_INDEX for code in _codes(summary))
+    covered = summary + footer[: RECORD.size + FOOTER.size - _COUNT.size]
+    return crc in (0, zlib.crc32(covered)) and any(code == Opcode.CHUNK_INDEX for code in _codes(summary))
 
 
 def _codes(records: bytes) -> Iterator[int]:
     """Yield the opcodes of records."""
     at = 0
-    while at + _RECORD.size <= len(records):
-        code, length = _RECORD.unpack_from(records, at)
+    while at + RECORD.size <= len(records):
+        code, length = RECORD.unpack_from(records, at)
         yield code
-        at += _RECORD.size + length
+        at += RECORD.size + length
 
 
 def scan(path: Path) -> ScannedSource:
@@ -71,13 +65,13 @@ def scan(path: Path) -> ScannedSource:
 
 
 def _origin(head: bytes) -> Origin:
-    _, sequence, _, published_ns = _MESSAGE_HEAD.unpack(head)
+    _, sequence, _, published_ns = MESSAGE_HEAD.unpack(head)
     return Origin(published_ns, sequence)
 
 
 class _Found(Scan):
     form = "an MCAP file"
-    heads = Heads(_MESSAGE_HEAD.size, _origin)
+    heads = Heads(MESSAGE_HEAD.size, _origin)
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,20 +81,20 @@ class _Found(Scan):
         """Read every record; return why it ended early, empty where it did not."""
         while True:
             at = file.tell()
-            head = file.read(_RECORD.size)
-            if len(head) < _RECORD.size:
+            head = file.read(RECORD.size)
+            if len(head) < RECORD.size:
                 return f"the file ends in the middle, at byte {size}"
-            code, length = _RECORD.unpack(head)
-            start = at + _RECORD.size
-            if code in (_DATA_END, _END):
+            code, length = RECORD.unpack(head)
+            start = at + RECORD.size
+            if code in (Opcode.DATA_END, Opcode.FOOTER):
                 return ""
             there = min(length, size - start)
             try:
-                if code == _CHUNK:
+                if code == Opcode.CHUNK:
                     self._chunk(file.read(there), start)
-                elif there == length and code == _MESSAGE:
-                    self._message(file.read(_MESSAGE_HEAD.size), -1, start, length)
-                elif there == length and code in (_SCHEMA, _CHANNEL):
+                elif there == length and code == Opcode.MESSAGE:
+                    self._message(file.read(MESSAGE_HEAD.size), -1, start, length)
+                elif there == length and code in (Opcode.SCHEMA, Opcode.CHANNEL):
                     self._describe(code, file.read(there))
             except (struct.error, UnicodeDecodeError, SalvageError) as error:
                 if there < length:
@@ -111,8 +105,8 @@ class _Found(Scan):
             file.seek(start + length)
 
     def _chunk(self, record: bytes, start: int) -> None:
-        _, _, unpacked_size, _ = _CHUNK_HEAD.unpack_from(record)
-        compression, at = _string(record, _CHUNK_HEAD.size)
+        _, _, unpacked_size, _ = CHUNK_HEAD.unpack_from(record)
+        compression, at = _string(record, CHUNK_HEAD.size)
         (size,) = _LENGTH.unpack_from(record, at)
         at += _LENGTH.size
         size = min(size, len(record) - at)
@@ -122,31 +116,31 @@ class _Found(Scan):
         self.stats.scanned_bytes += len(data)
         self.chunks.append(Chunk(start + at, size, compression, unpacked_size))
         at = 0
-        while at + _RECORD.size <= len(data):
-            code, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
+        while at + RECORD.size <= len(data):
+            code, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
             if at + length > len(data):
                 return
-            if code == _MESSAGE:
-                self._message(data[at : at + _MESSAGE_HEAD.size], len(self.chunks) - 1, at, length)
-            elif code in (_SCHEMA, _CHANNEL):
+            if code == Opcode.MESSAGE:
+                self._message(data[at : at + MESSAGE_HEAD.size], len(self.chunks) - 1, at, length)
+            elif code in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._describe(code, data[at : at + length])
             at += length
 
     def _message(self, head: bytes, chunk: int, start: int, length: int) -> None:
-        channel, _, stamp_ns, _ = _MESSAGE_HEAD.unpack(head)
+        channel, _, stamp_ns, _ = MESSAGE_HEAD.unpack(head)
         if channel in self._omitted:
             return
-        if channel not in self._index or length < _MESSAGE_HEAD.size:
+        if channel not in self._index or length < MESSAGE_HEAD.size:
             raise SalvageError(f"a message of an unknown channel {channel}")
-        size = length - _MESSAGE_HEAD.size
+        size = length - MESSAGE_HEAD.size
         self.stats.messages += 1
         self.places.append(
-            Place(stamp_ns, len(self.places), self._index[channel], chunk, start + _MESSAGE_HEAD.size, size)
+            Place(stamp_ns, len(self.places), self._index[channel], chunk, start + MESSAGE_HEAD.size, size)
         )
 
     def _describe(self, code: int, record: bytes) -> None:
-        if code == _SCHEMA:
+        if code == Opcode.SCHEMA:
             (number,) = _ID.unpack_from(record)
             name, at = _string(record, _ID.size)
             encoding, at = _string(record, at)

@@ -30,7 +30,7 @@ from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
 
-__all__ = ["PARTIAL", "BagWriter", "refuse_existing"]
+__all__ = ["PARTIAL", "BagWriter"]
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class BagWriter:
         self.partial = self.path.with_name(self.path.name + PARTIAL)
         self.ros = ros
         self.failure = ""
-        refuse_existing(self.path)
+        _refuse_existing(self.path)
         try:
             _put_aside(self.partial)
             self._format: _Format = (
@@ -178,7 +178,7 @@ class BagWriter:
         try:
             self._format.finish()
             _sync(self.partial)
-            refuse_existing(self.path)
+            _refuse_existing(self.path)
             self.partial.rename(self.path)
             _sync(self.path.parent)
         except OSError as error:
@@ -221,6 +221,7 @@ class _Ros1Format:
             raise LocalError(f"{path}: rosbags did not open it")
         self.file: BinaryIO = self._writer.bio
         self._connections: list[Connection] = []
+        self._definitions_bytes = 0
         self._torn: OSError | None = None  # a chunk was written in part
         self._pending = 0
         self.written = 0
@@ -229,10 +230,10 @@ class _Ros1Format:
     def unwritten_bytes(self) -> int:
         indexed = 12 * self._pending + 8 * len(self._connections)
         chunks = len(self._writer.chunks) * (128 + 8 * len(self._connections))
-        definitions = sum(len(each.msgdef.data) + 1_024 for each in self._connections)
-        return self._writer.chunks[-1].data.tell() + indexed + chunks + definitions + 8_192
+        return self._writer.chunks[-1].data.tell() + indexed + chunks + self._definitions_bytes + 8_192
 
     def connect(self, channel: Channel) -> None:
+        self._definitions_bytes += len(channel.definition) + 1_024
         self._connections.append(
             self._writer.add_connection(
                 channel.topic,
@@ -268,7 +269,7 @@ class _Ros1Format:
         self._writer.close()
 
 
-def refuse_existing(path: Path) -> None:
+def _refuse_existing(path: Path) -> None:
     """Refuse to record into an existing file, with a ``LocalError``."""
     if path.exists():
         raise LocalError(f"{path} exists already")

@@ -10,14 +10,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from gdp.metadata import Metadata
+from gdp.metadata import SALT, Metadata, hidden
 from gdp.names import Name
 from gdp.ros_names import Kind
 from gdp.trust.right import Right
 from proxy.bridge.core.action_interface import action_of
 from proxy.check.core.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
-from proxy.config.rule import SALT, Rule
+from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.core.qos import is_depth_unknown
 from proxy.serial.channel import Qos
@@ -242,17 +242,12 @@ def _qos_in_words(qos: Qos) -> str:
     return f"{qos.reliability}, {qos.durability}".replace("_", " ")
 
 
-def _shown(metadata: Metadata) -> dict[str, str | int]:
-    """Return metadata without the salt's text."""
-    return {key: "(hidden)" if key == SALT else value for key, value in metadata.items()}
-
-
 def _how_to_delegate(metadata: Metadata, right: str) -> str:
     """Return how the owner creates the delegation: a command, as far as its options can state these metadata."""
     words = ["gdp", "delegate", "name", "--owner", "OWNER", "--card", "node.card", "--right", right]
     for key, value in metadata.items():
         if isinstance(value, int) and key != "pin":
-            return f"its owner makes one for these metadata: {_shown(metadata)}"
+            return f"its owner makes one for these metadata: {hidden(metadata)}"
         if key in ("kind", "name", "type", *_OPTIONS) or isinstance(value, int):
             words += [f"--{key}", str(value)]
         else:
