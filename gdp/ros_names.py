@@ -14,6 +14,7 @@ import re
 from typing import Final, Literal, TypeAlias
 
 __all__ = [
+    "ACTION_INFIX",
     "NAME_FORM",
     "NAME_MAX_CHARS",
     "PATTERN_FORM",
@@ -32,6 +33,7 @@ __all__ = [
 
 Kind: TypeAlias = Literal["topic", "service", "action"]
 
+ACTION_INFIX: Final = "/_action/"  # between an action's name and its parts; ROS 2 design article on actions
 NAME_MAX_CHARS: Final = 512
 NAME_FORM: Final = r"(?:/[A-Za-z0-9_]+)+"
 PREFIX_FORM: Final = r"(?:[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*)?"  # a namespace without its first slash; empty: the root

@@ -67,7 +67,7 @@ def begun_epochs(secrets: Mapping[int, bytes], unix_s: float) -> dict[int, bytes
 def daily_epochs(held: Collection[int], unix_s: float) -> set[int]:
     """Return the epochs that the members of a topic hold today: the present one, the one before, and tomorrow's.
 
-    The one before opens what its publishers repeat. A day whose eve brought no grant goes on with the present epoch.
+    The one before opens what its publishers repeat. A day whose eve brought no grant keeps the present epoch.
 
     Args:
         held: epochs that any of the members holds.

@@ -141,6 +141,7 @@ class Bridge:
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
         self._timed: dict[ExposedService | ImportedService, str] = {}  # to its local name
+        self._probed: dict[ExposedTopic, str] = {}  # whose depth is to be found, to its local name
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
         self._flow_begun_s: dict[_Key, float] = {}
@@ -214,7 +215,7 @@ class Bridge:
     @property
     def best_effort(self) -> list[SentStats]:
         """Return the statistics of the best-effort topics that are exposed now."""
-        exposed = [(local, flow.publisher) for local, flow in self._exposed_topics()]
+        exposed = [(spec.local, flow.publisher) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
         return [SentStats.of(local, each) for local, each in exposed if each is not None and not each.confirms]
 
     def answered_by(self, name: Name) -> Name | None:
@@ -292,19 +293,16 @@ class Bridge:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
-        for local, exposed_topic in self._exposed_topics():
-            due_s = exposed_topic.get_timer()
+        for probed, local in self._probed.items():
+            due_s = probed.get_timer()
             if due_s is not None and due_s <= now_s:
-                self._context.contain(local, b"", now_s, exposed_topic.handle_timer, now_s)
+                self._context.contain(local, b"", now_s, probed.handle_timer, now_s)
         for topic in self._status_topics:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
             self._context.traffic.dropped = sum(dispatcher.endpoint.dropped for dispatcher in self._dispatchers)
-
-    def _exposed_topics(self) -> Iterator[tuple[str, ExposedTopic]]:
-        return ((spec.local, flow) for spec, flow in self._flows.values() if isinstance(flow, ExposedTopic))
 
     def poll_changes(self) -> list[FlowChange]:
         """Return the flows that began or ended since the last call, in order; the oldest are forgotten first."""
@@ -317,8 +315,7 @@ class Bridge:
         if self._is_stale:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
-        times = [each.get_timer() for each in (*self._timed, *self._probes.values())]
-        times += [each.get_timer() for _, each in self._exposed_topics()]
+        times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._probed)]
         times += [self._tick_at_s] if has_ticks else []
         return min((time for time in times if time is not None), default=None)
 
@@ -467,6 +464,10 @@ class Bridge:
         _, flow = self._flows.get(key, (flow_spec, None))
         if isinstance(flow, ExposedTopic):
             flow.follow(view.ends(Role.PUBLISHES, flow_spec))
+            if flow.has_timer:
+                self._probed[flow] = flow_spec.local
+            else:
+                self._probed.pop(flow, None)
         elif isinstance(flow, ImportedTopic):
             flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
         elif isinstance(flow, ExposedService):
@@ -536,6 +537,8 @@ class Bridge:
         del self._flow_begun_s[key]
         if isinstance(flow, ExposedService | ImportedService):
             del self._timed[flow]
+        if isinstance(flow, ExposedTopic):
+            self._probed.pop(flow, None)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
         self._changes.append(FlowChange(flow_spec, is_begun=False))

@@ -21,15 +21,17 @@ _TRIES = 8  # one for each further message; later ones when the messages have do
 class DepthProbe:
     """Probe of one topic, which one publisher publishes.
 
+    Args:
+        profile: under which the proxy's own subscription reads it.
+
     Attributes:
         depth: messages that it keeps; None: not known yet.
     """
 
-    def __init__(self, dispatcher: EndpointDispatcher, local: str, type_name: str) -> None:
+    def __init__(self, dispatcher: EndpointDispatcher, local: str, type_name: str, profile: Qos | None) -> None:
         self._dispatcher = dispatcher
-        self._names = local, type_name
+        self._reads = local, type_name, profile
         self.depth: int | None = None
-        self._profile: Qos | None = None
         self._handle: int | None = None
         self._published = 0
         self._counted = 0
@@ -37,10 +39,9 @@ class DepthProbe:
         self._tries = 0
         self._due_s: float | None = None
 
-    def handle_message(self, profile: Qos | None, now_s: float) -> None:
-        """Process a message of the publisher, which the proxy's own subscription got under this profile."""
+    def handle_message(self, now_s: float) -> None:
+        """Process a message of the publisher."""
         self._published += 1
-        self._profile = profile
         if self.depth is None and self._published >= self._ask_from:
             self.close()
             self._due_s = now_s + _QUIET_S
@@ -61,7 +62,7 @@ class DepthProbe:
         if self._handle is None:
             self._counted, self._due_s = 0, now_s + _QUIET_S
             try:
-                self._handle = self._dispatcher.subscribe(self, *self._names, self._profile)
+                self._handle = self._dispatcher.subscribe(self, *self._reads)
             except LocalError:
                 self._due_s = None  # the topic has gone; the next message asks again
             return False

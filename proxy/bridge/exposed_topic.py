@@ -115,6 +115,11 @@ class ExposedTopic:
         elif isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
+    @property
+    def has_timer(self) -> bool:
+        """Return whether ``get_timer`` may return a time while its local publishers stay."""
+        return self._qos.asks_depth
+
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return None if self._depth_probe is None else self._depth_probe.get_timer()
@@ -199,8 +204,9 @@ class ExposedTopic:
         self.last_s = now_s
         if self._qos.asks_depth:
             if self._depth_probe is None:
-                self._depth_probe = DepthProbe(self._dispatcher, self._flow_spec.local, self._flow_spec.type_name)
-            self._depth_probe.handle_message(self._qos.request, now_s)
+                spec = self._flow_spec
+                self._depth_probe = DepthProbe(self._dispatcher, spec.local, spec.type_name, self._qos.request)
+            self._depth_probe.handle_message(now_s)
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             self.thinned += 1

@@ -15,7 +15,7 @@ from gdp.diagnosis.facts import FlowFact, ProxyFacts, WaitFact
 from gdp.errors import RemoteError
 from gdp.message.loss import by_label
 from gdp.names import Name
-from gdp.ros_names import Kind
+from gdp.ros_names import ACTION_INFIX, Kind
 from gdp.sansio import Timestamps
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
@@ -48,7 +48,7 @@ _RIGHTS: Final[dict[tuple[bool, bool], Right]] = {  # is it a topic, is it expos
     (False, True): Right.SERVE,
     (False, False): Right.CALL,
 }
-_PART: Final = {"topic": "", "service": "", "action": "/_action/send_goal"}
+_PART: Final = {"topic": "", "service": "", "action": f"{ACTION_INFIX}send_goal"}
 
 
 class _Meant(NamedTuple):

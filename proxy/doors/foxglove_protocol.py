@@ -13,8 +13,8 @@ from typing import Final, TypeAlias
 
 import orjson
 
-from gdp.errors import DropReason, RemoteError
 from gdp.ros_names import resolved
+from proxy.doors.client_fields import word, wrong
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
@@ -250,14 +250,14 @@ def _parse_binary(data: bytes) -> ClientMessage:
         if size <= _TEXT_MAX and begin <= len(data):
             encoding = data[_RESPONSE.size : begin].decode("ascii", errors="replace")
             return CallService(service, call, encoding, data[begin:])
-    raise _wrong("a binary message that is neither a message nor a service call")
+    raise wrong("a binary message that is neither a message nor a service call")
 
 
 def _parse_text(data: str) -> ClientMessage:
     try:
         fields = orjson.loads(data)
     except orjson.JSONDecodeError as error:
-        raise _wrong("a text that is not JSON") from error
+        raise wrong("a text that is not JSON") from error
     operation = fields.get("op") if isinstance(fields, dict) else None
     match operation:
         case "subscribe":
@@ -275,26 +275,26 @@ def _parse_text(data: str) -> ClientMessage:
         case "getParameters":
             names = fields.get("parameterNames")
             if not isinstance(names, list) or len(names) > _LIST_MAX:
-                raise _wrong(f"parameterNames: a list of at most {_LIST_MAX} texts was expected")
-            return GetParameters(tuple(_word({"name": name}, "name") for name in names), _id(fields))
+                raise wrong(f"parameterNames: a list of at most {_LIST_MAX} texts was expected")
+            return GetParameters(tuple(word({"name": name}, "name") for name in names), _id(fields))
         case "setParameters":
             return SetParameters(tuple(_maps(fields, "parameters")), _id(fields))
-    raise _wrong(f"operation {operation!r}, which this server does not announce"[:200])
+    raise wrong(f"operation {operation!r}, which this server does not announce"[:200])
 
 
 def _client_channel(fields: dict[str, object]) -> ClientChannel:
     return ClientChannel(
         number=_u32(fields, "id"),
-        topic=resolved(_word(fields, "topic")),
-        encoding=_word(fields, "encoding"),
-        type_name=_word(fields, "schemaName"),
-        schema=_word(fields, "schema", _SCHEMA_MAX, is_optional=True),
-        schema_encoding=_word(fields, "schemaEncoding", is_optional=True),
+        topic=resolved(word(fields, "topic")),
+        encoding=word(fields, "encoding"),
+        type_name=word(fields, "schemaName"),
+        schema=word(fields, "schema", _SCHEMA_MAX, is_optional=True),
+        schema_encoding=word(fields, "schemaEncoding", is_optional=True),
     )
 
 
 def _id(fields: dict[str, object]) -> str | None:
-    return _word(fields, "id") if fields.get("id") is not None else None
+    return word(fields, "id") if fields.get("id") is not None else None
 
 
 def _half(channel: Channel) -> dict[str, str]:
@@ -313,35 +313,22 @@ def _text(**fields: object) -> str:
 def _maps(fields: dict[str, object], key: str) -> list[dict[str, object]]:
     items = fields.get(key)
     if not isinstance(items, list) or len(items) > _LIST_MAX:
-        raise _wrong(f"{key}: a list of at most {_LIST_MAX} items was expected")
+        raise wrong(f"{key}: a list of at most {_LIST_MAX} items was expected")
     maps = [item for item in items if isinstance(item, dict)]
     if len(maps) < len(items):
-        raise _wrong(f"{key}: objects were expected")
+        raise wrong(f"{key}: objects were expected")
     return maps
 
 
 def _numbers(fields: dict[str, object], key: str) -> tuple[int, ...]:
     items = fields.get(key)
     if not isinstance(items, list) or len(items) > _LIST_MAX:
-        raise _wrong(f"{key}: a list of at most {_LIST_MAX} numbers was expected")
+        raise wrong(f"{key}: a list of at most {_LIST_MAX} numbers was expected")
     return tuple(_u32({key: item}, key) for item in items)
 
 
 def _u32(fields: dict[str, object], key: str) -> int:
     value = fields.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _U32:
-        raise _wrong(f"{key}: a whole number of 32 bits was expected")
+        raise wrong(f"{key}: a whole number of 32 bits was expected")
     return value
-
-
-def _word(fields: dict[str, object], key: str, limit: int = _TEXT_MAX, *, is_optional: bool = False) -> str:
-    value = fields.get(key)
-    if value is None and is_optional:
-        return ""
-    if not isinstance(value, str) or len(value) > limit:
-        raise _wrong(f"{key}: a text of at most {limit} characters was expected")
-    return value
-
-
-def _wrong(detail: str) -> RemoteError:
-    return RemoteError(DropReason.MALFORMED, detail)

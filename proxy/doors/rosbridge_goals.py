@@ -1,7 +1,7 @@
 """Goals of one rosbridge client: ``send_action_goal`` and ``cancel_action_goal`` of the rosbridge v2 protocol.
 
 Sans-I/O. Source: the ROS 2 design article on actions: three services and a topic of feedback below the action's name.
-A goal goes on when its client has gone, as with rosbridge_suite.
+A goal continues when its client has gone, as with rosbridge_suite.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Final
 import orjson
 
 from gdp.errors import GdpError, LocalError
-from gdp.ros_names import resolved
+from gdp.ros_names import ACTION_INFIX, resolved
+from proxy.doors.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import REASON_MAX, DoorSession, Hub, Publication
-from proxy.doors.rosbridge_fields import Fields, identifier, ros2_type, text_of, word, wrong
 from proxy.doors.rosbridge_json import codec_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
@@ -25,8 +25,8 @@ __all__ = ["SENDS", "GoalStep", "RosbridgeGoals"]
 
 GOALS_MAX: Final = 256
 _SEND, _RESULT, _CANCEL = "send_goal", "get_result", "cancel_goal"
-SENDS: Final = f"/_action/{_SEND}"
-_FEEDBACK: Final = "/_action/feedback"
+SENDS: Final = f"{ACTION_INFIX}{_SEND}"
+_FEEDBACK: Final = f"{ACTION_INFIX}feedback"
 _ID: Final = slice(4, 20)  # of the goal, behind the encapsulation of its feedback
 _UNKNOWN: Final = 0  # action_msgs/msg/GoalStatus
 
@@ -156,7 +156,7 @@ class RosbridgeGoals:
             self._fail(step.goal, reason)
 
     def _request(self, goal: _Goal, part: str, fields: Fields, type_name: str = "", now_ns: int = 0) -> None:
-        name = f"{goal.name}/_action/{part}"
+        name = f"{goal.name}{ACTION_INFIX}{part}"
         handle = self._hub.server_of(name)
         if handle is None:
             reason = self._hub.rights().may_call(goal.name, "action")

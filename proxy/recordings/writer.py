@@ -13,11 +13,10 @@ import logging
 import os
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
-from io import FileIO
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Final, Protocol
+from typing import BinaryIO, Final
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer as Writer1
@@ -40,32 +39,6 @@ _CONNECTIONS_MAX: Final = 4_096  # each is kept, with its definition, until the 
 _DEFINITIONS_MAX_BYTES: Final = 64 << 20
 _SPARE_BYTES: Final = 256 << 10  # of the disk, for what others write meanwhile and for the file system's own blocks
 _ANY_MD5: Final = "*"  # ROS 1's own value for an unknown one
-
-
-class _Format(Protocol):
-    """A file format that is written in chunks."""
-
-    written: int  # messages in complete chunks
-
-    @property
-    def file(self) -> BinaryIO | FileIO:
-        """Return the open file."""
-
-    @property
-    def unwritten_bytes(self) -> int:
-        """Return about the most bytes that the file still takes until it is complete."""
-
-    def connect(self, channel: Channel) -> None:
-        """Add a channel; the first has number 0."""
-
-    def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
-        """Add a message to the chunk."""
-
-    def flush(self) -> None:
-        """Write the chunk."""
-
-    def finish(self) -> None:
-        """Write what is left, and the index."""
 
 
 class BagWriter:
@@ -91,7 +64,7 @@ class BagWriter:
         _refuse_existing(self.path)
         try:
             _put_aside(self.partial)
-            self._format: _Format = (
+            self._format: McapWriter | _Ros1Format = (
                 _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
             )
             fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.ros_names import ACTION_INFIX
 from proxy.endpoints.core.endpoint import GraphEntity, RosEndpoint
 from proxy.endpoints.core.qos import default
 from proxy.serial.serializer import Encoding
@@ -21,7 +22,6 @@ CANCEL: Final = 1
 RESULT: Final = 2  # answers when the goal has ended, without a time limit
 # of feedback and status, as rcl_action sets them
 PROFILES: Final = (default(depth=100), default(latched=True, depth=1))
-_INFIX: Final = "/_action/"
 _SEND_GOAL: Final = "_SendGoal"
 
 
@@ -37,7 +37,7 @@ class ActionInterface:
         """Return the parts of a service or an action."""
         if kind != "action":
             return cls(((name, type_name),))
-        at = name + _INFIX
+        at = name + ACTION_INFIX
         services = (
             (f"{at}send_goal", f"{type_name}_SendGoal"),
             (f"{at}cancel_goal", "action_msgs/srv/CancelGoal"),
@@ -61,12 +61,12 @@ class ActionInterface:
 
 def is_part(name: str) -> bool:
     """Return whether a local name is a hidden part of an action."""
-    return _INFIX in name
+    return ACTION_INFIX in name
 
 
 def action_of(end: GraphEntity) -> tuple[str, str] | None:
     """Return name and type of the action whose ``send_goal`` service this entity is; None for any other entity."""
-    name, infix, part = end.name.partition(_INFIX)
+    name, infix, part = end.name.partition(ACTION_INFIX)
     if not infix or part != "send_goal" or not end.type_name.endswith(_SEND_GOAL):
         return None
     return name, end.type_name[: -len(_SEND_GOAL)]

@@ -11,6 +11,7 @@ from itertools import count
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
+from gdp.ros_names import ACTION_INFIX
 from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
 from proxy.endpoints.dds.discovery import Discovery
 from proxy.endpoints.dds.graph_cache import GraphCache
@@ -75,7 +76,7 @@ class DdsEndpoint:
         if known is not None:
             return known
         for peer in self._survey.peers(Role.PUBLISHES, topic, type_name):
-            if "/_action/" in topic:
+            if ACTION_INFIX in topic:
                 return Channel(topic, type_name, 2, hash=peer.hash)
         raise LocalError(
             f"{type_name} is not known here: endpoint dds knows the types of ROS 2's own packages;"

@@ -1,4 +1,4 @@
-"""Fields of a rosbridge client's message, each of the expected kind and bounded; and texts of the door.
+"""Fields of a client's message, each of the expected kind and bounded; and texts of the rosbridge door.
 
 Sans-I/O. What reads a field raises ``RemoteError`` (MALFORMED) where it is not as expected.
 """
@@ -18,13 +18,13 @@ _TEXT_MAX: Final = 1_024
 Fields: TypeAlias = "dict[str, object]"
 
 
-def word(fields: Fields, key: str, *, is_optional: bool = False) -> str:
-    """Return a text of at most 1,024 characters."""
+def word(fields: Fields, key: str, limit: int = _TEXT_MAX, *, is_optional: bool = False) -> str:
+    """Return a text of at most ``limit`` characters."""
     value = fields.get(key)
     if value is None and is_optional:
         return ""
-    if not isinstance(value, str) or len(value) > _TEXT_MAX:
-        raise wrong(f"{key}: a text of at most {_TEXT_MAX} characters was expected")
+    if not isinstance(value, str) or len(value) > limit:
+        raise wrong(f"{key}: a text of at most {limit} characters was expected")
     return value
 
 
