@@ -55,7 +55,7 @@ wait "$checks" || status=1
 cat "$scratch/check.log"
 if [[ $ended -eq 6 ]]; then  # all passed, and a folder took half more than its budget
     status=1
-elif [[ $ended -gt 1 ]]; then
+elif [[ $ended -gt 1 ]] || { [[ $ended -eq 1 ]] && grep -q 'message="collection failure"' "$out/tests.xml"; }; then
     printf 'pytest did not finish (exit status %d)\n' "$ended"
     status=1
 elif [[ $ended -eq 1 ]]; then

@@ -52,7 +52,9 @@ def test_z05_a_frame_of_a_pcap_file_that_claims_gigabytes_costs_no_memory(tmp_pa
     frames_of(path)
 
 
-@pytest.mark.parametrize("head", [SECTION[:4], PCAP[:4], b"\x1f\x8b", gzip.compress(gzip.compress(SECTION))])
+@pytest.mark.parametrize(
+    "head", [SECTION[:4], PCAP[:4], b"\x1f\x8b", gzip.compress(gzip.compress(SECTION, mtime=0), mtime=0)]
+)
 def test_z05_a_file_of_a_few_bytes_is_one_error(head: bytes, tmp_path: Path) -> None:
     path = tmp_path / "c"
     path.write_bytes(head)
