@@ -190,8 +190,11 @@ class AckNackHandler:
             oldest = self._window.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start.number < oldest
             if reader.start is None or is_gone or not queue.is_acknowledged:
-                number = self._first_of(acknack, now_s)
+                since_s = now_s - acknack.held_us / 1e6  # since when it waits
+                number = self._first_of(acknack, since_s)
                 begin = queue.begin_of(number)
+                if queue.is_acknowledged and not (queue.depth or acknack.next_number):
+                    begin = min(queue.ledger.first_since(since_s), begin)  # what was published in between is lost
                 if reader.start is not None:  # it is a reader since then: what it did not get since is lost
                     begin = min(reader.start.sequence, begin)
                 reader.start = StreamStart(reader.incarnation, number, begin, reader.confirmed)
@@ -204,7 +207,7 @@ class AckNackHandler:
             self._heartbeats.starts[name] = reader.start
         self._heartbeats.wanted = True
 
-    def _first_of(self, acknack: AckNack, now_s: float) -> int:
+    def _first_of(self, acknack: AckNack, since_s: float) -> int:
         """Return the message number at which a reader begins: where it was before, or with the next message.
 
         One that waited before a message was published gets that message, while it is kept for such readers.
@@ -213,7 +216,7 @@ class AckNackHandler:
         if acknack.next_number and queue.is_acknowledged:
             return min(max(acknack.next_number, queue.oldest), queue.next_number)
         if not queue.depth:
-            return queue.first_since(now_s - acknack.held_us / 1e6) if queue.awaited else queue.next_number
+            return queue.first_since(since_s) if queue.awaited else queue.next_number
         return max(queue.oldest, queue.next_number + queue.deferred - queue.depth)
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:

@@ -447,15 +447,15 @@ class Publisher:
                 self._queue.defer(message, now_s)
             else:
                 self.drops[DropReason.NO_READER] += 1
-                self.skip(LossReason.NO_READER)
+                self.skip(LossReason.NO_READER, now_s)
             return None
         self._queue.add(message, gather_bytes=WINDOW_BYTES if self._readers else BUNDLE_BYTES, added_s=now_s)
         self.published(self)
         return self.messages
 
-    def skip(self, reason: LossReason) -> None:
+    def skip(self, reason: LossReason, now_s: float | None = None) -> None:
         """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason."""
-        self._queue.skip(reason)
+        self._queue.skip(reason, now_s)
         if self._readers:
             self._heartbeats.wanted = True
             self.published(self)

@@ -165,7 +165,7 @@ class SendQueue:
         Args:
             added_s: when it is published; None: it does not age.
         """
-        self._deferred.append((self.ledger.next(), message, added_s))
+        self._deferred.append((self.ledger.next(added_s), message, added_s))
         self._deferred_bytes += len(message)
         self._drop_deferred(self.kept, added_s)
 
@@ -188,16 +188,16 @@ class SendQueue:
         if self.depth or not self._gathered.is_small(message, self._bundle_capacity()):
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s)
-            self.ledger.next()
+            self.ledger.next(added_s)
             return
-        self._gathered.add(self.ledger.next(), message, added_s)
+        self._gathered.add(self.ledger.next(added_s), message, added_s)
         if self._gathered.held_bytes > gather_bytes:
             self._seal_next()
 
-    def skip(self, reason: LossReason) -> None:
+    def skip(self, reason: LossReason, now_s: float | None = None) -> None:
         """Use up a sequence number for a message that no reader gets."""
         self.seal_gathered()
-        sequence = self.ledger.next()
+        sequence = self.ledger.next(now_s)
         self.ledger.lose(sequence, sequence, reason)
 
     def set_options(self, options: SendOptions) -> None:

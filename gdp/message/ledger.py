@@ -6,13 +6,17 @@ belongs to each message that the application published, sealed or not.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
+from typing import Final
 
 from gdp.message.loss import GONE_MAX, Losses, LossReason, LostRange, RangeSet, append
 from gdp.message.renumbering import Renumbering
 
 __all__ = ["Ledger"]
+
+_TIMES_MAX: Final = 64  # messages whose time of publication is remembered; every second one goes when they are more
 
 
 class Ledger:
@@ -35,16 +39,28 @@ class Ledger:
         self._unconfirmed = RangeSet()
         self._numbers: dict[int, int] = {}  # sequence number -> message number of one that carries nothing else
         self._of: dict[int, tuple[int, int]] = {}  # message number -> first sequence number, messages; numbers rise
+        self._times: list[tuple[float, int]] = []  # when a message was published, its sequence number
+        self._gap_s = 0.0  # what lies closer to the one before is not remembered
 
     @property
     def messages(self) -> int:
         """Return how many messages were published here."""
         return self.last - self._before
 
-    def next(self) -> int:
+    def next(self, now_s: float | None = None) -> int:
         """Return the sequence number of a message that is published now."""
         self.last += 1
+        if now_s is not None and (not self._times or now_s - self._times[-1][0] >= self._gap_s):
+            self._times.append((now_s, self.last))
+            if len(self._times) > _TIMES_MAX:
+                self._times = self._times[::2]
+                self._gap_s = (now_s - self._times[0][0]) / _TIMES_MAX
         return self.last
+
+    def first_since(self, since_s: float) -> int:
+        """Return the first sequence number known to be published since a second, or the next one."""
+        index = bisect_left(self._times, (since_s, 0))
+        return self._times[index][1] if index < len(self._times) else self.last + 1
 
     def put(self, number: int, sequence: int, messages: int) -> None:
         """Note what the newest message number carries."""

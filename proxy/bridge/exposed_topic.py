@@ -214,11 +214,11 @@ class ExposedTopic:
         if len(event.raw) > rule.max_bytes:
             detail = f"a message of {len(event.raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
-            publisher.skip(LossReason.TOO_LARGE)
+            publisher.skip(LossReason.TOO_LARGE, now_s)
             return
         if not publisher.is_wanted and not publisher.keeps_unread:
             traffic.unread += 1
-            publisher.skip(LossReason.NO_READER)
+            publisher.skip(LossReason.NO_READER, now_s)
             self._count(event)
             return
         adaptation = self._adaptation
@@ -231,7 +231,7 @@ class ExposedTopic:
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
-            publisher.skip(LossReason.WINDOW_OVERFLOW)
+            publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
             return
         body, steps = self._encoders[event.channel].encode(
             event.raw, rule.quality if adaptation is None else adaptation.quality
@@ -241,7 +241,7 @@ class ExposedTopic:
             count = publisher.publish(message, now_s)
         except LocalError as error:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
-            publisher.skip(LossReason.TOO_LARGE)
+            publisher.skip(LossReason.TOO_LARGE, now_s)
             return
         if adaptation is not None and count is not None:
             adaptation.handle_sent(count, len(message), now_s)

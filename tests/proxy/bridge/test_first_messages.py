@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gdp.limits import READER_LEASE_S
@@ -113,3 +113,39 @@ def test_what_no_reader_waits_for_is_kept_for_a_moment_and_counted(sites: Sites)
     sites.run(1)
     assert robot.context.traffic.unread == 1
     assert robot.stream.losses.total == 101
+
+
+@settings(max_examples=4, deadline=None, derandomize=True)
+@given(
+    count=st.integers(1, 60),
+    every_s=st.floats(0.01, 0.5),
+    cut_s=st.floats(0.5, 25.0),
+    is_known=st.booleans(),
+    seed=st.integers(0, 1 << 16),
+)
+@example(count=20, every_s=0.1, cut_s=20.0, is_known=True, seed=0)
+@example(count=60, every_s=0.3, cut_s=12.0, is_known=False, seed=1)
+def test_what_a_waiting_reader_did_not_get_is_counted(
+    tmp_path_factory: pytest.TempPathFactory, count: int, every_s: float, cut_s: float, is_known: bool, seed: int
+) -> None:
+    sites = Sites(tmp_path_factory.mktemp("sites"), seed=seed)
+    robot = sites.add(ROBOT, expose=[CHATTER])
+    servers = [sites.add(label, imports=[CHATTER]) for label in (SERVER, OTHER)]
+    ears = [Ear(server.graph, "/chatter") for server in servers]
+    sites.run(5 if is_known else 0.1)
+    cut = [cable for ends, cable in sites.world.cables.items() if SERVER.partition("/")[0] in str(ends)]
+    assert cut
+    for cable in cut:
+        cable.loss = 1.0
+    talker = robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(1, lambda: is_matched(robot))
+    sites.every(every_s, count, lambda number: talker.publish(string(str(number))))
+    sites.run(cut_s)
+    for cable in cut:
+        cable.loss = 0.0
+    sites.run(count * every_s + 30)
+    said = [str(number) for number in range(count)]
+    for server, ear in zip(servers, ears, strict=True):
+        (stats,) = (each for each in server.bridge.stats if each.topic == "/chatter")
+        assert ear.texts == said[count - len(ear.texts) :]
+        assert stats.lost == count - len(ear.texts)
