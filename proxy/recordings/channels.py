@@ -140,22 +140,18 @@ def ros2_type(name: str) -> str:
     return "/".join(parts)
 
 
-def offered_qos(profiles: object) -> list[RosbagsQos]:
-    """Return the QoS profiles that a recording states as offered: a YAML text, or a list of maps.
-
-    Raises:
-        SalvageError: it is neither, or too long.
-    """
-    if isinstance(profiles, str) and len(profiles) > _QOS_TEXT_MAX:
-        raise SalvageError(f"QoS profiles of {len(profiles)} characters")
-    if isinstance(profiles, str):
-        profiles = load_plain(profiles)
+def offered_qos(topic: str, text: str, lacking: list[str]) -> list[RosbagsQos]:
+    """Return the QoS profiles that a recording states as offered; what cannot be read adds a line to ``lacking``."""
     try:
-        return parse_qos(profiles)  # type: ignore[arg-type]
-    except (ReaderError, YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError) as error:
-        raise SalvageError(f"QoS profiles that cannot be read: {type(error).__name__}") from error
-    except (AssertionError, TypeError, ValueError) as error:
-        raise SalvageError(f"QoS profiles that cannot be read: {error}") from error
+        if len(text) > _QOS_TEXT_MAX:
+            raise SalvageError(f"{len(text)} characters")
+        return parse_qos(load_plain(text))  # type: ignore[arg-type]
+    except (LocalError, ReaderError, YAMLError, ArithmeticError, AttributeError, RecursionError) as error:
+        why = str(error) or type(error).__name__
+    except (AssertionError, TypeError, ValueError, LookupError) as error:
+        why = f"{type(error).__name__}: {error}"
+    lacking.append(f"topic {topic} is given without its QoS, which cannot be read ({' '.join(why.split())[:200]})")
+    return []
 
 
 def _from_qos(profile: RosbagsQos) -> Qos:

@@ -32,7 +32,7 @@ from gdp.errors import ConfigError, LocalError
 from proxy.recordings import mcap_format, salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
-from proxy.recordings.source import ZSTD, JoinedSource, Message, Source, UnpackedSource
+from proxy.recordings.source import COMPRESSIONS, ZSTD, JoinedSource, Message, Source, UnpackedSource
 from proxy.recordings.unpacking import bound_rosbags, unpack_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
@@ -167,6 +167,9 @@ def _open(path: Path) -> Source:
         return UnpackedSource(salvage_sqlite.SqliteSource(path))
     if magic.startswith(ZSTD):
         return _UnpackedFile(path)
+    for start, name in COMPRESSIONS.items():
+        if magic.startswith(start):
+            raise LocalError(f"it is compressed by {name}: unpack it first")
     raise LocalError("neither a ROS 1 bag nor MCAP nor sqlite3")
 
 
@@ -197,10 +200,14 @@ def _lacking(metadata: Path, there: set[str]) -> list[str]:
         match load_plain(metadata.read_text(encoding="utf-8", errors="replace")):
             case {"rosbag2_bagfile_information": {"relative_file_paths": list(names)}}:
                 files = [Path(str(name)).name for name in names]
-                return [f"{name}, which {metadata.name} names, is not there" for name in files if name not in there]
+                return [_absent(metadata, name) for name in files if name not in there]
     except _FOREIGN as error:
         return [f"{metadata.name} cannot be read ({_reason(error)}); all storage files are"]
     return [f"{metadata.name} states no files; all storage files are read"]
+
+
+def _absent(metadata: Path, name: str) -> str:
+    return f"{name}, which {metadata.name} names, is {'empty' if (metadata.parent / name).exists() else 'not there'}"
 
 
 class _UnpackedFile(UnpackedSource):

@@ -19,7 +19,7 @@ from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD
 from proxy.recordings.salvage_ros1 import channel_of
 from proxy.recordings.source import Chunk, Heads, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
-from proxy.serial.channel import DefinitionFormat
+from proxy.serial.channel import Channel, DefinitionFormat
 
 __all__ = ["is_indexed", "scan"]
 
@@ -106,7 +106,7 @@ class _Found(Scan):
 
     def _chunk(self, record: bytes, start: int) -> None:
         _, _, unpacked_size, _ = CHUNK_HEAD.unpack_from(record)
-        compression, at = _string(record, CHUNK_HEAD.size)
+        compression, at = _text(record, CHUNK_HEAD.size)
         (size,) = _LENGTH.unpack_from(record, at)
         at += _LENGTH.size
         size = min(size, len(record) - at)
@@ -142,38 +142,37 @@ class _Found(Scan):
     def _describe(self, code: int, record: bytes) -> None:
         if code == Opcode.SCHEMA:
             (number,) = _ID.unpack_from(record)
-            name, at = _string(record, _ID.size)
-            encoding, at = _string(record, at)
-            text, _ = _string(record, at, "replace")  # its comments need not be UTF-8
+            name, at = _text(record, _ID.size)
+            encoding, at = _text(record, at)
+            text, _ = _text(record, at)
             self._schemas[number] = (name, _FORMATS.get(encoding, ""), text)
             return
         number, schema = _IDS.unpack_from(record)
         if number in self._index or number in self._omitted:
             return
-        topic, at = _string(record, _IDS.size)
-        encoding, at = _string(record, at)
-        if encoding not in ("cdr", "ros1"):
-            self._omitted.add(number)
-            self.left_out.append(f"topic {topic} is left out: it is in {encoding}, not CDR")
-            return
+        topic, at = _text(record, _IDS.size)
+        encoding, at = _text(record, at)
+        self.add(number, topic, lambda: self._channel(topic, encoding, schema, _map(record, at)))
+
+    def _channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> Channel:
         name, definition_format, definition = self._schemas.get(schema, ("", "", ""))
-        metadata = _map(record, at)
-        self._index[number] = len(self.channels)
         if encoding == "ros1":
             about = {"type": name, "message_definition": definition} | metadata
-            self.channels.append(channel_of(topic, {key.encode(): value.encode() for key, value in about.items()}))
-            return
-        profiles = offered_qos(metadata.get("offered_qos_profiles", ""))
+            return channel_of(topic, {key.encode(): value.encode() for key, value in about.items()})
+        if encoding != "cdr":
+            raise SalvageError(f"it is in {encoding or 'no encoding that is named'}, not CDR")
+        profiles = offered_qos(topic, metadata.get("offered_qos_profiles", ""), self.left_out)
         digest = metadata.get("topic_type_hash", "")
-        self.channels.append(from_ros2(topic, name, digest, definition, definition_format, profiles))
+        return from_ros2(topic, name, digest, definition, definition_format, profiles)
 
 
-def _string(record: bytes, at: int, errors: str = "strict") -> tuple[str, int]:
+def _text(record: bytes, at: int) -> tuple[str, int]:
+    """Return a text, and where it ends. It need not be UTF-8: comments of a definition often are not."""
     (size,) = _COUNT.unpack_from(record, at)
     end = at + _COUNT.size + size
     if end > len(record):
         raise SalvageError("a text longer than its record")
-    return record[at + _COUNT.size : end].decode("utf-8", errors), end
+    return record[at + _COUNT.size : end].decode("utf-8", "replace"), end
 
 
 def _map(record: bytes, at: int) -> dict[str, str]:
@@ -182,6 +181,6 @@ def _map(record: bytes, at: int) -> dict[str, str]:
     end = min(at + size, len(record))
     items = {}
     while at < end:
-        key, at = _string(record, at)
-        items[key], at = _string(record, at)
+        key, at = _text(record, at)
+        items[key], at = _text(record, at)
     return items

@@ -91,24 +91,28 @@ class _Found(Scan):
         (number,) = _SIZE.unpack(header[b"conn"])
         if code == _MESSAGE:
             seconds, nanoseconds = _TIME.unpack(header[b"time"])
+            if number in self._omitted:
+                return
             if number not in self._index:
                 raise SalvageError(f"a message of an unknown connection {number}")
             self.stats.messages += 1
             stamp_ns = seconds * 1_000_000_000 + nanoseconds
             self.places.append(Place(stamp_ns, len(self.places), self._index[number], chunk, start, len(data)))
-        elif number not in self._index:
-            self._index[number] = len(self.channels)
-            self.channels.append(channel_of(header[b"topic"].decode(), _fields(data)))
+        elif number not in self._index and number not in self._omitted:
+            topic = header[b"topic"].decode("utf-8", "replace")
+            self.add(number, topic, lambda: channel_of(topic, _fields(data)))
 
 
 def channel_of(topic: str, about: Mapping[bytes, bytes]) -> Channel:
-    """Return a channel from a connection's header. Comments of its definition need not be UTF-8."""
+    """Return a channel from a connection's header; its texts need not be UTF-8. Raises ``SalvageError``: no type."""
     callerid = about.get(b"callerid")
+    if b"type" not in about:
+        raise SalvageError("it has no type")
     return from_ros1(
         topic,
-        normalize_msgtype(about[b"type"].decode()),
-        about.get(b"md5sum", b"").decode(),
-        about[b"message_definition"].decode("utf-8", "replace"),
+        normalize_msgtype(about[b"type"].decode("utf-8", "replace")),
+        about.get(b"md5sum", b"").decode("utf-8", "replace"),
+        about.get(b"message_definition", b"").decode("utf-8", "replace"),
         "msg",
         latched=about.get(b"latching") == b"1",
         callerid=None if callerid is None else callerid.decode("utf-8", "replace"),

@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -27,6 +27,8 @@ from proxy.serial.channel import Channel, DefinitionFormat
 __all__ = ["MAGIC", "SqliteSource"]
 
 MAGIC: Final = b"SQLite format 3\0"
+_DEFINITION: Final = ("topic_type", "encoding", "encoded_message_definition")
+_TOPIC: Final = ("name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
 _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl"}
 
 
@@ -149,28 +151,29 @@ class SqliteSource:
     def _read_topics(self) -> None:
         definitions: dict[str, tuple[DefinitionFormat, str]] = {}
         if self._columns("message_definitions"):
-            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            for type_name, encoding, text in self._db.execute(query):
-                definitions[str(type_name)] = (_FORMATS.get(encoding, ""), str(text))
-        columns = self._columns("topics")
-        qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
-        digest = "type_description_hash" if "type_description_hash" in columns else "''"
-        query = f"SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics ORDER BY id"
-        for number, topic, type_name, form, profiles, type_hash in self._db.execute(query):
+            for _, (type_name, encoding, text) in self._rows("message_definitions", _DEFINITION):
+                definitions[type_name] = (_FORMATS.get(encoding, ""), text)
+        for number, (topic, type_name, form, profiles, type_hash) in self._rows("topics", _TOPIC):
             if form != "cdr":
-                self._left_out.append(f"topic {topic} is left out: it is in {form}, not CDR")
+                self._left_out.append(f"topic {topic} is left out: it is in {form or 'no encoding'}, not CDR")
                 continue
             definition_format, definition = definitions.get(type_name, ("", ""))
-            self._index[int(number)] = len(self.channels)
-            self.channels.append(
-                from_ros2(topic, type_name, type_hash, definition, definition_format, offered_qos(profiles))
-            )
+            qos = offered_qos(topic, profiles, self._left_out)
+            self._index[number] = len(self.channels)
+            self.channels.append(from_ros2(topic, type_name, type_hash, definition, definition_format, qos))
+
+    def _rows(self, table: str, columns: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
+        """Yield the number and the texts of each row; a column that is not there is empty, and UTF-8 is not assumed."""
+        there = self._columns(table)
+        texts = ", ".join(f"CAST({column} AS BLOB)" if column in there else "x''" for column in columns)
+        for number, *values in self._db.execute(f"SELECT rowid, {texts} FROM {table} ORDER BY rowid"):
+            yield int(number), [(value or b"").decode("utf-8", "replace") for value in values]
 
     def _find_messages(self) -> None:
         reason = ""
         try:
             # The data is queried as well, so that a row whose pages are missing is detected here.
-            rows = self._db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
+            rows = self._db.execute("SELECT id, topic_id, timestamp, CAST(data AS BLOB) FROM messages ORDER BY id")
             for row, topic, stamp_ns, _ in rows:
                 if topic in self._index and isinstance(stamp_ns, int):
                     self._order.append((int(stamp_ns), int(row), int(topic)))

@@ -19,6 +19,7 @@ from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
 __all__ = [
+    "COMPRESSIONS",
     "ZSTD",
     "Chunk",
     "Heads",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
+COMPRESSIONS: Final = {b"\x04\x22\x4d\x18": "lz4", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz"}
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file
 
 
@@ -188,6 +190,17 @@ class Scan(ABC):
         self._index: dict[int, int] = {}  # the format's number of a channel, to its index
         self._omitted: set[int] = set()  # the numbers of channels that are left out
 
+    def add(self, number: int, topic: str, make: Callable[[], Channel]) -> None:
+        """Add the channel that ``make`` returns; where that raises ``SalvageError``, the topic is left out."""
+        try:
+            channel = make()
+        except SalvageError as error:
+            self._omitted.add(number)
+            self.left_out.append(f"topic {topic} is left out: {error}")
+            return
+        self._index[number] = len(self.channels)
+        self.channels.append(channel)
+
     @abstractmethod
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
@@ -216,7 +229,7 @@ class Scan(ABC):
 class UnpackedSource:
     """Messages of a ROS 2 recording, those that are compressed one by one unpacked as they are read.
 
-    A frame of zstd is no CDR, which begins with a zero byte. What cannot be unpacked is omitted and reported.
+    CDR begins with a zero byte. What is compressed and cannot be unpacked is omitted and reported.
     """
 
     def __init__(self, packed: Source) -> None:
@@ -242,15 +255,15 @@ class UnpackedSource:
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for message in self._packed.messages():
-            if not message.raw.startswith(ZSTD):
+            channel, raw = self.channels[message.channel], message.raw
+            other = next((name for magic, name in COMPRESSIONS.items() if raw.startswith(magic)), "")
+            if channel.ros == 1 or not (other or raw.startswith(ZSTD)):
                 yield message
                 continue
             try:
-                raw = unpack("zstd", message.raw)
+                yield message._replace(raw=unpack(other or "zstd", raw, is_whole=True))
             except SalvageError as error:
-                self._refused = self._refused or f"a message could not be unpacked: {error}"
-                continue
-            yield message._replace(raw=raw)
+                self._refused = self._refused or f"a message of {channel.topic} cannot be unpacked: {error}"
 
     def close(self) -> None:
         """Close the files."""

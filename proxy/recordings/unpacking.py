@@ -37,36 +37,41 @@ class SalvageError(LocalError):
     """Not even the beginning of a file is a valid recording."""
 
 
-def unpack(compression: str, data: bytes, size: int | None = None) -> bytes:
-    """Return the decompressed part of a chunk; a truncated chunk yields its beginning.
+def unpack(compression: str, data: bytes, size: int | None = None, *, is_whole: bool = False) -> bytes:
+    """Return the decompressed part of a chunk; a truncated chunk yields its beginning, unless ``is_whole``.
 
     Args:
         size: unpacked bytes as its header states; None: unknown.
 
     Raises:
         SalvageError: the compression is unknown, the bytes are not of it, or they unpack to more than ``size`` or than
-            ``CHUNK_MAX_BYTES``.
+            ``CHUNK_MAX_BYTES``, or are cut off and ``is_whole``.
     """
     if size is not None and size > CHUNK_MAX_BYTES:
         raise SalvageError(f"a chunk of {size} bytes; at most {CHUNK_MAX_BYTES} are read")
     limit = CHUNK_MAX_BYTES if size is None else size
+    unpacker: LZ4FrameDecompressor | zstd.ZstdDecompressor | bz2.BZ2Decompressor
     try:
         match compression:
             case "" | "none":
                 return data
             case "lz4":
-                unpacked = bytes(LZ4FrameDecompressor().decompress(data, max_length=limit + 1))
+                unpacker = LZ4FrameDecompressor()
             case "zstd":
-                options = {int(zstd.DecompressionParameter.window_log_max): _WINDOW_LOG_MAX}
-                unpacked = zstd.ZstdDecompressor(options=options).decompress(data, max_length=limit + 1)
+                unpacker = zstd.ZstdDecompressor(
+                    options={int(zstd.DecompressionParameter.window_log_max): _WINDOW_LOG_MAX}
+                )
             case "bz2":
-                unpacked = bz2.BZ2Decompressor().decompress(data, max_length=limit + 1)
+                unpacker = bz2.BZ2Decompressor()
             case _:
                 raise SalvageError(f"compression {compression[:40]!r} is not supported")
+        unpacked = bytes(unpacker.decompress(data, max_length=limit + 1))
     except (RuntimeError, OSError, ValueError, EOFError, zstd.ZstdError) as error:
         raise SalvageError(f"a chunk cannot be unpacked: {error}") from error
     if len(unpacked) > limit:
         raise SalvageError(f"a chunk that unpacks to more than {limit} bytes")
+    if is_whole and not unpacker.eof:
+        raise SalvageError("its end is missing")
     return unpacked
 
 

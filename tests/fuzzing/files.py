@@ -87,7 +87,7 @@ def _frames(data: bytes) -> object:
 
 
 def _qos(data: bytes) -> object:
-    return offered_qos(data.decode("latin-1"))
+    return offered_qos("/a", data.decode("latin-1"), [])
 
 
 def _recording(ros: int) -> bytes:

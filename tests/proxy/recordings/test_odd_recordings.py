@@ -203,6 +203,8 @@ CHATTER: Final[Made] = ("/chatter", "cdr", STRING, "ros2msg", b"string data", {}
         (("/cfg", "cdr", "a/msg/B", "ros2msg", b"string a # \xe9\n", {}), ""),
         (("/cfg", "cdr", "a/msg/B", "", b"", {}), ""),
         (("/cfg", "cdr", "a/msg/B", "ros2msg", b"\x0cint8\x0b a\x0c\n", {}), ""),
+        (("/cfg", "", "a/msg/B", "ros2msg", b"int8 a", {}), "topic /cfg is left out: it is in no encoding"),
+        (("/cfg", "cdr", "a/msg/B", "ros2msg", b"int8 a", {"offered_qos_profiles": "- ["}), "given without its QoS"),
     ],
 )
 def test_one_odd_topic_never_refuses_the_others(tmp_path: Path, odd: Made, said: str) -> None:
@@ -225,6 +227,60 @@ def test_an_mcap_of_ros_1_is_read_as_the_bag_that_it_came_from(tmp_path: Path) -
         (found,) = bag.channels
         assert (found.ros, found.type_name, found.hash, found.latched) == (1, STRING, md5, True)
         assert found.callerid == "/talker"
+
+
+def _database_of_odd_text(folder: Path) -> Path:
+    path = database(folder / "a.db3", TEXTS)
+    with sqlite3.connect(path) as made:
+        made.execute("CREATE TABLE message_definitions(topic_type, encoding, encoded_message_definition)")
+        text = "INSERT INTO message_definitions VALUES(?, 'ros2msg', CAST(? AS TEXT))"
+        made.execute(text, (STRING, b"# \xa1\nstring data"))
+        made.execute("INSERT INTO topics VALUES(2, CAST(? AS TEXT), NULL, 'cdr', '- [')", (b"/caf\xe9",))
+    made.close()
+    return path
+
+
+def _mcap_of_odd_text(folder: Path) -> Path:
+    other: Made = ("/cafX", "cdr", "a/msg/BX", "ros2msg", b"string a", {"by": "X"})
+    path = mcap(folder / "a.mcap", [CHATTER, other], [(0, raw) for raw in TEXTS])
+    path.write_bytes(path.read_bytes().replace(b"X", b"\xe9"))
+    return path
+
+
+def _bag_of_odd_text(folder: Path) -> Path:
+    with Ros1Writer(folder / "a.bag") as writer:
+        typestore = get_typestore(Stores.ROS1_NOETIC)
+        chatter = writer.add_connection("/chatter", STRING, typestore=typestore)
+        writer.add_connection("/cafX", "a/msg/BX", msgdef="string data # X", md5sum="0" * 31 + "X")
+        for raw in TEXTS:
+            writer.write(chatter, T0, raw)
+    path = folder / "a.bag"
+    path.write_bytes(path.read_bytes().replace(b"X", b"\xe9"))
+    return path
+
+
+@pytest.mark.parametrize("made", [_database_of_odd_text, _mcap_of_odd_text, _bag_of_odd_text])
+def test_no_text_of_a_recording_need_be_utf_8(tmp_path: Path, made: Callable[[Path], Path]) -> None:
+    found, unread = given(made(tmp_path))
+    assert found == {"/chatter": TEXTS, "/caf\ufffd": []}
+    assert not unread or "/caf\ufffd is given without its QoS" in unread
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        (zstd.compress(TEXTS[0])[:-4], "its end is missing"),
+        (b"\x1f\x8b\x08more", "compression 'gzip' is not supported"),
+    ],
+)
+def test_a_message_that_cannot_be_unpacked_is_named_and_does_not_pass_as_one(
+    tmp_path: Path, raw: bytes, said: str
+) -> None:
+    path = mcap(tmp_path / "a.mcap", [CHATTER], [(0, TEXTS[0]), (0, raw), (0, TEXTS[1])])
+    with BagReader(path) as bag:
+        assert [message.raw for message in bag.messages()] == TEXTS[:2]
+        assert bag.missing == 1
+        assert f"a message of /chatter cannot be unpacked: {said}" in bag.unread
 
 
 @pytest.mark.parametrize("constant", ["string NONE=", "string  NONE = ", "int8 A=1\t# one"])
