@@ -103,7 +103,7 @@ class RequestServer(ABC):
         return len(self._connections) >= self._connections_max
 
     def _handle_timer(self, now_s: float) -> float | None:
-        """Do what is due beside the connections; return when to be called next, or None."""
+        """Do what is due apart from the connections; return when to be called next, or None."""
         del now_s
         return None
 

@@ -13,11 +13,8 @@ supervisor use one object.
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -27,15 +24,14 @@ from fog.cluster import ExportedInterface
 from fog.credentials import IssuedCredentials
 from gdp.crypto.certificates import Role
 from gdp.crypto.kem import KemPrivateKey
-from gdp.errors import StoreError
 from gdp.stores.files import private, read_private, write_all
+from gdp.stores.transactions import TransactionFile
 from gdp.trust.bootstrap_ticket import Seat, Ticket, token_id
 
 __all__ = ["Kept", "News", "PlannedSeat", "Report", "Tickets"]
 
 _KEY: Final = "responder.key"
 _FILE: Final = "tickets.sqlite3"
-_PATIENCE_S: Final = 10.0
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS tickets (
   id BLOB PRIMARY KEY, token BLOB NOT NULL, cluster TEXT NOT NULL, machine TEXT NOT NULL, seats TEXT NOT NULL,
@@ -101,7 +97,7 @@ class News:
     issued_credentials: IssuedCredentials | None
 
 
-class Tickets:
+class Tickets(TransactionFile):
     """Opened folder of tickets.
 
     Raises:
@@ -110,22 +106,10 @@ class Tickets:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / _FILE
         if not (folder / _KEY).exists():
             write_all(folder, {_KEY: private(KemPrivateKey.generate().wire)})
         self.responder = KemPrivateKey.from_wire(read_private(folder / _KEY))
-        self._lock = threading.Lock()
-        with self._translated():
-            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-            self._file = sqlite3.connect(self._path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False)
-            self._file.execute("PRAGMA journal_mode=WAL")
-            self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
-            self._file.executescript(_TABLES)
-
-    def close(self) -> None:
-        """Close the files."""
-        with self._lock:
-            self._file.close()
+        super().__init__(folder / _FILE, _TABLES)
 
     def issue(
         self,
@@ -140,7 +124,7 @@ class Tickets:
         until_unix_s: float,
     ) -> Ticket:
         """Store and return a machine's ticket; expired tickets are deleted; ``token``: 32 random bytes."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute(
                 "DELETE FROM tickets WHERE until_unix_s < ? OR (keys IS NULL AND expires_unix_s < ?)", (unix_s, unix_s)
             )
@@ -153,8 +137,8 @@ class Tickets:
 
     def knows(self, identifier: bytes) -> bool:
         """Return whether a ticket has this id."""
-        with self._translated(), self._lock:
-            return self._file.execute("SELECT 1 FROM tickets WHERE id = ?", (identifier,)).fetchone() is not None
+        with self.reading() as file:
+            return file.execute("SELECT 1 FROM tickets WHERE id = ?", (identifier,)).fetchone() is not None
 
     def find(self, identifier: bytes) -> Kept | None:
         """Return the ticket with this id."""
@@ -162,8 +146,8 @@ class Tickets:
             "SELECT token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, issued_credentials,"
             " is_reported FROM tickets WHERE id = ?"
         )
-        with self._translated(), self._lock:
-            row = self._file.execute(query, (identifier,)).fetchone()
+        with self.reading() as file:
+            row = file.execute(query, (identifier,)).fetchone()
         if row is None:
             return None
         token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, issued_credentials, is_reported = (
@@ -184,7 +168,7 @@ class Tickets:
 
     def use(self, identifier: bytes, keys: bytes) -> bool:
         """Mark a ticket as used by these keys; return whether it was unused or used by the same keys."""
-        with self._writing() as file:
+        with self.writing() as file:
             return bool(
                 file.execute(
                     "UPDATE tickets SET keys = ? WHERE id = ? AND is_reported = 0 AND (keys IS NULL OR keys = ?)",
@@ -195,7 +179,7 @@ class Tickets:
     def complete(self, identifier: bytes, answer: bytes, issued_credentials: IssuedCredentials, detail: str) -> bool:
         """Store the response to a ticket's keys, and report it to the supervisor; False: the ticket was withdrawn."""
         text = json.dumps(asdict(issued_credentials))
-        with self._writing() as file:
+        with self.writing() as file:
             if not file.execute(
                 "UPDATE tickets SET answer = ?, issued_credentials = ? WHERE id = ?", (answer, text, identifier)
             ).rowcount:
@@ -205,7 +189,7 @@ class Tickets:
 
     def misused(self, identifier: bytes, detail: str) -> None:
         """Invalidate a ticket, and report that to the supervisor once."""
-        with self._writing() as file:
+        with self.writing() as file:
             if file.execute(
                 "UPDATE tickets SET is_reported = 1 WHERE id = ? AND is_reported = 0", (identifier,)
             ).rowcount:
@@ -213,13 +197,13 @@ class Tickets:
 
     def delete(self, cluster: str, machine: str) -> None:
         """Delete the ticket of a machine that is gone; no effect if there is none."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("DELETE FROM tickets WHERE cluster = ? AND machine = ?", (cluster, machine))
 
     def pending_reports(self) -> list[News]:
         """Return the news that was not ``taken`` yet, oldest first."""
-        with self._translated(), self._lock:
-            rows = self._file.execute(
+        with self.reading() as file:
+            rows = file.execute(
                 "SELECT id, cluster, machine, report, detail, issued_credentials FROM news ORDER BY id"
             ).fetchall()
         return [
@@ -236,22 +220,8 @@ class Tickets:
 
     def taken(self, news: News) -> None:
         """Delete news that was handled."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("DELETE FROM news WHERE id = ?", (news.id,))
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        with self._translated(), self._lock:
-            self._file.execute("BEGIN IMMEDIATE")
-            with self._file:  # commits, or rolls back
-                yield self._file
-
-    @contextmanager
-    def _translated(self) -> Iterator[None]:
-        try:
-            yield
-        except (sqlite3.Error, OSError) as error:
-            raise StoreError(f"{self._path}: {error}") from error
 
 
 def _tell(

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum
 from pathlib import Path
@@ -22,12 +21,12 @@ from fog.machine import MachineSpec, MachineState
 from fog.offer import Offer
 from fog.supervisor.core.record import Outcome, Record
 from gdp.errors import LocalError, StoreError
+from gdp.stores.transactions import TransactionFile
 
 __all__ = ["FINAL_LOGS", "Cluster", "Entry", "Journal"]
 
 FINAL_LOGS: Final = "final logs"
 
-_PATIENCE_S: Final = 10.0  # wait for another writing process
 _EVENTS_MAX: Final = 10_000  # older ones are deleted
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS clusters (
@@ -85,7 +84,7 @@ class Entry:
 _ENTRY_COLUMNS: Final = tuple(column.name for column in fields(Entry))
 
 
-class Journal:
+class Journal(TransactionFile):
     """Opened journal. Every method is one transaction.
 
     Raises:
@@ -93,24 +92,16 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with _translated(path):
-            self._file = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False)
-            self._file.execute("PRAGMA journal_mode=WAL")
-            self._file.execute("PRAGMA synchronous=NORMAL")
-            self._file.executescript(_TABLES)
-            has = {row[1] for row in self._file.execute("PRAGMA table_info(events)")}
+        super().__init__(path, _TABLES, synchronous="NORMAL")
+        with self.reading() as file:
+            has = {row[1] for row in file.execute("PRAGMA table_info(events)")}
             for column in _LATER.keys() - has:
-                self._file.execute(f"ALTER TABLE events ADD COLUMN {column} {_LATER[column]}")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+                file.execute(f"ALTER TABLE events ADD COLUMN {column} {_LATER[column]}")
 
     def put_cluster(self, plan: ClusterPlan, now_s: float, *, why: str = "") -> None:
         """Write that a cluster is wanted; a running cluster of that name receives the new plan and continues."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute(
                 "INSERT INTO clusters (name, plan, is_up, why, begun_unix_s) VALUES (?, ?, 1, '', ?)"
                 " ON CONFLICT (name) DO UPDATE SET plan = excluded.plan, why = '',"
@@ -121,7 +112,7 @@ class Journal:
 
     def unwant(self, name: str, why: str, now_s: float) -> None:
         """Write that a cluster is no longer wanted; a cluster that is not up is unchanged."""
-        with self._writing() as file:
+        with self.writing() as file:
             if file.execute(
                 "UPDATE clusters SET is_up = 0, why = ? WHERE name = ? AND is_up = 1", (why, name)
             ).rowcount:
@@ -129,9 +120,9 @@ class Journal:
 
     def clusters(self) -> list[Cluster]:
         """Return all present and past clusters, in the order of their names."""
-        with _translated(self._path):
+        with self.reading() as file:
             query = "SELECT name, plan, is_up, why, begun_unix_s FROM clusters ORDER BY name"
-            rows = self._file.execute(query).fetchall()
+            rows = file.execute(query).fetchall()
         return [Cluster(self._plan(name, plan), bool(is_up), why, begun) for name, plan, is_up, why, begun in rows]
 
     def cluster(self, name: str) -> Cluster:
@@ -148,7 +139,7 @@ class Journal:
 
     def next_machine(self, cluster: str) -> str:
         """Return a name that no machine of the cluster has ever had."""
-        with self._writing() as file:
+        with self.writing() as file:
             (number,) = file.execute(
                 "UPDATE clusters SET machines = machines + 1 WHERE name = ? RETURNING machines", (cluster,)
             ).fetchone()
@@ -159,7 +150,7 @@ class Journal:
     ) -> None:
         """Write a machine's record, and an event if given; see ``Entry``."""
         spec = record.spec
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute(
                 "INSERT OR REPLACE INTO machines (cluster, name, is_gone, record) VALUES (?, ?, ?, ?)",
                 (spec.cluster, spec.name, record.is_gone, json.dumps(asdict(record), default=_plain)),
@@ -170,8 +161,8 @@ class Journal:
     def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
         """Return the machines of a cluster in the order of their requests."""
         query = "SELECT name, record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
-        with _translated(self._path):
-            rows = self._file.execute(query, (cluster,)).fetchall()
+        with self.reading() as file:
+            rows = file.execute(query, (cluster,)).fetchall()
         return sorted((self._machine(cluster, *row) for row in rows), key=_number)
 
     def write_event(
@@ -186,14 +177,14 @@ class Journal:
         lines: str = "",
     ) -> None:
         """Write an event; see ``Entry``."""
-        with self._writing() as file:
+        with self.writing() as file:
             _tell(file, now_s, cluster, machine, what, detail, since_unix_s, lines)
 
     def stored_logs(self, cluster: str, machine: str) -> dict[str, str]:
         """Return program -> final log lines of a machine that failed or was preempted."""
         query = "SELECT detail, lines FROM events WHERE what = ? AND cluster = ? AND machine = ? ORDER BY id"
-        with _translated(self._path):
-            return dict(self._file.execute(query, (FINAL_LOGS, cluster, machine)).fetchall())
+        with self.reading() as file:
+            return dict(file.execute(query, (FINAL_LOGS, cluster, machine)).fetchall())
 
     def events(self, cluster: str = "", after: int = 0, last: int | None = None) -> list[Entry]:
         """Return events, oldest first.
@@ -206,28 +197,21 @@ class Journal:
             f"SELECT {', '.join(_ENTRY_COLUMNS)} FROM events"
             " WHERE id > ? AND (? = '' OR cluster = ?) ORDER BY id DESC LIMIT ?"
         )
-        with _translated(self._path):
-            rows = self._file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
+        with self.reading() as file:
+            rows = file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
         return [Entry(**dict(zip(_ENTRY_COLUMNS, row, strict=True))) for row in reversed(rows)]
 
     def _plan(self, name: str, plan: str) -> ClusterPlan:
         try:
             return ClusterPlan.from_json(plan)
         except LocalError as error:
-            raise StoreError(f"{self._path}: clusters: {name}: {error}") from error
+            raise StoreError(f"{self.path}: clusters: {name}: {error}") from error
 
     def _machine(self, cluster: str, name: str, record: str) -> Record:
         try:
             return _record(json.loads(record))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise StoreError(f"{self._path}: machines: {cluster} {name}: not the record of one: {error!r}") from error
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        with _translated(self._path):
-            self._file.execute("BEGIN IMMEDIATE")
-            with self._file:  # commits, or rolls back
-                yield self._file
+            raise StoreError(f"{self.path}: machines: {cluster} {name}: not the record of one: {error!r}") from error
 
 
 def _tell(
@@ -247,16 +231,6 @@ def _tell(
             (now_s, cluster, machine, what, detail, since_unix_s, lines),
         )
         cursor.execute("DELETE FROM events WHERE id <= ?", ((cursor.lastrowid or 0) - _EVENTS_MAX,))
-
-
-@contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise StoreError(f"{path}: {error}") from error
-    except UnicodeDecodeError as error:  # text of a damaged file, also within error messages of sqlite3
-        raise StoreError(f"{path}: not a text: {error}") from error
 
 
 def _plain(value: object) -> object:

@@ -7,11 +7,8 @@ second key use it. Of a token the file holds the id and the MAC key, not the sec
 
 from __future__ import annotations
 
-import os
 import sqlite3
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,6 +17,7 @@ from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StoreError
 from gdp.names import Name
 from gdp.stores.files import write_all
+from gdp.stores.transactions import TransactionFile
 from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 
 __all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "StoredMail", "TokenRow"]
@@ -29,7 +27,6 @@ MAILBOX_MAX_BYTES: Final = 4 << 20
 _SENDER_MAX: Final = MAILBOX_MAX // 4  # of them, by the nodes of one machine
 _SENDER_MAX_BYTES: Final = MAILBOX_MAX_BYTES // 4
 _FILE: Final = "registry.sqlite3"
-_TIMEOUT_S: Final = 10.0
 _DAY_S: Final = 86_400.0
 _TOKEN_KEPT_S: Final = 30 * _DAY_S  # after its end, so that its refusal can say why
 _TABLES: Final = """
@@ -128,7 +125,7 @@ class StoredMail:
     wire: bytes = field(repr=False)
 
 
-class Registry:
+class Registry(TransactionFile):
     """The opened registry of a domain; threads may share it.
 
     Raises:
@@ -137,24 +134,8 @@ class Registry:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / _FILE
         write_all(folder, {})
-        self._lock = threading.Lock()
-        with self._translated():
-            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-            self._file = sqlite3.connect(self._path, timeout=_TIMEOUT_S, isolation_level=None, check_same_thread=False)
-            try:
-                self._file.execute("PRAGMA journal_mode=WAL")
-                self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
-                self._file.executescript(_TABLES)
-            except sqlite3.Error:
-                self._file.close()
-                raise
-
-    def close(self) -> None:
-        """Close the file."""
-        with self._lock:
-            self._file.close()
+        super().__init__(folder / _FILE, _TABLES)
 
     def __enter__(self) -> Registry:
         return self
@@ -168,7 +149,7 @@ class Registry:
         self, identifier: bytes, mac: bytes, *, role: str, label: str, unix_s: float, expires_unix_s: float
     ) -> None:
         """Store a token; those that ended long ago are deleted."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("DELETE FROM tokens WHERE expires_unix_s < ?", (unix_s - _TOKEN_KEPT_S,))
             file.execute(
                 "INSERT INTO tokens (id, mac, role, label, made_unix_s, expires_unix_s) VALUES (?, ?, ?, ?, ?, ?)",
@@ -180,8 +161,8 @@ class Registry:
         query = (
             "SELECT id, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer FROM tokens WHERE id = ?"
         )
-        with self._translated(), self._lock:
-            row = self._file.execute(query, (identifier,)).fetchone()
+        with self.reading() as file:
+            row = file.execute(query, (identifier,)).fetchone()
         if row is None:
             return None
         id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer = row
@@ -206,7 +187,7 @@ class Registry:
             EnrolmentError: USED by other keys, LABEL_TAKEN, or NO_MEMBER: its machine was removed since. Nothing has
                 changed then.
         """
-        with self._writing() as file:
+        with self.writing() as file:
             row = file.execute("SELECT keys, machine, role FROM tokens WHERE id = ?", (identifier,)).fetchone()
             if row is None or (row[0] is not None and row[0] != keys):
                 raise EnrolmentError(Refusal.USED, "this token was used already")
@@ -222,7 +203,7 @@ class Registry:
 
     def withdraw_tokens(self, label: str) -> None:
         """Delete the unused tokens for machines with this label."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
 
     def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
@@ -231,7 +212,7 @@ class Registry:
         Raises:
             EnrolmentError: NO_MEMBER, the machine was removed meanwhile; what was issued must not be handed out.
         """
-        with self._writing() as file:
+        with self.writing() as file:
             _refuse_removed(file, machine)
             for each in members:
                 _insert_node(file, machine, each)
@@ -241,7 +222,7 @@ class Registry:
 
     def add_machine(self, label: str, role: str, members: Sequence[Membership], unix_s: float) -> int:
         """Store a machine that joined without a token; return its id. Raises ``EnrolmentError``: LABEL_TAKEN."""
-        with self._writing() as file:
+        with self.writing() as file:
             machine = self._insert_machine(file, label, role, unix_s)
             for each in members:
                 _insert_node(file, machine, each)
@@ -253,7 +234,7 @@ class Registry:
         Raises:
             EnrolmentError: NO_MEMBER, their machine was removed meanwhile; they must not be handed out.
         """
-        with self._writing() as file:
+        with self.writing() as file:
             for each in members:
                 row = file.execute("SELECT machine FROM nodes WHERE name = ?", (each.name,)).fetchone()
                 _refuse_removed(file, 0 if row is None else row[0])
@@ -265,7 +246,7 @@ class Registry:
 
     def set_card(self, name: Name, card: bytes) -> None:
         """Store a node's descriptor."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("UPDATE nodes SET card = ? WHERE name = ?", (card, name))
 
     def machine_of(self, name: Name) -> MachineRow | None:
@@ -284,23 +265,23 @@ class Registry:
         """Return machines in the order of their labels, beginning after a label."""
         condition = "" if with_removed else " AND removed_unix_s IS NULL"
         query = f"SELECT id FROM machines WHERE label > ?{condition} ORDER BY label, id LIMIT ?"
-        with self._translated(), self._lock:
-            found = [row[0] for row in self._file.execute(query, (after, limit)).fetchall()]
-            return [self._row(each) for each in found]
+        with self.reading() as file:
+            found = [row[0] for row in file.execute(query, (after, limit)).fetchall()]
+            return [self._row(file, each) for each in found]
 
     def saw(self, machine: int, unix_s: float) -> None:
         """Note that a machine's agent is connected."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("UPDATE machines SET seen_unix_s = ? WHERE id = ?", (unix_s, machine))
 
     def set_double(self, machine: int) -> None:
         """Note that two machines run with the identity of this one."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("UPDATE machines SET has_double = 1 WHERE id = ?", (machine,))
 
     def remove_machine(self, machine: int, unix_s: float) -> list[tuple[bytes, int]]:
         """Mark a machine as removed; return fingerprint and end of every membership of it that is still valid."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute(
                 "UPDATE machines SET removed_unix_s = ? WHERE id = ? AND removed_unix_s IS NULL", (unix_s, machine)
             )
@@ -317,14 +298,14 @@ class Registry:
     def fingerprints(self, machine: int) -> frozenset[bytes]:
         """Return the fingerprints of all memberships that the nodes of a machine ever had."""
         query = "SELECT fingerprint FROM certificates WHERE name IN (SELECT name FROM nodes WHERE machine = ?)"
-        with self._translated(), self._lock:
-            return frozenset(row[0] for row in self._file.execute(query, (machine,)).fetchall())
+        with self.reading() as file:
+            return frozenset(row[0] for row in file.execute(query, (machine,)).fetchall())
 
     # mail
 
     def add_mail(self, recipient: Name, sender: Name, wire: bytes) -> None:
         """Store a mail. Raises ``EnrolmentError``: MAILBOX_FULL, or NO_MEMBER: no such recipient."""
-        with self._writing() as file:
+        with self.writing() as file:
             known = file.execute(
                 "SELECT 1 FROM nodes n JOIN machines m ON m.id = n.machine"
                 " WHERE n.name = ? AND m.removed_unix_s IS NULL",
@@ -343,7 +324,7 @@ class Registry:
 
     def mail_of(self, recipient: Name, since: int, limit: int) -> list[StoredMail]:
         """Return the mail of a node after an id; mail up to that id was fetched and is deleted."""
-        with self._writing() as file:
+        with self.writing() as file:
             file.execute("DELETE FROM mail WHERE recipient = ? AND id <= ?", (recipient, since))
             rows = file.execute(
                 "SELECT id, wire FROM mail WHERE recipient = ? ORDER BY id LIMIT ?", (recipient, limit)
@@ -352,9 +333,9 @@ class Registry:
 
     def has_mail(self, recipient: Name) -> bool:
         """Return whether mail waits for a node."""
-        with self._translated(), self._lock:
+        with self.reading() as file:
             query = "SELECT 1 FROM mail WHERE recipient = ? LIMIT 1"
-            return self._file.execute(query, (recipient,)).fetchone() is not None
+            return file.execute(query, (recipient,)).fetchone() is not None
 
     def _insert_machine(self, file: sqlite3.Connection, label: str, role: str, unix_s: float) -> int:
         query = "SELECT 1 FROM machines WHERE label = ? AND removed_unix_s IS NULL"
@@ -370,16 +351,16 @@ class Registry:
         return int(cursor.lastrowid or 0)
 
     def _machine(self, query: str, key: object) -> MachineRow | None:
-        with self._translated(), self._lock:
-            row = self._file.execute(query, (key,)).fetchone()
-            return None if row is None else self._row(row[0])
+        with self.reading() as file:
+            row = file.execute(query, (key,)).fetchone()
+            return None if row is None else self._row(file, row[0])
 
-    def _row(self, machine: int) -> MachineRow:
-        found = self._file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
+    def _row(self, file: sqlite3.Connection, machine: int) -> MachineRow:
+        found = file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
         if found is None:
-            raise StoreError(f"{self._path}: a node of no machine")
+            raise StoreError(f"{self.path}: a node of no machine")
         id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double = found
-        rows = self._file.execute(
+        rows = file.execute(
             "SELECT name, role, certificate, until_unix_s, card FROM nodes WHERE machine = ? ORDER BY rowid", (machine,)
         ).fetchall()
         nodes = tuple(
@@ -396,20 +377,6 @@ class Registry:
             has_double=bool(has_double),
             nodes=nodes,
         )
-
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        with self._translated(), self._lock:
-            self._file.execute("BEGIN IMMEDIATE")
-            with self._file:  # commits, or rolls back
-                yield self._file
-
-    @contextmanager
-    def _translated(self) -> Iterator[None]:
-        try:
-            yield
-        except (sqlite3.Error, OSError) as error:
-            raise StoreError(f"{self._path}: {error}") from error
 
 
 def _refuse_removed(file: sqlite3.Connection, machine: int) -> None:
