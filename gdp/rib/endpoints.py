@@ -10,7 +10,6 @@ switches publish again. A change is sent to its watchers three times, because no
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -22,6 +21,7 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, parse
+from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.limits import (
@@ -82,7 +82,7 @@ class RibEndpoints:
         self._watches = Watches(watches)
         self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
         self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
-        self._repeats: list[tuple[float, Name, int]] = []  # when, of which switch, of which record
+        self._repeats = DueQueue[tuple[Name, int, float]]()  # of which switch, of which record, how long after it
         self._out: list[_Outgoing] = []
 
     def __len__(self) -> int:
@@ -170,7 +170,7 @@ class RibEndpoints:
         kept = self._kept[record.name] = _Kept(record, member, now.mono_s + ENDPOINT_LEASE_S)
         self._tell(kept, now.mono_s)
         for after_s in _REPEAT_S:
-            heapq.heappush(self._repeats, (now.mono_s + after_s, record.name, record.sequence))
+            self._repeats.put((record.name, record.sequence, after_s), now.mono_s + after_s)
         return kept
 
     def _check(self, kept: _Kept, now: Timestamps) -> None:
@@ -221,17 +221,15 @@ class RibEndpoints:
         while self._kept and next(iter(self._kept.values())).expires_s <= now.mono_s:
             self._drop(next(iter(self._kept)))
         self._watches.expire(now.mono_s)
-        while self._repeats and self._repeats[0][0] <= now.mono_s:
-            _, name, sequence = heapq.heappop(self._repeats)
+        for name, sequence, _ in self._repeats.poll_due(now.mono_s):
             known = self._kept.get(name)
             if known is not None and known.record.sequence == sequence and self._is_valid(known, now):
                 self._tell(known, now.mono_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [next(iter(self._kept.values())).expires_s] if self._kept else []
-        times += [self._repeats[0][0]] if self._repeats else []
-        return min(times, default=None)
+        times = [self._repeats.next_due(), next(iter(self._kept.values())).expires_s if self._kept else None]
+        return min((each for each in times if each is not None), default=None)
 
     def poll_statements(self) -> list[_Outgoing]:
         """Return, once, the statements to send: receiver, kind and wire form."""

@@ -7,11 +7,11 @@ of their leases, within a bound.
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 from typing import Final
 
 from gdp.control.rib_replication import Key
+from gdp.due_queue import DueQueue
 from gdp.names import Name
 
 __all__ = ["Passed", "UpstreamAdvertisements"]
@@ -43,7 +43,6 @@ class Passed:
 @dataclass(slots=True)
 class _Waiting:
     passed: Passed
-    again_s: float
     pause_s: float = RETRY_S
 
 
@@ -58,7 +57,7 @@ class UpstreamAdvertisements:
         self._ribs = ribs
         self._at = 0
         self._waiting: dict[Key, _Waiting] = {}
-        self._due: list[tuple[float, Key]] = []
+        self._due = DueQueue[Key](is_sorted=True)
         self._asked_s: float | None = None  # since when a message is unanswered
         self._unheard_s: float | None = None  # when the first message left since one of them was heard
         self._heard_s = float("-inf")
@@ -83,18 +82,19 @@ class UpstreamAdvertisements:
         """Send an advertisement upstream until it is acknowledged; it replaces the same advertiser's pending one."""
         if passed.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
             self._drop(next(iter(self._waiting)))
-        self._waiting[passed.key] = _Waiting(passed, now_s)
-        heapq.heappush(self._due, (now_s, passed.key))
+        self._waiting[passed.key] = _Waiting(passed)
+        self._due.put(passed.key, now_s)
 
     def handle_ack(self, key: Key, sequence: int) -> None:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
         if waiting is not None and sequence >= waiting.passed.sequence:
-            del self._waiting[key]
+            self.refused(key)
 
     def refused(self, key: Key) -> None:
         """Record that an advertiser's pending advertisement was rejected."""
         self._waiting.pop(key, None)
+        self._due.discard(key)
 
     def probe(self, now_s: float, quiet_s: float) -> bool:
         """Return whether to probe the RIB in use, if it is one of several and silent for ``quiet_s``."""
@@ -150,17 +150,13 @@ class UpstreamAdvertisements:
         """Return the advertisements to send to ``rib`` now; those with ended leases are dropped, and counted."""
         found: list[Passed] = []
         most = 1 if self._is_gone(now_s) else SEND_MAX
-        while self._due and self._due[0][0] <= now_s and len(found) < SEND_MAX:
-            at_s, key = heapq.heappop(self._due)
-            waiting = self._waiting.get(key)
-            if waiting is None or waiting.again_s != at_s:
-                continue
+        while len(found) < SEND_MAX and (keys := self._due.poll_due(now_s, 1)):
+            waiting = self._waiting[keys[0]]
             if waiting.passed.until_s <= now_s:
-                self._drop(key)
+                self._drop(keys[0])
                 continue
-            waiting.again_s = now_s + waiting.pause_s
+            self._due.put(keys[0], now_s + waiting.pause_s)
             waiting.pause_s = min(2 * waiting.pause_s, RETRY_MAX_S)
-            heapq.heappush(self._due, (waiting.again_s, key))
             if len(found) < most:
                 found.append(waiting.passed)
         if found:
@@ -171,7 +167,8 @@ class UpstreamAdvertisements:
 
     def next_due(self) -> float | None:
         """Return a monotonic second that is no later than the next timer, or None."""
-        times = [self._due[0][0]] if self._due else []
+        due_s = self._due.next_due()
+        times = [] if due_s is None else [due_s]
         if len(self._ribs) > 1:
             times.append(self._heard_s + PROBE_S if self._asked_s is None else self._asked_s + self._silent_s())
             times.append(self._return_at_s)
@@ -189,10 +186,10 @@ class UpstreamAdvertisements:
         return self._asked_s is not None and now_s - self._asked_s >= GONE_S
 
     def _all_due(self, now_s: float) -> None:
-        for waiting in self._waiting.values():
-            waiting.again_s, waiting.pause_s = now_s, RETRY_S
-        self._due = [(now_s, key) for key in self._waiting]
+        for key, waiting in self._waiting.items():
+            waiting.pause_s = RETRY_S
+            self._due.put(key, now_s)
 
     def _drop(self, key: Key) -> None:
-        del self._waiting[key]
+        self.refused(key)
         self.given_up += 1

@@ -7,10 +7,10 @@ finds no call.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from typing import Final, Generic, TypeVar
 
+from gdp.due_queue import DueQueue
 from gdp.errors import LocalError
 
 __all__ = ["Calls"]
@@ -18,7 +18,6 @@ __all__ = ["Calls"]
 T = TypeVar("T")
 
 _NUMBERS: Final = 1 << 64
-_SPARE: Final = 64  # timers of ended calls that are not worth a clean-up
 
 
 class Calls(Generic[T]):
@@ -32,7 +31,7 @@ class Calls(Generic[T]):
         self._limit = limit
         self._next = start % _NUMBERS
         self._contexts: dict[int, T] = {}  # in the order of their start
-        self._timers: list[tuple[float, int]] = []  # a heap; includes ended calls
+        self._timeouts = DueQueue[int]()
 
     def __len__(self) -> int:
         return len(self._contexts)
@@ -60,7 +59,7 @@ class Calls(Generic[T]):
         self._next = (number + 1) % _NUMBERS
         self._contexts[number] = context
         if timeout_s is not None:
-            heapq.heappush(self._timers, (now_s + timeout_s, number))
+            self._timeouts.put(number, now_s + timeout_s)
         return number
 
     def get(self, number: int) -> T | None:
@@ -69,30 +68,20 @@ class Calls(Generic[T]):
 
     def end(self, number: int) -> T | None:
         """End a call; return its context, or None where it ended before."""
-        context = self._contexts.pop(number, None)
-        if context is not None and len(self._timers) > 2 * len(self._contexts) + _SPARE:
-            self._timers = [timer for timer in self._timers if timer[1] in self._contexts]
-            heapq.heapify(self._timers)
-        return context
+        self._timeouts.discard(number)
+        return self._contexts.pop(number, None)
 
     def expired(self, now_s: float) -> list[tuple[int, T]]:
         """End the calls whose timeout has passed; return their numbers and contexts, the longest overdue first."""
-        ended = []
-        while self._timers and self._timers[0][0] <= now_s:
-            number = heapq.heappop(self._timers)[1]
-            if number in self._contexts:
-                ended.append((number, self._contexts.pop(number)))
-        return ended
+        return [(number, self._contexts.pop(number)) for number in self._timeouts.poll_due(now_s)]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timeout, or None."""
-        while self._timers and self._timers[0][1] not in self._contexts:
-            heapq.heappop(self._timers)
-        return self._timers[0][0] if self._timers else None
+        return self._timeouts.next_due()
 
     def fail_all(self) -> list[tuple[int, T]]:
         """End every call, since no server is left to respond; return their numbers and contexts, the oldest first."""
         ended = list(self._contexts.items())
         self._contexts.clear()
-        self._timers.clear()
+        self._timeouts.clear()
         return ended

@@ -15,12 +15,12 @@ When a server that owes a response refuses, declines or goes, the next untried s
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
 
+from gdp.due_queue import DueQueue
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.budget import HedgeBudget
@@ -125,7 +125,7 @@ class Dispatch(Generic[A]):
         self._servers: dict[Name, bool] = {}  # whether it is leaving
         self._latencies = Latencies()
         self._budget = HedgeBudget(replication.budget)
-        self._hedges: list[tuple[float, int]] = []  # a heap; includes ended calls
+        self._hedges = DueQueue[int]()
         self._late: dict[int, None] = {}  # calls whose second copy waits for the budget, the oldest first
         self._ended: dict[int, _Ended] = {}  # in the order of their end
         self._effects: list[Effect] = []
@@ -189,7 +189,7 @@ class Dispatch(Generic[A]):
             copies = self._replication.copies if mode is Mode.SOME else 1
             self._ask(number, call, chosen or self._untried(call, now_s)[:copies], now_s)
         if mode is Mode.HEDGED and not chosen:
-            heapq.heappush(self._hedges, (now_s + self._hedge_after_s(), number))
+            self._hedges.put(number, now_s + self._hedge_after_s())
         self._hedge(now_s)
         return number
 
@@ -252,17 +252,13 @@ class Dispatch(Generic[A]):
         """Run the timers that are due."""
         for number, call in self._calls.expired(now_s):
             self._fail(number, call, Failure.TIMED_OUT, "")
-        while self._hedges and self._hedges[0][0] <= now_s:
-            if (number := heapq.heappop(self._hedges)[1]) in self._calls:
-                self._late[number] = None
+        self._late |= dict.fromkeys(self._hedges.poll_due(now_s))
         self._hedge(now_s)
         self._tell_stops(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        while self._hedges and self._hedges[0][1] not in self._calls:
-            heapq.heappop(self._hedges)
-        times = [self._calls.get_timer(), self._hedges[0][0] if self._hedges else None]
+        times = [self._calls.get_timer(), self._hedges.next_due()]
         times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
         return min((time for time in times if time is not None), default=None)
 
@@ -347,6 +343,7 @@ class Dispatch(Generic[A]):
         if self._stops:
             self._effects.append(End(number))
         self._late.pop(number, None)
+        self._hedges.discard(number)
 
     def _fail(self, number: int, call: _Call[A], failure: Failure, reason: str) -> None:
         self._release(number, call)

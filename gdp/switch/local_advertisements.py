@@ -5,10 +5,10 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
+from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
 from gdp.limits import ATTACHED_MAX
 from gdp.message.shares import Shares
@@ -22,6 +22,7 @@ RELAY_AGAIN_S: Final = 0.4  # many attempts in a lease: a relay over a lossy pat
 _RELAY_MAX_S: Final = 3.2  # over a slow link
 _ROUND_TRIPS: Final = 2.0
 RELAY_TRIES: Final = 20
+_Key: TypeAlias = tuple[Name, Name]  # name, advertiser
 
 
 @dataclass(slots=True, kw_only=True)
@@ -44,11 +45,8 @@ class LocalAdvertisements:
     def __init__(self) -> None:
         self._by_name: dict[Name, dict[Name, LocalAdvertisement]] = {}
         self._shares = Shares(ATTACHED_MAX)
-        self._relays: list[
-            tuple[float, int, LocalAdvertisement]
-        ] = []  # heaps; entries that a renewal made stale are skipped
-        self._ends: list[tuple[float, int, LocalAdvertisement]] = []
-        self._pushed = 0
+        self._relays = DueQueue[_Key]()
+        self._ends = DueQueue[_Key]()
 
     def __len__(self) -> int:
         return len(self._shares)
@@ -85,14 +83,17 @@ class LocalAdvertisements:
         if before is not None and before.is_slow and not before.is_settled and (before.port, before.mac) == (port, mac):
             attachment.relay_at_s, attachment.is_slow = max(before.relay_at_s, now_s), True
         self._by_name.setdefault(advertisement.name, {})[advertisement.node] = attachment
-        self._push(self._relays, attachment.relay_at_s, attachment)
-        self._push(self._ends, attachment.expires_s, attachment)
+        key = advertisement.name, advertisement.node
+        self._relays.put(key, attachment.relay_at_s)
+        self._ends.put(key, attachment.expires_s)
         return attachment
 
     def remove(self, name: Name, advertiser: Name) -> LocalAdvertisement | None:
         """Remove an advertisement and return it, or None."""
         advertisements = self._by_name.get(name, {})
         gone = advertisements.pop(advertiser, None)
+        self._relays.discard((name, advertiser))
+        self._ends.discard((name, advertiser))
         if gone is not None:
             self._shares.release(advertiser)
         if not advertisements:
@@ -117,17 +118,19 @@ class LocalAdvertisements:
         if attachment is None or (taken is not None and taken < attachment.advertisement.sequence):
             return None
         attachment.is_settled = True
+        self._relays.discard((name, advertiser))
         return attachment
 
     def relay_all(self, now_s: float) -> None:
         """Make every advertisement due to be relayed: there is a new RIB."""
         for attachment in self.all():
             attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
-            self._push(self._relays, now_s, attachment)
+            self._relays.put((attachment.advertisement.name, attachment.advertisement.node), now_s)
 
     def is_relay_due(self, now_s: float) -> bool:
         """Return whether an advertisement is to be relayed now."""
-        return self._next_relay() <= now_s
+        due_s = self._relays.next_due()
+        return due_s is not None and due_s <= now_s
 
     def due(self, now_s: float, trip_s: float) -> list[LocalAdvertisement]:
         """Return the advertisements to relay now.
@@ -135,55 +138,25 @@ class LocalAdvertisements:
         Args:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
-        due, interval_s = [], min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
-        while self._next_relay() <= now_s:
-            each = heapq.heappop(self._relays)[2]
+        interval_s = min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
+        due = [self._by_name[name][advertiser] for name, advertiser in self._relays.poll_due(now_s)]
+        for each in due:
             each.tries += 1
             each.relay_at_s, each.is_slow = now_s + interval_s, interval_s > RELAY_AGAIN_S
-            self._push(self._relays, each.relay_at_s, each)
-            due.append(each)
+            if each.tries < RELAY_TRIES:
+                self._relays.put((each.advertisement.name, each.advertisement.node), each.relay_at_s)
         return due
 
     def expire(self, now_s: float) -> list[LocalAdvertisement]:
         """Remove and return the advertisements that were not renewed."""
-        late = []
-        while self._next_end() <= now_s:
-            late.append(heapq.heappop(self._ends)[2])
-            self.remove(late[-1].advertisement.name, late[-1].advertisement.node)
-        return late
+        gone = [self.remove(name, advertiser) for name, advertiser in self._ends.poll_due(now_s)]
+        return [each for each in gone if each is not None]
 
     def next_event(self) -> float | None:
         """Return the monotonic second of the next relay or lease end, or None."""
-        next_s = min(self._next_relay(), self._next_end())
-        return None if next_s == float("inf") else next_s
+        times = self._relays.next_due(), self._ends.next_due()
+        return min((each for each in times if each is not None), default=None)
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next lease end, or None."""
-        next_s = self._next_end()
-        return None if next_s == float("inf") else next_s
-
-    def _push(
-        self, heap: list[tuple[float, int, LocalAdvertisement]], at_s: float, attachment: LocalAdvertisement
-    ) -> None:
-        self._pushed += 1
-        heapq.heappush(heap, (at_s, self._pushed, attachment))
-
-    def _is_held(self, attachment: LocalAdvertisement) -> bool:
-        return self.get(attachment.advertisement.name, attachment.advertisement.node) is attachment
-
-    def _next_relay(self) -> float:
-        while self._relays:
-            at_s, _, each = self._relays[0]
-            is_open = not each.is_settled and each.tries < RELAY_TRIES
-            if is_open and each.relay_at_s == at_s and self._is_held(each):
-                return at_s
-            heapq.heappop(self._relays)
-        return float("inf")
-
-    def _next_end(self) -> float:
-        while self._ends:
-            at_s, _, each = self._ends[0]
-            if self._is_held(each):
-                return at_s
-            heapq.heappop(self._ends)
-        return float("inf")
+        return self._ends.next_due()

@@ -14,13 +14,13 @@ is closed.
 
 from __future__ import annotations
 
-import heapq
 from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, parse
+from gdp.due_queue import DueQueue
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
@@ -198,39 +198,42 @@ class _SubmittedRevocations:
 
     def __init__(self) -> None:
         self._wires: dict[bytes, bytes] = {}
-        self._due: list[tuple[float, int, bytes]] = []  # when, how often it was sent, fingerprint
+        self._times: dict[bytes, int] = {}  # how often it was sent
+        self._due = DueQueue[bytes]()
         self._tick_at_s = float("-inf")
 
     def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
         """Add a statement to send from now on."""
         if fingerprint not in self._wires:
-            heapq.heappush(self._due, (now_s, 0, fingerprint))
+            self._times[fingerprint] = 0
+            self._due.put(fingerprint, now_s)
         self._wires[fingerprint] = wire
 
     def remove(self, fingerprint: bytes) -> None:
         """Stop sending a statement: it has expired."""
         self._wires.pop(fingerprint, None)
+        self._due.discard(fingerprint)
 
     def say_again(self, now_s: float) -> None:
         """Send every statement again: there is another RIB."""
-        self._due = [(now_s, 0, fingerprint) for fingerprint in self._wires]
+        for fingerprint in self._wires:
+            self._times[fingerprint] = 0
+            self._due.put(fingerprint, now_s)
 
     def poll_due(self, now_s: float) -> list[tuple[bytes, bytes]]:
         """Return the few statements to send now, each with its fingerprint."""
         if now_s < self._tick_at_s:
             return []
-        said: list[tuple[bytes, bytes]] = []
-        while self._due and self._due[0][0] <= now_s and len(said) < _PER_TICK:
-            _, times, fingerprint = heapq.heappop(self._due)
-            wire = self._wires.get(fingerprint)
-            if wire is not None:
-                said.append((fingerprint, wire))
-                pause_s = _FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S
-                heapq.heappush(self._due, (now_s + pause_s, times + 1, fingerprint))
-        if said:
+        due = self._due.poll_due(now_s, _PER_TICK)
+        for fingerprint in due:
+            times = self._times[fingerprint]
+            self._due.put(fingerprint, now_s + (_FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S))
+            self._times[fingerprint] += 1
+        if due:
             self._tick_at_s = now_s + _TICK_S
-        return said
+        return [(fingerprint, self._wires[fingerprint]) for fingerprint in due]
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next statement, or None."""
-        return max(self._due[0][0], self._tick_at_s) if self._due else None
+        due_s = self._due.next_due()
+        return None if due_s is None else max(due_s, self._tick_at_s)

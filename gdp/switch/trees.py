@@ -13,12 +13,12 @@ that routes of different readers form no loop.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from gdp.control.join import Route, RouteLink
+from gdp.due_queue import DueQueue
 from gdp.frame.codec import second_path_key
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
@@ -28,7 +28,6 @@ __all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees"]
 
 Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
 TreeKey = tuple[Name, Name, int]  # topic, publisher and path
-_HEAP_SLACK: Final = 1_024
 
 
 @dataclass(slots=True, kw_only=True)
@@ -227,8 +226,7 @@ class Trees:
         self._by_topic: dict[Name, dict[tuple[Name, int], Tree]] = {}
         self._size = 0
         self._touched: dict[TreeKey, Tree] = {}
-        self._due_s: dict[TreeKey, float] = {}  # deadline of the valid heap entry
-        self._heap: list[tuple[float, TreeKey]] = []
+        self._due = DueQueue[TreeKey](is_sorted=True)
 
     def __len__(self) -> int:
         return self._size
@@ -279,38 +277,21 @@ class Trees:
         if not trees:
             self._by_topic.pop(tree.topic, None)
         self._touched.pop(tree.identity, None)
-        self._due_s.pop(tree.identity, None)
+        self._due.discard(tree.identity)
 
     def due(self, now_s: float) -> list[Tree]:
         """Return the trees with a timer that is due; each is returned again while that is so."""
         self._schedule()
-        due = []
-        while self._heap and self._heap[0][0] <= now_s:
-            at_s, key = heapq.heappop(self._heap)
-            if self._due_s.get(key) == at_s:
-                del self._due_s[key]
-                tree = self._by_topic[key[0]][key[1:]]
-                self._touched[key] = tree
-                due.append(tree)
-        return due
+        due = {key: self._by_topic[key[0]][key[1:]] for key in self._due.poll_due(now_s)}
+        self._touched.update(due)
+        return list(due.values())
 
     def next_event(self) -> float | None:
         """Return the monotonic second at which something is due next, or None."""
         self._schedule()
-        while self._heap:
-            at_s, key = self._heap[0]
-            if self._due_s.get(key) == at_s:
-                return at_s
-            heapq.heappop(self._heap)
-        return None
+        return self._due.next_due()
 
     def _schedule(self) -> None:
         for key, tree in self._touched.items():
-            next_s = tree.next_s()
-            if self._due_s.get(key) != next_s:
-                self._due_s[key] = next_s
-                heapq.heappush(self._heap, (next_s, key))
+            self._due.put(key, tree.next_s())
         self._touched.clear()
-        if len(self._heap) > 4 * self._size + _HEAP_SLACK:
-            self._heap = [(at_s, key) for key, at_s in self._due_s.items()]
-            heapq.heapify(self._heap)

@@ -67,7 +67,7 @@ def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
     clock.due_s = float("inf")
     timers.reschedule(clock)
     assert timers.next_due() is None
-    assert [len(each) for each in (timers._heap, timers._due_s, timers._place_s, timers._touched)] == [0, 0, 0, 0]
+    assert [len(each) for each in (timers._queue, timers._queue._heap, timers._touched)] == [0, 0, 0]
 
 
 def test_a_timer_that_fired_is_queried_again() -> None:
