@@ -7,16 +7,17 @@ Source: CORBA CDR 15.3 (a primitive is aligned to its size, counted from the sta
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from proxy.serial.dialect import BITS
 from proxy.serial.schema import SIZES, Array, Number, Record, Type
 
-__all__ = ["RUN_MAX", "Phases", "Wire", "inline_codes"]
+__all__ = ["Phases", "Wire", "inline_codes", "runs"]
 
 _AS_BITS: Final = str.maketrans(BITS)
 # numbers of one record that are unpacked in runs; further arrays and records are unpacked one by one
-RUN_MAX: Final = 4_096
+_RUN_MAX: Final = 4_096
 _INLINE_MAX: Final = 256  # numbers in one record that still form one run
 
 
@@ -91,3 +92,25 @@ def inline_codes(kind: Type, inline_max: int, known: dict[int, str | None]) -> s
             codes += more
         known[id(kind)] = codes
     return known[id(kind)]
+
+
+def runs(record: Record, codes: Callable[[Type], str | None]) -> Iterator[tuple[list[tuple[str, Type]], bool]]:
+    """Yield the fields of a record in order: those together that one format reads (True), any other alone (False).
+
+    Args:
+        codes: as ``inline_codes``.
+    """
+    run: list[tuple[str, Type]] = []
+    left = _RUN_MAX
+    for name, kind in record.fields:
+        found = codes(kind)
+        if found is not None and (isinstance(kind, Number) or len(found) <= left):
+            left -= len(found)
+            run.append((name, kind))
+            continue
+        if run:
+            yield run, True
+            run = []
+        yield [(name, kind)], False
+    if run:
+        yield run, True

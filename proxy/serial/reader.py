@@ -17,7 +17,7 @@ import numpy as np
 
 from proxy.serial.cost import fixed_bytes, items_of
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.layout import RUN_MAX, Wire, inline_codes
+from proxy.serial.layout import Wire, inline_codes, runs
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
 __all__ = ["ITEMS_MAX", "Reader", "Tree", "read_with"]
@@ -89,22 +89,10 @@ class _Compiler:
         return read
 
     def _steps(self, record: Record) -> list[_Step]:
-        steps: list[_Step] = []
-        run: list[tuple[str, Type]] = []
-        left = RUN_MAX
-        for name, kind in record.fields:
-            codes = inline_codes(kind, self._dialect.inline_max, self._inline)
-            if codes is not None and (isinstance(kind, Number) or len(codes) <= left):
-                left -= len(codes)
-                run.append((name, kind))
-                continue
-            if run:
-                steps.append(self._run(run))
-                run = []
-            steps.append(_named(name, self._value(kind)))
-        if run:
-            steps.append(self._run(run))
-        return steps
+        return [
+            self._run(fields) if is_run else _named(fields[0][0], self._value(fields[0][1]))
+            for fields, is_run in runs(record, lambda kind: inline_codes(kind, self._dialect.inline_max, self._inline))
+        ]
 
     def _codes(self, kind: Type) -> str:
         return inline_codes(kind, self._dialect.inline_max, self._inline) or ""

@@ -13,7 +13,7 @@ from operator import itemgetter
 from typing import Final, TypeAlias
 
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.layout import RUN_MAX, Wire, inline_codes
+from proxy.serial.layout import Wire, inline_codes, runs
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
 __all__ = ["Writer", "write_with"]
@@ -51,22 +51,10 @@ class _Compiler:
         return self._records[id(record)]
 
     def _steps(self, record: Record) -> list[Writer]:
-        steps: list[Writer] = []
-        run: list[tuple[str, Type]] = []
-        left = RUN_MAX
-        for name, kind in record.fields:
-            codes = self._codes(kind)
-            if codes is not None and (isinstance(kind, Number) or len(codes) <= left):
-                left -= len(codes)
-                run.append((name, kind))
-                continue
-            if run:
-                steps.append(self._run(run))
-                run = []
-            steps.append(_named(name, self._value(kind)))
-        if run:
-            steps.append(self._run(run))
-        return steps
+        return [
+            self._run(fields) if is_run else _named(fields[0][0], self._value(fields[0][1]))
+            for fields, is_run in runs(record, self._codes)
+        ]
 
     def _codes(self, kind: Type) -> str | None:
         return inline_codes(kind, self._dialect.inline_max, self._inline)

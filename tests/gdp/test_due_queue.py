@@ -1,4 +1,4 @@
-"""Queue of due keys, beside a plain dictionary."""
+"""Queue of due keys: it does what a plain dictionary does."""
 
 from __future__ import annotations
 
