@@ -1,17 +1,19 @@
 """Files of a site that its machines fetch: read, hashed, and the workspace packed.
 
-I/O. A workspace travels as one archive for each package, by content (``workspace.py``).
+I/O. A workspace travels as one archive for each package, by content (``workspace.py``). A machine's user data has the
+digest of the manifest, so the cloud's API authenticates every file.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 from fog.software.config import SoftwareConfig
-from fog.software.manifest import Artifact, manifest_bytes
 from fog.software.workspace import packed_parts, parts_of, remove_unused
 from gdp.errors import LocalError
 
@@ -23,12 +25,32 @@ _PARTS: Final = "workspace"  # folder of archives in the scratch folder
 _PIECE_BYTES: Final = 1 << 20
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class _Artifact:
+    """File for a machine.
+
+    Args:
+        name: path below the machine's folder of software, such as ``wheels/numpy-2.3.0-cp311-...whl``.
+        size: in bytes.
+        sha256: 64 hex digits.
+    """
+
+    name: str
+    size: int
+    sha256: str
+
+    @classmethod
+    def of(cls, name: str, content: bytes) -> _Artifact:
+        """Return the entry of a file with this content."""
+        return cls(name, len(content), hashlib.sha256(content).hexdigest())
+
+
 @dataclass(frozen=True, slots=True)
 class Offered:
     """Software of a site at one moment.
 
     Args:
-        manifest: as of ``manifest_bytes``.
+        manifest: list of the files as JSON, the same bytes for the same files.
         files: SHA-256 in hex -> file with that content.
     """
 
@@ -47,7 +69,7 @@ def offered(config: SoftwareConfig, scratch: Path) -> Offered:
     Raises:
         LocalError: a folder has no wheel, or a file cannot be read.
     """
-    entries: list[Artifact] = []
+    entries: list[_Artifact] = []
     files: dict[str, Path] = {}
     try:
         for path in _wheels(config):
@@ -58,7 +80,7 @@ def offered(config: SoftwareConfig, scratch: Path) -> Offered:
                 _add(f"{WORKSPACE}/{name}", packed, entries, files)
     except OSError as error:
         raise LocalError(f"software: {error.filename}: {error.strerror}") from error
-    return Offered(manifest_bytes(entries), files)
+    return Offered(_manifest_bytes(entries), files)
 
 
 def signature(config: SoftwareConfig) -> tuple[tuple[str, int, int] | str, ...]:
@@ -87,11 +109,16 @@ def _wheels(config: SoftwareConfig) -> list[Path]:
     return found
 
 
-def _add(name: str, path: Path, entries: list[Artifact], files: dict[str, Path]) -> None:
+def _add(name: str, path: Path, entries: list[_Artifact], files: dict[str, Path]) -> None:
     digest, size = hashlib.sha256(), 0
     with path.open("rb") as file:
         while piece := file.read(_PIECE_BYTES):
             digest.update(piece)
             size += len(piece)
-    entries.append(Artifact(name, size, digest.hexdigest()))
+    entries.append(_Artifact(name, size, digest.hexdigest()))
     files[digest.hexdigest()] = path
+
+
+def _manifest_bytes(artifacts: Sequence[_Artifact]) -> bytes:
+    """Return the list as JSON, the same bytes for the same files."""
+    return json.dumps([asdict(each) for each in sorted(artifacts)], separators=(",", ":")).encode()

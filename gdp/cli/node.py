@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Final
@@ -17,7 +18,6 @@ from typing import Annotated, Final
 import orjson
 import typer
 
-from gdp.cli.log_lines import JsonLines
 from gdp.config.config import UplinkPlane
 from gdp.errors import ConfigError, GdpError, LocalError
 from gdp.terminal import echo
@@ -103,7 +103,7 @@ def set_up_logging(
     for handler in logging.getLogger().handlers:
         handler.addFilter(_is_ours_or_serious)
         if form is Format.JSON:
-            handler.setFormatter(JsonLines())
+            handler.setFormatter(_JsonLines())
 
 
 def _is_ours_or_serious(record: logging.LogRecord) -> bool:
@@ -140,3 +140,19 @@ def failing_clearly() -> Iterator[None]:
     except GdpError as error:
         echo(f"error: {error}", err=True)
         raise typer.Exit(WRONG) from error
+
+
+class _JsonLines(logging.Formatter):
+    """One object a record: ``time`` (RFC 3339, UTC), ``level``, ``logger``, ``message``; ``trace`` of an exception."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return a record as one line without its end."""
+        fields = {
+            "time": datetime.fromtimestamp(record.created, timezone.utc).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info is not None:
+            fields["trace"] = self.formatException(record.exc_info)
+        return orjson.dumps(fields).decode()
