@@ -48,9 +48,9 @@ class DueQueue(Generic[K]):
         """Return when a key is due; infinity: it does not wait."""
         return self._due_s.get(key, _NEVER)
 
-    def put(self, key: K, at_s: float) -> None:
-        """Have a key due at a second, instead of when it was before; infinity: never."""
-        if at_s == _NEVER:
+    def put(self, key: K, at_s: float | None) -> None:
+        """Have a key due at a second, instead of when it was before; None or infinity: never."""
+        if at_s is None or at_s == _NEVER:
             self.discard(key)
             return
         self._due_s[key] = at_s

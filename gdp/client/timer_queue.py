@@ -5,13 +5,11 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from gdp.due_queue import DueQueue
 
 __all__ = ["HasTimer", "TimerQueue"]
-
-_NEVER: Final = float("inf")
 
 
 class HasTimer(Protocol):
@@ -38,8 +36,7 @@ class TimerQueue(Generic[T]):
     def next_due(self) -> float | None:
         """Return the monotonic second at which the first is due, or None."""
         for each in self._touched:
-            due_s = each.get_timer()
-            self._queue.put(each, _NEVER if due_s is None else due_s)
+            self._queue.put(each, each.get_timer())
         self._touched.clear()
         return self._queue.next_due()
 

@@ -89,12 +89,11 @@ class UpstreamAdvertisements:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
         if waiting is not None and sequence >= waiting.passed.sequence:
-            self.refused(key)
+            self._remove(key)
 
     def refused(self, key: Key) -> None:
         """Record that an advertiser's pending advertisement was rejected."""
-        self._waiting.pop(key, None)
-        self._due.discard(key)
+        self._remove(key)
 
     def probe(self, now_s: float, quiet_s: float) -> bool:
         """Return whether to probe the RIB in use, if it is one of several and silent for ``quiet_s``."""
@@ -191,5 +190,9 @@ class UpstreamAdvertisements:
             self._due.put(key, now_s)
 
     def _drop(self, key: Key) -> None:
-        self.refused(key)
+        self._remove(key)
         self.given_up += 1
+
+    def _remove(self, key: Key) -> None:
+        self._waiting.pop(key, None)
+        self._due.discard(key)

@@ -165,8 +165,9 @@ class SqliteSource:
     def _rows(self, table: str, columns: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
         """Yield the number and the texts of each row; a column that is not there is empty, and UTF-8 is not assumed."""
         there = self._columns(table)
+        key = "id" if "id" in there else "rowid"
         texts = ", ".join(f"CAST({column} AS BLOB)" if column in there else "x''" for column in columns)
-        for number, *values in self._db.execute(f"SELECT rowid, {texts} FROM {table} ORDER BY rowid"):
+        for number, *values in self._db.execute(f"SELECT {key}, {texts} FROM {table} ORDER BY {key}"):
             yield int(number), [(value or b"").decode("utf-8", "replace") for value in values]
 
     def _find_messages(self) -> None:
