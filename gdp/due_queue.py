@@ -9,7 +9,6 @@ up. A key that is due sooner gets a second entry, and the first becomes void.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
 from itertools import count
 from typing import Any, Final, Generic, TypeVar
 
@@ -40,9 +39,6 @@ class DueQueue(Generic[K]):
 
     def __contains__(self, key: K) -> bool:
         return key in self._due_s
-
-    def __iter__(self) -> Iterator[K]:
-        return iter(self._due_s)
 
     def due_s(self, key: K) -> float:
         """Return when a key is due; infinity: it does not wait."""
