@@ -37,7 +37,7 @@ class StreamStart(NamedTuple):
     Args:
         incarnation: of the reader; a recorded Heartbeat opens nothing to a later incarnation.
         number: the reader's first message number.
-        sequence: the first sequence number under it.
+        sequence: the first sequence number under it, or a lower one: what the reader waited for and will not get.
         confirmed: below this a former incarnation of this reader had confirmed everything; 0: not known.
     """
 
