@@ -6,10 +6,11 @@ Sans-I/O. Source: OSPF (RFC 2328, section 9.5).
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.control.endpoints import Endpoint
+from gdp.control.preshared_key import SIZES
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
@@ -99,6 +100,7 @@ class Hello:
         conflicts: echoes of those here whose identity another node has, too; those not in ``heard`` are refused.
         cookies: for each receiver that required one, the nonce of its port and the tag that proves the cookie.
         observed: on a tunnel, for each receiver the nonce of its port, and its endpoint as the sender sees it.
+        preshared: on a tunnel, a message of the agreement on its preshared key; empty: none.
     """
 
     nonce: bytes
@@ -114,6 +116,7 @@ class Hello:
     rtcerts: tuple[bytes, ...] = ()
     cookies: tuple[tuple[bytes, bytes], ...] = ()
     observed: tuple[tuple[bytes, Endpoint], ...] = ()
+    preshared: bytes = field(default=b"", repr=False)
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -132,6 +135,8 @@ class Hello:
             "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
             "o": [nonce + endpoint.to_wire() for nonce, endpoint in self.observed[:OBSERVED_MAX]],
         }
+        if self.preshared:
+            body["p"] = self.preshared
         return sign(StatementType.HELLO, body, signer, key)
 
     @classmethod
@@ -154,6 +159,7 @@ class Hello:
                 for each in fields.byte_strings("y", COOKIES_MAX, NONCE_BYTES + COOKIE_BYTES)
             ),
             observed=_observed(fields),
+            preshared=_preshared(fields),
         )
 
 
@@ -165,6 +171,13 @@ def _observed(fields: Fields) -> tuple[tuple[bytes, Endpoint], ...]:
         )
     except ValueError as error:
         raise StatementError(DropReason.MALFORMED, "an observed endpoint") from error
+
+
+def _preshared(fields: Fields) -> bytes:
+    message = fields.bytes_("p") if "p" in fields else b""
+    if len(message) not in SIZES:
+        raise StatementError(DropReason.MALFORMED, "a message about a preshared key")
+    return message
 
 
 def _timing(fields: Fields) -> Timing:

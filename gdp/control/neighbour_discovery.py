@@ -48,6 +48,7 @@ from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
 from gdp.control.identity_conflicts import IdentityConflicts
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.preshared_key import NO_KEY, PresharedKeyAgreement
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
@@ -120,6 +121,8 @@ class HelloProtocol:
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
         self._uplinks: dict[int, int] = {}  # of ports whose links share one
+        self._agreements: dict[int, PresharedKeyAgreement] = {}  # by the port of a tunnel
+        self._refused: Counter[DropReason] = Counter()  # messages of an agreement
         self._failed_s: dict[int, float] = {}  # by uplink: when a link over it failed alone
         self._is_probing = False  # some neighbour is
         self._polled: set[int] = set()  # ports at which a neighbour has polled us
@@ -161,6 +164,15 @@ class HelloProtocol:
     def set_uplink(self, index: int, uplink: int) -> None:
         """State which uplink carries the links of a port: ports of one uplink have an address in common."""
         self._uplinks[index] = uplink
+
+    def agree_on_key(self, index: int, peer: Name) -> None:
+        """Agree with a peer on the preshared key of a tunnel, whose port this is, whenever it is up."""
+        self._agreements[index] = PresharedKeyAgreement(self._identity.name, peer, self._random_bytes)
+
+    def preshared_key(self, index: int) -> bytes:
+        """Return the preshared key of a tunnel; ``NO_KEY`` unless its peer is up and has it, too."""
+        agreement = self._agreements.get(index)
+        return NO_KEY if agreement is None else agreement.key
 
     def probe_uplink(self, uplink: int, now_s: float, *, is_restarted: bool = True) -> None:
         """Poll all neighbours over an uplink whose address has changed; those that others outlive are lost soon.
@@ -267,8 +279,8 @@ class HelloProtocol:
 
     @property
     def drops(self) -> Counter[DropReason]:
-        """Return the unfinished hellos that were given up, by reason."""
-        return self._reassembler.drops + self._strangers_reassembler.drops
+        """Return the unfinished hellos and the messages about preshared keys that were given up, by reason."""
+        return self._reassembler.drops + self._strangers_reassembler.drops + self._refused
 
     @property
     def held_bytes(self) -> int:
@@ -372,6 +384,7 @@ class HelloProtocol:
         if is_two_way and known.keepalives is None:
             self._begin_keepalives(port, known, hello, now.mono_s)
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
+        self._agree(port, known, hello, now.mono_s)
         if change is None and is_new_session and is_two_way:
             return known, NeighbourState.GONE  # it restarted, and has lost the state that we sent it
         is_placed = (known.proof is not None) is not had_proof
@@ -567,6 +580,23 @@ class HelloProtocol:
         if uplink is not None and None not in (before, neighbour.observed) and before != neighbour.observed:
             self.probe_uplink(uplink, now_s, is_restarted=False)
 
+    def _agree(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        """Let the agreement on a tunnel's preshared key go on; it begins again when its peer is not up."""
+        agreement = self._agreements.get(port.index)
+        if agreement is None or agreement.peer != neighbour.name:
+            return
+        if neighbour.state is not NeighbourState.UP:
+            agreement.reset()
+            return
+        own, far = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
+        try:
+            has_news = agreement.receive(hello.preshared, own, far)
+        except StatementError as error:
+            self._refused[error.reason] += 1
+            return
+        if has_news:
+            port.hurry(max(now_s, port.said_s + ANSWER_S))
+
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
         """Process a keepalive; return the neighbour that sent it.
 
@@ -614,6 +644,7 @@ class HelloProtocol:
         self.ports.pop(index, None)
         self._timings.pop(index, None)
         self._uplinks.pop(index, None)
+        self._agreements.pop(index, None)
         self._reported_addresses.pop(index, None)
 
     def drop_silent(self, now_s: float) -> list[Change]:
@@ -806,6 +837,7 @@ class HelloProtocol:
         port.said_s, port.answer_at_s = now_s, float("inf")
         heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
+        agreement = self._agreements.get(port.index)
         hello = Hello(
             nonce=port.nonce,
             sequence=port.sequence,
@@ -828,6 +860,7 @@ class HelloProtocol:
                 for each in port.neighbours.values()
                 if each.name in port.observed and each.is_proven
             ),
+            preshared=b"" if agreement is None else agreement.message,
         )
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
@@ -843,6 +876,9 @@ class HelloProtocol:
         for neighbour in lost:
             del port.neighbours[neighbour.name], port.said_mtus[neighbour.name]
             port.observed.pop(neighbour.name, None)
+            agreement = self._agreements.get(port.index)
+            if agreement is not None and agreement.peer == neighbour.name:
+                agreement.reset()
             port.end(neighbour)
         return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
 

@@ -23,13 +23,14 @@ from cryptography.hazmat.primitives.asymmetric import x25519
 
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["KEM_PRIVATE_BYTES", "KEM_PUBLIC_BYTES", "KemPrivateKey", "KemPublicKey"]
+__all__ = ["KEM_PRIVATE_BYTES", "KEM_PUBLIC_BYTES", "SEALING_BYTES", "KemPrivateKey", "KemPublicKey"]
 
 _SEED_BYTES: Final = 64
 _MLKEM_PUBLIC_BYTES: Final = 1_184
 _X25519_BYTES: Final = 32
 KEM_PRIVATE_BYTES: Final = _SEED_BYTES + _X25519_BYTES
 KEM_PUBLIC_BYTES: Final = _MLKEM_PUBLIC_BYTES + _X25519_BYTES
+SEALING_BYTES: Final = 1_120 + 16  # of what is sealed above its secret
 _TOO_OLD: Final = "handing over topic secrets needs the package cryptography, version 48 or later, with ML-KEM"
 
 

@@ -124,6 +124,7 @@ class TunnelLinks:
             "direct": found.is_direct,
             "endpoint": None if found.endpoint is None else found.endpoint.to_text(),
             "handshake_age_s": age_s,
+            "preshared": found.is_preshared,
             "mtu": found.mtu,
             "up": neighbour is not None,
             "why": self._switch.tunnel_failure(tunnel.peer) if found.is_direct and neighbour is None else "",

@@ -18,6 +18,7 @@ from typing import Final
 from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
 from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
+from gdp.control.preshared_key import NO_KEY
 from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
@@ -57,6 +58,7 @@ class Tunnel:
         handshake_unix_s: of the last handshake; 0: there was none.
         is_direct: opened by decision of the switch, not by configuration.
         dialled_s: when a handshake was requested last.
+        preshared_unix_s: since when new handshakes have a preshared key; infinite: they have none.
     """
 
     ifname: str
@@ -71,6 +73,12 @@ class Tunnel:
     endpoint: Endpoint | None = None
     handshake_unix_s: float = 0.0
     dialled_s: float = float("-inf")
+    preshared_unix_s: float = float("inf")
+
+    @property
+    def is_preshared(self) -> bool:
+        """Return whether the present session of WireGuard has a preshared key."""
+        return self.handshake_unix_s > self.preshared_unix_s
 
 
 @contextlib.contextmanager
@@ -196,6 +204,7 @@ class Tunnels:
             self._remove(tunnel.uplink, ifname, key)
             return False
         self._switch.hello_protocol.set_uplink(port, tunnel.uplink)
+        self._switch.hello_protocol.agree_on_key(port, tunnel.peer)
         self._tunnels[tunnel] = Tunnel(
             ifname=ifname,
             inner=inner,
@@ -231,6 +240,7 @@ class Tunnels:
         found, device = self._tunnels[tunnel], self._underlays[tunnel.uplink]
         found.dialled_s = time.monotonic()
         try:
+            self._set_preshared(device, found)
             device.set_peer(found.key, inner=found.inner, endpoint=endpoint, keepalive_s=found.keepalive_s)
             device.retry_handshake(found.key)
         except LocalError as error:
@@ -290,6 +300,7 @@ class Tunnels:
 
     def handle_timer(self, now: Timestamps) -> list[TunnelId]:
         """Follow where WireGuard hears each peer, and the MTU of the paths; return tunnels with a new handshake."""
+        self._follow_preshared()
         is_device_due = now.mono_s >= self._device_due_s
         if is_device_due:
             self._device_due_s = now.mono_s + _DEVICE_PERIOD_S
@@ -310,6 +321,20 @@ class Tunnels:
             self._switch.hello_protocol.remove_port(self._closed.popleft()[1])
         answered, self._answered = self._answered, []
         return answered
+
+    def _follow_preshared(self) -> None:
+        """Let WireGuard have the preshared key that both ends have, and none from when the peer is lost."""
+        for tunnel, found in list(self._tunnels.items()):
+            try:
+                self._set_preshared(self._underlays[tunnel.uplink], found)
+            except LocalError as error:
+                log.error("no preshared key peer=%s reason=%s; the tunnel is made again", tunnel.peer.short, error)
+                self.close(tunnel, time.monotonic())
+
+    def _set_preshared(self, device: WireGuardDevice, found: Tunnel) -> None:
+        key = self._switch.hello_protocol.preshared_key(found.port)
+        if device.set_preshared_key(found.key, key):
+            found.preshared_unix_s = float("inf") if key == NO_KEY else time.time()
 
     def _has_unknown(self, uplink: int, now_s: float) -> bool:
         """Return whether WireGuard may soon know more: a handshake was requested, or a peer has just come up."""

@@ -51,6 +51,7 @@ class PeerChange:
         inner: the peer's inner IPv6 address, the only one that it may use; empty: as before.
         endpoint: None: as before.
         keepalive_s: seconds between keepalives; 0: none; None: as before. A packet leaves at once if it was 0.
+        preshared_key: 32 bytes, of which zeros mean none, from the next handshake on; empty: as before.
         is_removed: whether the peer is removed; nothing else applies then.
     """
 
@@ -58,6 +59,7 @@ class PeerChange:
     inner: str = ""
     endpoint: Endpoint | None = None
     keepalive_s: int | None = None
+    preshared_key: bytes = field(default=b"", repr=False)
     is_removed: bool = False
 
 

@@ -86,6 +86,8 @@ def peer_arguments(peer: PeerChange) -> dict[str, object]:
     arguments: dict[str, object] = {"public_key": b64encode(peer.public_key).decode()}
     if peer.is_removed:
         return {**arguments, "remove": True}
+    if peer.preshared_key:
+        arguments["preshared_key"] = b64encode(peer.preshared_key).decode()
     if peer.endpoint is not None:
         arguments |= {"endpoint_addr": peer.endpoint.address, "endpoint_port": peer.endpoint.port}
     if peer.keepalive_s is not None:

@@ -148,6 +148,8 @@ def _peer_lines(peer: PeerChange) -> list[str]:
     lines = [f"public_key={peer.public_key.hex()}"]
     if peer.is_removed:
         return [*lines, "remove=true"]
+    if peer.preshared_key:
+        lines.append(f"preshared_key={peer.preshared_key.hex()}")
     if peer.endpoint is not None:
         lines.append(f"endpoint={peer.endpoint.to_text()}")
     if peer.keepalive_s is not None:

@@ -15,7 +15,7 @@ import select
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from gdp.control.endpoints import Endpoint
@@ -60,6 +60,7 @@ class _Peer:
     inner: str
     endpoint: Endpoint | None
     keepalive_s: int
+    preshared_key: bytes = field(default=b"", repr=False)  # empty: never set
 
 
 class WireGuardDevice:
@@ -136,7 +137,7 @@ class WireGuardDevice:
         """
         before = self._peers.get(public_key)
         known = endpoint or (None if before is None else self._endpoint(public_key))
-        self._peers[public_key] = _Peer(inner, known, keepalive_s)
+        self._peers[public_key] = _Peer(inner, known, keepalive_s, b"" if before is None else before.preshared_key)
         change = PeerChange(public_key=public_key, inner=inner, endpoint=endpoint, keepalive_s=keepalive_s)
         try:
             self._apply(Change(peers=(change,)))
@@ -150,6 +151,22 @@ class WireGuardDevice:
         self._with_device(lambda device: add_route(device.ifindex, inner))
         if known is not None:
             self._routes.watch(known)
+
+    def set_preshared_key(self, public_key: bytes, preshared_key: bytes) -> bool:
+        """Set the preshared key of a peer, from its next handshake on; return whether it had another.
+
+        Args:
+            preshared_key: 32 bytes; zeros: none.
+
+        Raises:
+            LocalError: the device refuses.
+        """
+        peer = self._peers.get(public_key)
+        if peer is None or (peer.preshared_key or bytes(len(preshared_key))) == preshared_key:
+            return False
+        self._peers[public_key] = replace(peer, preshared_key=preshared_key)
+        self._apply(Change(peers=(PeerChange(public_key=public_key, preshared_key=preshared_key),)))
+        return True
 
     def remove_peer(self, public_key: bytes) -> None:
         """Remove a peer with its session and its route; does nothing if there is none."""
@@ -316,7 +333,11 @@ class WireGuardDevice:
         """Return the changes that make a peer and let it start a handshake."""
         peer = self._peers[public_key]
         made = PeerChange(
-            public_key=public_key, inner=peer.inner, endpoint=self._endpoint(public_key), keepalive_s=peer.keepalive_s
+            public_key=public_key,
+            inner=peer.inner,
+            endpoint=self._endpoint(public_key),
+            keepalive_s=peer.keepalive_s,
+            preshared_key=peer.preshared_key,
         )
         return (made,) if peer.keepalive_s else (made, *_kicked(public_key, 0))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
@@ -58,6 +60,11 @@ def hello_protocol(identity: Identity, salt: int, policy: Policy = POLICY) -> He
 def statement_of(frame: bytes) -> bytes:
     """Return the payload of a frame, without its padding."""
     return frame[HEADER_BYTES : HEADER_BYTES + decode(frame).length]
+
+
+def statement_of_frames(frames: Sequence[bytes]) -> bytes:
+    """Return the statement that several frames carry."""
+    return b"".join(map(statement_of, frames))
 
 
 def hello_in(statement: bytes, port: int = 0, mac: bytes = b"\x02far\x00\x00", padded_bytes: int = 0) -> ReceivedFrame:

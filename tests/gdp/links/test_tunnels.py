@@ -45,6 +45,9 @@ class Device:
     def poll_move(self) -> bool:
         return self.has_moved
 
+    def set_preshared_key(self, key: bytes, preshared_key: bytes) -> bool:
+        return False
+
 
 @dataclass
 class Loop:
