@@ -52,7 +52,7 @@ class PresharedKeyAgreement:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, because the other end is no neighbour any more."""
+        """Begin again, because the other end is no neighbour any more."""
         self.message, self.key = b"", NO_KEY
         self._private: KemPrivateKey | None = None
         self._received = b""  # the message that ours answers
@@ -80,11 +80,11 @@ class PresharedKeyAgreement:
         return self.message != before
 
     def _receive_at_first(self, message: bytes) -> None:
-        if self._agreed is None and self._private is not None:
+        if self._private is not None:
             if len(message) == _SEALED_BYTES:
                 self._agree(self._private.open(message, self._info), message)
-            return
-        if self._agreed is not None and message == self._agreed[2]:
+                self._private = None
+        elif self._agreed is not None and message == self._agreed[2]:
             self.key = self._agreed[0]
         elif self._agreed is None or self.key != NO_KEY or message != self._received:
             self.reset()
