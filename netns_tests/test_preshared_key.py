@@ -82,7 +82,7 @@ def pair(laboratory: Laboratory) -> Iterator[Pair]:
 
 
 @pytest.mark.parametrize("label", ["border", "robot"])
-def test_after_a_kill_of_one_end_frames_cross_again_and_both_have_a_new_key(pair: Pair, label: str) -> None:
+def test_a_tunnel_with_a_killed_end_works_again_with_a_new_key(pair: Pair, label: str) -> None:
     before = pair.key(pair.border)
     host = pair.border if label == "border" else pair.robot
     pair.overlay.kill_border(host)

@@ -29,7 +29,7 @@ def agreed() -> tuple[PresharedKeyAgreement, PresharedKeyAgreement, list[bytes]]
     return first, second, seen
 
 
-def test_n52_a_recorder_with_the_kept_keys_of_both_ends_does_not_open_the_preshared_key() -> None:
+def test_n52_kept_keys_open_no_preshared_key() -> None:
     first, second, seen = agreed()
     (sealed,) = {each for each in seen if KEM_PUBLIC_BYTES > len(each) > 1_000}
     for identity in ENDS:

@@ -186,6 +186,24 @@ def test_a_key_is_not_made_with_another_node_on_the_port(lab: Lab) -> None:
     assert lab.ends[1].preshared_key(0) == NO_KEY
 
 
+def test_a_hello_that_may_be_recorded_begins_no_agreement() -> None:
+    second, peer = hello_protocol(ENDS[1], 2), ENDS[0]
+    second.agree_on_key(0, peer.name)
+    hello = Hello(
+        nonce=b"n" * NONCE_BYTES,
+        sequence=1,
+        heard=(),  # it does not echo this session
+        mtu=1_500,
+        digest=bytes(8),
+        membership=peer.membership,
+        preshared=peer.kem.public.wire,
+    )
+    wire = hello.to_wire(peer.name, peer.key)
+    second.receive(hello_in(wire), parse(wire), at(0.0))
+    (transmit,) = second.hellos_to_send(1.0)
+    assert "p" not in parse(statement_of_frames(transmit.frames)).fields
+
+
 def test_hellos_of_other_ports_say_nothing_about_keys() -> None:
     hello = Hello(nonce=b"n" * NONCE_BYTES, sequence=1, heard=(), mtu=1_500, digest=bytes(8), membership=b"")
     assert "p" not in parse(hello.to_wire(ENDS[0].name, ENDS[0].key)).fields
