@@ -8,8 +8,11 @@ from typing import cast
 
 import pytest
 
+from gdp.control.preshared_key import NO_KEY
 from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import TunnelId
+from gdp.errors import LocalError
+from gdp.links import tunnels as tunnels_module
 from gdp.links.tunnels import Tunnel, Tunnels
 from gdp.names import Name
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
@@ -30,6 +33,8 @@ class Device:
     ifname: str = "wg"
     reads: int = 0
     has_moved: bool = False
+    preshared_key: bytes = NO_KEY
+    is_refusing: bool = False
 
     def peers(self) -> dict[bytes, PeerState]:
         self.reads += 1
@@ -46,7 +51,13 @@ class Device:
         return self.has_moved
 
     def set_preshared_key(self, key: bytes, preshared_key: bytes) -> bool:
-        return False
+        if self.is_refusing:
+            raise LocalError("refused")
+        is_new, self.preshared_key = self.preshared_key != preshared_key, preshared_key
+        return is_new
+
+    def remove_peer(self, key: bytes) -> None:
+        self.preshared_key = NO_KEY
 
 
 @dataclass
@@ -60,6 +71,9 @@ class Loop:
 
     def after_receive(self, look: Callable[[], None]) -> None:
         self.follow.append(look)
+
+    def remove_port(self, index: int) -> None:
+        """There is no port."""
 
 
 @dataclass
@@ -125,3 +139,27 @@ def test_states_are_read_at_once_when_a_peer_polls(bed: Bed) -> None:
 def test_frames_without_a_poll_cost_no_read(bed: Bed) -> None:
     bed.loop.follow[0]()
     assert bed.device.reads == 0
+
+
+def test_wireguard_has_the_key_while_both_ends_have_it_and_a_session_has_it_from_its_handshake_on(
+    bed: Bed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agreed = b"k" * 32
+    key = agreed
+    monkeypatch.setattr(bed.switch.hello_protocol, "preshared_key", lambda port: key if port == PORT else NO_KEY)
+    bed.look(1)
+    assert bed.device.preshared_key == agreed
+    assert not bed.tunnel.is_preshared  # the session is older than the key
+    bed.tunnel.handshake_unix_s = bed.tunnel.preshared_unix_s + 1
+    assert bed.tunnel.is_preshared
+    key = NO_KEY
+    bed.look(1)
+    assert bed.device.preshared_key == NO_KEY
+    assert not bed.tunnel.is_preshared
+
+
+def test_a_tunnel_whose_key_wireguard_refuses_is_closed(bed: Bed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tunnels_module, "remove_link", lambda *_: None)
+    bed.device.is_refusing = True
+    bed.look(1)
+    assert not bed.tunnels.all

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
+from base64 import b64decode, b64encode
 from typing import Any
 
 import pytest
@@ -74,3 +74,10 @@ def test_a_device_is_set_before_its_peers() -> None:
         {"peer": {"public_key": text, "remove": True}},
         {"peer": {"public_key": text, "persistent_keepalive": 0}},
     ]
+
+
+def test_a_preshared_key_survives_its_encoding() -> None:
+    (peer,) = decoded(PeerChange(public_key=KEY, preshared_key=KEY)).get_attr("WGDEVICE_A_PEERS")
+    assert b64decode(peer.get_attr("WGPEER_A_PRESHARED_KEY")) == KEY
+    (peer,) = decoded(PeerChange(public_key=KEY, keepalive_s=0)).get_attr("WGDEVICE_A_PEERS")
+    assert peer.get_attr("WGPEER_A_PRESHARED_KEY") is None

@@ -47,6 +47,13 @@ def test_a_removed_peer_has_no_other_line() -> None:
     assert text == f"set=1\npublic_key={KEY.hex()}\nremove=true\n\n"
 
 
+def test_a_preshared_key_is_written_only_when_it_changes() -> None:
+    changed = PeerChange(public_key=KEY, preshared_key=bytes(32))
+    assert f"preshared_key={'00' * 32}" in request_text(Change(peers=(changed,))).splitlines()
+    assert "preshared" not in request_text(Change(peers=(PeerChange(public_key=KEY),)))
+    assert "7777" not in repr(PeerChange(public_key=KEY, preshared_key=b"7" * 32))
+
+
 def test_a_key_is_not_shown() -> None:
     assert KEY.hex() not in repr(Change(private_key=KEY))
     assert repr(KEY) not in repr(Change(private_key=KEY))
