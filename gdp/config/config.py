@@ -153,7 +153,7 @@ class LinksConfig(Section):
         default=None, description="Directory of records, `*.endpoints`; each file is a tunnel, without a restart."
     )
     direct: bool = Field(default=True, description="Open direct tunnels to other members where both NATs allow it.")
-    backend: TunnelBackend = Field(default="auto", description="Which WireGuard; `auto`: the kernel's if it has one.")
+    backend: TunnelBackend = Field(default="auto", description="`auto`: the kernel's WireGuard, else `wireguard-go`.")
     keepalive_s: int = Field(
         default=25, ge=1, le=65_535, description="Seconds between WireGuard's keepalives to dialled peers."
     )
