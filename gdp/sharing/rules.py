@@ -114,6 +114,8 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
     for side, offer in used:
         if files.find(side, offer.kind, offer.ros_name) is None:
             more = _metadata(offer.more_metadata)
+            if offer.qos is not None and side == "import" and offer.kind == "topic":
+                more["offered"] = offer.qos.model_dump()
             lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, more))
     sides = [f"{side}:\n{''.join(rules)}" for side, rules in lines.items() if rules]
     return _HEAD + "".join(sides) if sides else None
