@@ -48,7 +48,7 @@ Values = Annotated[
 
 @app.callback()
 def _service() -> None:
-    """Keep ``call`` a command of its own: typer would run a single one without its name."""
+    """Call a service through the overlay, as a member."""  # a group: typer would run a single command without its name
 
 
 @app.command(
