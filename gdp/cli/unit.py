@@ -121,7 +121,7 @@ def status(directory: Whose = None, as_json: options.Json = False) -> None:
     show({"units": [{**asdict(each), "well": each.is_well} for each in states]}, as_json=as_json, plain=_table(states))
     if not all(each.is_well for each in states):
         first = next(each for each in states if not each.is_well)
-        say(f"gdp: {first.unit} is not well; its log: journalctl --unit={first.unit}")
+        say(f"error: {first.unit} is not well; its log: journalctl --unit={first.unit}")
         raise typer.Exit(_NOT_WELL)
 
 
@@ -131,7 +131,7 @@ def _folder(path: Path) -> Path:
 
 def _nothing_there(directory: Path | None) -> typer.Exit:
     of = "" if directory is None else f" for {directory}"
-    say(f"gdp: no unit is installed{of}; gdp unit install {directory or 'PATH'} makes them")
+    say(f"error: no unit is installed{of}; gdp unit install {directory or 'PATH'} makes them")
     return typer.Exit(_NOTHING)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
+from gdp.cli.version import versioned
 from gdp.names import Name
 from gdp.trust.right import Right
 from proxy.cli.node_options import Delegations, Iface
@@ -152,7 +153,7 @@ class _Call:
 
 def main() -> None:
     """Run the command."""
-    app(prog_name="gdp service")
+    versioned(app)(prog_name="gdp service")
 
 
 if __name__ == "__main__":
