@@ -17,6 +17,7 @@ from gdp.config.offered_qos import OfferedQos
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import SALT, Metadata
+from gdp.names import Name
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
@@ -30,9 +31,10 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["GROUPS", "RevocationsSink", "Sharing"]
+__all__ = ["GROUPS", "NOT_USED", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
+NOT_USED: Final = "not used"  # begins the state of an accepted offer that conflicts
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
@@ -209,19 +211,21 @@ class Sharing:
         return at.report
 
     def offers(self) -> list[tuple[Offer, str]]:
-        """Return the offers, each with its state: ``offered``, or if accepted ``used`` or ``not used``.
+        """Return the offers, each with its state: ``offered``, ``used``, or ``not used: `` and the reason.
 
         Raises:
             LocalError: a file is invalid.
         """
         state = self._folder.read_state()
         offers = list(self._folder.offers(state))
-        used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, [])]
-        accepted = [any(each.fits(name) for name in state.accepted) for each in offers]
-        return [
-            (each, ("used" if each in used else "not used") if is_accepted else "offered")
-            for each, is_accepted in zip(offers, accepted, strict=True)
-        ]
+        unused = dict[Name, str]()
+        used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, unused)]
+
+        def state_of(offer: Offer) -> str:
+            why = unused.get(offer.delegation.name)
+            return "used" if offer in used else "offered" if why is None else f"{NOT_USED}: {why}"
+
+        return [(each, state_of(each)) for each in offers]
 
     def state(self) -> ShareState:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""
@@ -271,7 +275,13 @@ class Sharing:
         Args:
             is_required: whether the proxy reloads in any case.
         """
-        used = list(usable(at.files, at.state, at.offers, at.report.problems))
+        unused = dict[Name, str]()
+        used = list(usable(at.files, at.state, at.offers, unused))
+        at.report.problems += [
+            f"{each.ros_name} from {each.sender}: {unused[each.delegation.name]}"
+            for each in at.offers
+            if each.delegation.name in unused
+        ]
         is_changed = is_required
         for offer in at.offers:
             file = at.files.delegations / f"{offer.delegation.name.to_text()}.delegation"
