@@ -57,7 +57,7 @@ for each in gdp gdp-switch gdp-rib gdp-relay gdp-proxy gdp-replay fog; do
 done
 gdp lab robot --iface lo --json > /dev/null
 gdp-switch --config robot/switch.yaml --check
-gdp service install robot --dry-run | grep ExecStart
+gdp unit install robot --dry-run | grep ExecStart
 ls /lib/systemd/system/gdp-*.service
 dpkg --audit
 rm -r robot lab owner

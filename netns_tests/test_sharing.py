@@ -48,6 +48,11 @@ def tick():
             out.publish(String(data=f'{said[topic]} {time.time()}'))
             said[topic] += 1
 timer = node.create_timer(0.005, tick)
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+latched = node.create_publisher(
+    String, '/robot_description', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+latched.publish(String(data='a robot'))
+clock = node.create_publisher(String, '/clock', QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
 """
 _LISTENER = """
 from std_msgs.msg import String
@@ -55,6 +60,20 @@ reads, got = {}, {}
 def read(topic):
     got[topic] = []
     reads[topic] = node.create_subscription(String, topic, lambda m: got[topic].append(m.data), 1000)
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile
+incompatible = []
+def read_latched(topic):
+    got[topic] = []
+    reads[topic] = node.create_subscription(
+        String, topic, lambda m: got[topic].append(m.data),
+        QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda event: incompatible.append(topic)))
+def offered(topic):
+    return [
+        (i.qos_profile.reliability.name, i.qos_profile.durability.name)
+        for i in node.get_publishers_info_by_topic(topic)
+    ]
 """
 
 
@@ -195,3 +214,17 @@ def test_topics_are_shared_and_taken_back_while_another_flows_without_a_loss(sit
     site.until_heard("/steady", len(site.heard("/steady")) + 100)
     numbers = [number for number, _ in site.heard("/steady")]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_the_far_graph_shows_a_publishers_qos_before_any_reader_and_the_first_latched_one_matches(site: Site) -> None:
+    for topic, qos in (
+        ("/robot_description", ("RELIABLE", "TRANSIENT_LOCAL")),
+        ("/clock", ("BEST_EFFORT", "VOLATILE")),
+    ):
+        assert site.gdp("import", "server", topic, "--from", "robot")["is_running"] is True
+        assert site.gdp("expose", "robot", topic, "--to", "server", "--wait", str(PATIENCE_S))["delegated"]
+        assert site.gdp("share", "server", "--renew")["problems"] == []
+        site.listener.waits_for(f"offered('{topic}')", [list(qos)])
+    site.listener.tell("!read_latched('/robot_description')")
+    site.listener.waits_for("got['/robot_description']", ["a robot"])
+    assert site.listener.tell("incompatible") == []

@@ -128,7 +128,7 @@ def test_a_program_that_ends_comes_back_and_the_exit_code_names_the_failure(up: 
     up.wait_for(r"program ended program=rib code=-9 pause_s=0\.2")
     up.wait_for(r"^rib    \| RIB .* is up", count=2)
     assert up.end() == 1
-    assert up.lines[-1] == "gdp: failed: rib; the log has their last words"
+    assert up.lines[-1] == "error: failed: rib; the log has their last words"
 
 
 def test_a_wrong_configuration_starts_nothing(lab: Path) -> None:

@@ -18,7 +18,7 @@ from fog.host.agent import MachineAgent
 from fog.host.bundle import JOIN_FILE, TICKET_FILE
 from gdp.cli.completion import allow_completion
 from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, emit, failing_clearly, set_up_logging
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.terminal import echo
 
 __all__ = ["main"]
@@ -93,7 +93,7 @@ def _become_member(home: Path) -> str:
 def main() -> None:
     """Run the command."""
     allow_completion("fog-machine")
-    app(prog_name="fog-machine")
+    versioned(app)(prog_name="fog-machine")
 
 
 if __name__ == "__main__":

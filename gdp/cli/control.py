@@ -105,7 +105,7 @@ def _run(
         _fail(f"{path}: {last.error}", _FAILED, as_json=as_json)
     show(last.result if as_json else _flat(last.result, has_zeros=has_zeros), as_json=as_json)
     if last.result.get("complete") is False:
-        echo(f"gdp: {path}: the node ended with unfinished work", err=True)
+        echo(f"error: {path}: the node ended with unfinished work", err=True)
         raise typer.Exit(_FAILED)
 
 
@@ -124,5 +124,5 @@ def _flat(fields: Mapping[str, object], *, has_zeros: bool) -> dict[str, object]
 def _fail(reason: str, code: int, *, as_json: bool) -> None:
     if as_json:
         echo(json.dumps({"error": reason}))
-    echo(f"gdp: {reason}", err=True)
+    echo(f"error: {reason}", err=True)
     raise typer.Exit(code)

@@ -1,6 +1,6 @@
 """Commands of other packages under ``gdp``, loaded through their entry points when they run.
 
-I/O. The first five are shown and run where ``proxy`` or an extra is not installed: the error says which.
+I/O. The first six are shown and run where ``proxy`` or an extra is not installed: the error says which.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import typer
 
 from gdp.cli.extension import load_command
 
-__all__ = ["foxglove", "recording", "rosbridge", "rule", "rules_of_proxies", "suggest_rules", "watch"]
+__all__ = ["foxglove", "recording", "rosbridge", "rule", "rules_of_proxies", "service", "suggest_rules", "watch"]
 
 
 def foxglove() -> None:
@@ -32,6 +32,11 @@ def recording() -> None:
 def rule() -> None:
     """Add, remove and list rules of a proxy while it runs."""
     load_command("rule")
+
+
+def service() -> None:
+    """Call a service through the overlay, as a member."""
+    load_command("service")
 
 
 def watch() -> None:

@@ -21,7 +21,7 @@ from gdp.terminal import echo
 
 __all__ = ["app", "main"]
 
-_DOORS: Final = ("foxglove", "rosbridge", "recording", "rule", "watch")  # of the package proxy
+_DOORS: Final = ("foxglove", "rosbridge", "recording", "rule", "service", "watch")  # of the package proxy
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
@@ -57,7 +57,7 @@ _KNOWN: Final = {
     "delegate": LazyCommand("gdp.cli.delegate:app"),
     "audit": LazyCommand("gdp.cli.audit:app"),
     "topic": LazyCommand("gdp.cli.topic:app"),
-    "service": LazyCommand("gdp.cli.service:app"),
+    "unit": LazyCommand("gdp.cli.unit:app"),
     "rib": LazyCommand("gdp.cli.rib_lookup:app"),
 }
 

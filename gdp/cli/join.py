@@ -129,7 +129,7 @@ def up(
     """Start the programs of a machine: switch, RIB where it has one, and proxy.
 
     A machine that joined or created a domain starts as systemd units, or in the foreground. Nodes that were configured
-    by hand, in machine.yaml or in files of their own, run in the foreground until Ctrl-C; gdp service install makes
+    by hand, in machine.yaml or in files of their own, run in the foreground until Ctrl-C; gdp unit install makes
     units. What ends is restarted, with growing pauses. The log is one, and each line begins with its program. The exit
     code is 1 if a program has failed. Without a proxy.yaml, the first start looks at the ROS graph, and writes one with
     a commented rule for each name.

@@ -94,7 +94,7 @@ def run_programs(programs: Sequence[MachineProgram], started: Callable[[], Await
         asyncio.run(interruptible(supervise(programs, started, failures)))
     except Interrupted:
         if failures.names:
-            say(f"gdp: failed: {', '.join(sorted(failures.names))}; the log has their last words")
+            say(f"error: failed: {', '.join(sorted(failures.names))}; the log has their last words")
         sys.exit(1 if failures.names else 0)
 
 

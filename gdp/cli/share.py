@@ -1,6 +1,6 @@
 """``gdp expose``, ``gdp import`` and ``gdp share``: names that the nodes of a domain share, on live proxies.
 
-I/O. Exit codes: 0 done, 2 wrong input; then nothing has changed.
+I/O. Exit codes: 0 done, 1 some of it is not in force, 2 wrong input; then nothing has changed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gdp.sharing.proxy_files import ProxyFiles, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.revocations import publish_revocations
 from gdp.sharing.rules import kind_from_text
-from gdp.sharing.sharing import Sharing
+from gdp.sharing.sharing import NOT_USED, Sharing
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, load_card, load_owner
@@ -41,6 +41,11 @@ _PROXY_FILE: Final = "proxy.yaml"
 _SWITCH_FILE: Final = "switch.yaml"
 _OWNER: Final = "owner"
 _POLL_S: Final = 0.1
+_PARTLY: Final = 1
+_WAITS: Final = "waits for delivery"
+_NOT_IN_FORCE: Final = (NOT_USED, _WAITS)  # states begin so
+_ISSUED_COLUMNS: Final = ("name", "type", "node", "rights", "until", "state")
+_OFFER_COLUMNS: Final = ("name", "type", "from", "rights", "until", "state")
 
 # typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 AnyName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**.")]
@@ -196,7 +201,7 @@ def import_names(
             offers = [_offer_fields(*each) for each in sharing.offers()]
             accepted = [each.model_dump() for each in sharing.state().accepted]
             fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
-            show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "state")))
+            show(fields, as_json=as_json, plain=_table(offers, _OFFER_COLUMNS))
         elif name is None:
             raise LocalError("import: state a NAME, or --list")
         elif remove:
@@ -245,7 +250,7 @@ def share(
             state = sharing.state()
             issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
             fields = {"exposed": _exposed_fields(state), "shared": issued}
-            show(fields, as_json=as_json, plain=_table(issued, ("name", "type", "node", "rights", "until", "state")))
+            show(fields, as_json=as_json, plain=_table(issued, _ISSUED_COLUMNS))
             return
         if renew:
             _show_change("all", sharing.work(time.time()), as_json=as_json)
@@ -337,7 +342,8 @@ def _show_change(
 ) -> None:
     """Print what a change did; problems go to stderr."""
     delegated = [_issued_fields(each) for each in report.granted]
-    given = {} if offers is None else {"offers": [_offer_fields(*each) for each in offers]}
+    taken = [_offer_fields(*each) for each in offers or ()]
+    given = {} if offers is None else {"offers": taken}
     applied = {True: "now", False: "at the next start of the proxy", None: "nothing to apply"}[report.is_running]
     if awaited and not delegated and not offers and report.is_running is not False:
         applied = awaited
@@ -349,19 +355,21 @@ def _show_change(
         "delegated": delegated,
         "problems": report.problems,
     }
-    lines = [f"{name}: {applied}"]
-    lines += [f"  {each['name']} [{each['type']}] to {each['node']} until {each['until']}" for each in delegated]
-    for each, state in offers or ():
-        more = "" if state == "used" else f": {state}"
-        lines.append(f"  {each.ros_name} [{each.type_name}] from {each.sender}{more}")
-    show(fields, as_json=as_json, plain="\n".join(lines))
+    tables = [_table(delegated, _ISSUED_COLUMNS)] if delegated else []
+    tables += [_table(taken, _OFFER_COLUMNS)] if taken else []
+    show(fields, as_json=as_json, plain="\n".join([f"{name}: {applied}", *tables]))
+    lacking = [str(each["state"]) for each in (*delegated, *taken) if str(each["state"]).startswith(_NOT_IN_FORCE)]
     for text in report.problems:
-        echo(f"gdp: {text}", err=True)
+        if not any(text.endswith(state.removeprefix(f"{NOT_USED}: ")) for state in lacking):
+            echo(f"gdp: {text}", err=True)
+    if lacking:
+        echo(f"error: {name}: {len(lacking)} of the names above are not in force", err=True)
+        raise typer.Exit(_PARTLY)
 
 
 def _issued_fields(issued: IssuedDelegation) -> dict[str, object]:
     meaning = issued.metadata
-    state = "revoked" if issued.is_revoked else "delivered" if issued.is_delivered else "waits for delivery"
+    state = "revoked" if issued.is_revoked else "delivered" if issued.is_delivered else _WAITS
     return {
         "kind": meaning["kind"],
         "name": meaning["name"],

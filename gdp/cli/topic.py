@@ -125,7 +125,7 @@ def info(
     """
     rows = [row for row in _measured(seconds, socket, node, is_host=host) if _fits(row, name, type_name)]
     if not rows:
-        echo(f"gdp: {name}: no running node of this machine knows it; 'gdp topic list --all' shows all", err=True)
+        echo(f"error: {name}: no running node of this machine knows it; 'gdp topic list --all' shows all", err=True)
         raise typer.Exit(_UNKNOWN)
     for at, row in enumerate(rows):
         if at and not as_json:
@@ -153,7 +153,9 @@ def answers_of(sockets: Sequence[Path], *, is_host: bool, is_needed: bool = True
 
 def none_runs() -> typer.Exit:
     """Report that no node runs that could answer; return the end of the command, with exit code 3."""
-    echo("gdp: no switch or proxy runs on this machine, as far as this user may see; start one, or use sudo", err=True)
+    echo(
+        "error: no switch or proxy runs on this machine, as far as this user may see; start one, or use sudo", err=True
+    )
     return typer.Exit(_NOT_RUNNING)
 
 

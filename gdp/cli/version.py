@@ -1,4 +1,4 @@
-"""Options ``--version`` and ``-h`` of every command and sub-command, and the form of its help.
+"""Options ``--version`` and ``-h`` of every command and sub-command, and the form of its help and of usage errors.
 
 I/O.
 """
@@ -6,7 +6,9 @@ I/O.
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Annotated, Any, Final
 
 import typer
@@ -17,6 +19,8 @@ from gdp.terminal import echo
 
 __all__ = ["HELP", "Version", "versioned", "with_version"]
 
+_SHOULD_BE: Final = "Input should be "  # prefix of pydantic, which some versions of the library use
+_USAGE_ERROR: Final[Any] = typer.BadParameter.__mro__[2]  # ClickException, whose module differs among versions
 HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-commands inherit them
 
 
@@ -32,8 +36,29 @@ Version = Annotated[
 
 
 def versioned(app: typer.Typer) -> Callable[..., Any]:
-    """Return the command of an application, with the option ``--version`` on every sub-command."""
-    return with_version(get_command(app))
+    """Return the command of an application, with the option ``--version`` on every sub-command.
+
+    A usage error is printed as every other error is, and ends the command with exit code 2.
+    """
+    command = with_version(get_command(app))
+    command.main = partial(_run, command.main)  # type: ignore[attr-defined]
+    return command
+
+
+def _run(main: Callable[..., Any], *arguments: Any, **settings: Any) -> None:
+    """Run a command and exit with its code."""
+    try:
+        code = main(*arguments, **settings, standalone_mode=False)
+    except _USAGE_ERROR as error:
+        if type(error).__name__ != "NoArgsIsHelpError":  # that one has printed the help
+            echo(f"error: {error.format_message().replace(_SHOULD_BE, 'expected ')}", err=True)
+            if (context := getattr(error, "ctx", None)) is not None:
+                echo(f"Try '{context.command_path} -h' for help.", err=True)
+        code = error.exit_code
+    except typer.Abort:
+        echo("error: aborted", err=True)
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def with_version(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -57,7 +57,7 @@ class UnitState:
 
 
 def known_units(directory: Path | None = None) -> list[str]:
-    """Return the units that ``gdp service`` wrote, and without a directory also enabled ones of a package."""
+    """Return the units that ``gdp unit`` wrote, and without a directory also enabled ones of a package."""
     found = installed_units(directory)
     if directory is None:
         found += [each.name for each in sorted(_PACKAGED.glob("gdp-*.service")) if _is_enabled(each.name)]

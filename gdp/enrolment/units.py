@@ -28,7 +28,9 @@ __all__ = [
     "unit_names",
 ]
 
-MARK: Final = "# gdp service: "  # begins the first line of each unit that is written here; then the machine's folder
+MARK: Final = (
+    "# gdp service: "  # begins the first line of each unit, in earlier versions too; then the machine's folder
+)
 UNIT_FOLDER: Final = Path("/etc/systemd/system")
 _RUNNING: Final = Path("/run/systemd/system")  # sd_booted(3)
 _TIMEOUT_S: Final = 120.0  # a node has 90 s to report that it is up

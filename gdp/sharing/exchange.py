@@ -22,10 +22,11 @@ __all__ = ["Exchange", "Mail", "MailKind", "load_groups", "proxies_of", "resolve
 
 
 class MailKind(str, Enum):
-    """Kind of a mail between the parties of a delegation."""
+    """Kind of a mail between the parties of a delegation; QoS comes after the delegation of its topic."""
 
     DELEGATION = "share"
     REVOCATION = "share-revocation"
+    QOS = "share-qos"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.config.offered_qos import OfferedQos
 from gdp.crypto.certificates import Root
 from gdp.errors import GdpError
 from gdp.metadata import SALT, Metadata
@@ -155,10 +156,13 @@ class Grants:
         self.report.granted.append(issued)
         return issued
 
-    def renew(self, owners: Iterable[IssuedStore]) -> None:
+    def renew(self, owners: Iterable[IssuedStore], qos: Mapping[Name, OfferedQos]) -> None:
         """Renew delegations after two thirds of their life, grant tomorrow's epoch, and deliver what waits.
 
         A node that has left the domain gets nothing.
+
+        Args:
+            qos: of the topics that the live proxy exposes; nodes that may read one learn what is new of it.
         """
         for store in owners:
             issued_of, held = list(store), defaultdict[Name, set[int]](set)
@@ -167,6 +171,7 @@ class Grants:
             for issued in issued_of:
                 try:
                     self._renew(store, issued, held[issued.delegation.name])
+                    self._send_qos(store, issued, qos)
                 except GdpError as error:
                     self.report.problems.append(
                         f"the delegation of {issued.metadata['name']} to {issued.label} is not renewed: {error}"
@@ -189,6 +194,21 @@ class Grants:
             self.deliver(store, store.rotate(issued, present, epochs))
         elif not issued.is_delivered:
             self.deliver(store, issued)
+
+    def _send_qos(self, store: IssuedStore, issued: IssuedDelegation, offered: Mapping[Name, OfferedQos]) -> None:
+        """Tell a node that reads a topic its QoS, where that is new to it; what fails is reported."""
+        name = issued.delegation.name
+        qos, is_reader = offered.get(name), not issued.is_own and Right.READ in issued.delegation.rights
+        if qos is None or qos == issued.qos or not is_reader:
+            return
+        latest = store.find(name, issued.descriptor.name)  # a renewal may have written another
+        if latest is None or not latest.is_delivered or latest.is_revoked:
+            return
+        try:
+            self.exchange.send(issued.descriptor.name, MailKind.QOS.value, qos.to_wire(name))
+            store.save(latest.model_copy(update={"qos": qos}))
+        except GdpError as error:
+            self.report.add_problem(error)
 
     def _has_daily_epochs(self, metadata: Metadata) -> bool:
         """Return whether a name gets them; holders of a plain one may have delegations that a person wrote."""

@@ -14,6 +14,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
+from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, first_fault
 from gdp.errors import LocalError
 from gdp.limits import CLOCK_SKEW_S
@@ -52,6 +53,7 @@ class IssuedDelegation(Section):
         is_own: whether the node is the proxy of this machine.
         is_delivered: whether it was installed here, or left in the node's mailbox.
         is_revoked: whether the owner took it back.
+        qos: of the topic, as last sent to the node; None: not yet.
     """
 
     label: str
@@ -65,6 +67,7 @@ class IssuedDelegation(Section):
     is_own: bool = False
     is_delivered: bool = False
     is_revoked: bool = False
+    qos: OfferedQos | None = None
 
     @property
     def delegation(self) -> Delegation:

@@ -7,11 +7,12 @@ rules when it reloads. If it refuses them, the earlier drop-in is restored.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from gdp.config.drop_in import drop_in_directory, read_drop_in, write_drop_in
+from gdp.config.offered_qos import OfferedQos
 from gdp.config.yaml_source import Plain, YamlSource, read_yaml
 from gdp.errors import ConfigError, LocalError
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
@@ -19,12 +20,13 @@ from gdp.names import Name
 from gdp.ros_names import is_name, matches
 from gdp.state.control_protocol import Command
 
-__all__ = ["ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
+__all__ = ["LiveNames", "ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
 
 Side: TypeAlias = Literal["expose", "import"]
 
 DROP_IN: Final = "gdp-share.yaml"
 _ANSWER_S: Final = 10.0
+_OTHER_FORMAT: Final = "the proxy reports its names in another format; restart it with this version"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +66,14 @@ class Undelegated:
     shared: str
     type_name: str
     name: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveNames:
+    """Names in the status of a live proxy: those that lack a delegation, and the QoS that exposed topics offer."""
+
+    undelegated: Sequence[Undelegated] = ()
+    qos: Mapping[Name, OfferedQos] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,8 +175,8 @@ class ProxyFiles:
             raise LocalError(f"the proxy refused the change: {answer.error}")
         return True
 
-    def undelegated(self) -> list[Undelegated] | None:
-        """Return what the live proxy lacks a delegation for; None if it does not run.
+    def live_names(self) -> LiveNames:
+        """Return the names that the live proxy reports; none if it does not run.
 
         Raises:
             LocalError: it does not answer, or answers in another format.
@@ -174,11 +184,11 @@ class ProxyFiles:
         try:
             answer = ask_node(self._socket(), Command.STATUS, _ANSWER_S)
         except NotRunningError:
-            return None
-        listed = answer.result.get("undelegated", [])
-        if not isinstance(listed, list):
-            raise LocalError("the proxy reports its names in another format; restart it with this version")
-        return [_undelegated(each) for each in listed]
+            return LiveNames()
+        listed, qos = (answer.result.get(key, []) for key in ("undelegated", "qos"))
+        if not isinstance(listed, list) or not isinstance(qos, list):
+            raise LocalError(_OTHER_FORMAT)
+        return LiveNames(undelegated=[_undelegated(each) for each in listed], qos=dict(map(_qos, qos)))
 
     def _socket(self) -> Path:
         return self.control_socket or find_control_socket(self.identity)
@@ -201,7 +211,14 @@ def _undelegated(fields: object) -> Undelegated:
         }:  # fmt: skip
             found = Name.from_text(name)
             return Undelegated(side=side, kind=kind, local=local, shared=shared, type_name=type_name, name=found)
-    raise LocalError("the proxy reports its names in another format; restart it with this version")
+    raise LocalError(_OTHER_FORMAT)
+
+
+def _qos(fields: object) -> tuple[Name, OfferedQos]:
+    match fields:
+        case {"name": str(name), **policies}:
+            return Name.from_text(name), OfferedQos.from_fields({str(key): value for key, value in policies.items()})
+    raise LocalError(_OTHER_FORMAT)
 
 
 def _path(source: YamlSource, key: str, value: Plain) -> Path:

@@ -13,6 +13,7 @@ from typing import Final
 
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError
+from gdp.names import Name
 from gdp.ros_names import TYPE_FORMS, Kind, fits_kind, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles, Side
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder
@@ -82,9 +83,9 @@ def check_accepted(files: ProxyFiles, state: ShareState, offers: Sequence[Offer]
 
 
 def usable(
-    files: ProxyFiles, state: ShareState, offers: Sequence[Offer], problems: list[str]
+    files: ProxyFiles, state: ShareState, offers: Sequence[Offer], unused: dict[Name, str]
 ) -> Iterator[tuple[Side, Offer]]:
-    """Yield the accepted offers with their side; ``problems`` gets a text for each that cannot be used."""
+    """Yield the accepted offers with their side; ``unused`` gets the reason of each that cannot be used."""
     taken = set[tuple[str, str]]()
     for offer in offers:
         key = (offer.kind, offer.ros_name)
@@ -92,12 +93,12 @@ def usable(
         for side in sides:
             if key in taken:
                 why = f"another owner's {offer.ros_name} is in use; state prefix: in the proxy.yaml of {offer.sender}"
-                problems.append(f"{offer.ros_name} from {offer.sender}: {why}")
+                unused[offer.delegation.name] = why
                 continue
             try:
                 _refuse_direction(files, state, (), side, *key)
             except LocalError as error:
-                problems.append(f"{offer.ros_name} from {offer.sender}: {error}")
+                unused[offer.delegation.name] = str(error)
                 continue
             yield side, offer
         if sides:
@@ -114,6 +115,8 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
     for side, offer in used:
         if files.find(side, offer.kind, offer.ros_name) is None:
             more = _metadata(offer.more_metadata)
+            if offer.qos is not None and side == "import" and offer.kind == "topic":
+                more["offered"] = offer.qos.model_dump()
             lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, more))
     sides = [f"{side}:\n{''.join(rules)}" for side, rules in lines.items() if rules]
     return _HEAD + "".join(sides) if sides else None

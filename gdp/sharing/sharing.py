@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from gdp.config.drop_in import locked, read_drop_in
+from gdp.config.offered_qos import OfferedQos
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import SALT, Metadata
+from gdp.names import Name
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
-from gdp.sharing.proxy_files import ProxyFiles, Side, StatedRule, fits
+from gdp.sharing.proxy_files import LiveNames, ProxyFiles, Side, StatedRule, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.rules import check_accepted, check_exposed, check_name, kind_from_text, render, usable
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder, links_of
@@ -29,9 +31,10 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["GROUPS", "RevocationsSink", "Sharing"]
+__all__ = ["GROUPS", "NOT_USED", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
+NOT_USED: Final = "not used"  # begins the state of an accepted offer that conflicts
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
@@ -44,6 +47,7 @@ class _Pass:
     state: ShareState
     offers: list[Offer]
     grants: Grants
+    live: LiveNames = field(default_factory=LiveNames)
     report: ShareReport = field(default_factory=ShareReport)
 
 
@@ -92,6 +96,7 @@ class Sharing:
             at.state = at.state.model_copy(update={"exposed": (*kept, wanted)})
             self._apply(at, is_required=True)
             self._grant(at, restored=added)
+            self._renew(at)
         return at.report
 
     def stop_exposing(self, kind: str, name: str, unix_s: float) -> ShareReport:
@@ -206,19 +211,21 @@ class Sharing:
         return at.report
 
     def offers(self) -> list[tuple[Offer, str]]:
-        """Return the offers, each with its state: ``offered``, or if accepted ``used`` or ``not used``.
+        """Return the offers, each with its state: ``offered``, ``used``, or ``not used: `` and the reason.
 
         Raises:
             LocalError: a file is invalid.
         """
         state = self._folder.read_state()
         offers = list(self._folder.offers(state))
-        used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, [])]
-        accepted = [any(each.fits(name) for name in state.accepted) for each in offers]
-        return [
-            (each, ("used" if each in used else "not used") if is_accepted else "offered")
-            for each, is_accepted in zip(offers, accepted, strict=True)
-        ]
+        unused = dict[Name, str]()
+        used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, unused)]
+
+        def state_of(offer: Offer) -> str:
+            why = unused.get(offer.delegation.name)
+            return "used" if offer in used else "offered" if why is None else f"{NOT_USED}: {why}"
+
+        return [(each, state_of(each)) for each in offers]
 
     def state(self) -> ShareState:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""
@@ -250,7 +257,7 @@ class Sharing:
                 report=report,
             )
             state = self._folder.read_state()
-            at = _Pass(files, state, list(self._folder.offers(state)), grants, report)
+            at = _Pass(files, state, list(self._folder.offers(state)), grants, report=report)
             yield at
             if at.state != state:
                 self._folder.save(at.state)
@@ -268,7 +275,13 @@ class Sharing:
         Args:
             is_required: whether the proxy reloads in any case.
         """
-        used = list(usable(at.files, at.state, at.offers, at.report.problems))
+        unused = dict[Name, str]()
+        used = list(usable(at.files, at.state, at.offers, unused))
+        at.report.problems += [
+            f"{each.ros_name} from {each.sender}: {unused[each.delegation.name]}"
+            for each in at.offers
+            if each.delegation.name in unused
+        ]
         is_changed = is_required
         for offer in at.offers:
             file = at.files.delegations / f"{offer.delegation.name.to_text()}.delegation"
@@ -285,13 +298,15 @@ class Sharing:
             at.report.is_running = at.files.replace_rules(text)
 
     def _grant(self, at: _Pass, restored: Sequence[str] | dict[str, NodeDescriptor] = ()) -> None:
+        if at.state.exposed or self._owners:
+            at.live = at.files.live_names()
         if at.state.exposed:
-            at.grants.grant_exposed(at.state, at.files.undelegated() or (), restored)
+            at.grants.grant_exposed(at.state, at.live.undelegated, restored)
         self._reload_changed(at)
 
     def _renew(self, at: _Pass) -> None:
         folders = dict.fromkeys([*(each.owner for each in at.state.exposed), *self._owners])
-        at.grants.renew([IssuedStore(folder) for folder in folders])
+        at.grants.renew([IssuedStore(folder) for folder in folders], at.live.qos)
         self._reload_changed(at)
 
     def _reload_changed(self, at: _Pass) -> None:
@@ -347,6 +362,10 @@ class Sharing:
                     self._take_delegation(at, mail)
                 elif mail.kind == MailKind.REVOCATION.value:
                     self._take_revocation(at, mail)
+                elif mail.kind == MailKind.QOS.value:
+                    name, qos = OfferedQos.from_wire(mail.data)
+                    at.state = self._folder.set_qos(at.state, name, mail.sender, qos)
+                    at.offers = list(self._folder.offers(at.state))
             except GdpError as error:
                 at.report.problems.append(f"mail from {mail.sender} is not taken: {error}")
             self._folder.save(at.state)  # before the mail is removed

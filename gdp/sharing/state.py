@@ -16,6 +16,7 @@ from typing import Final, Literal
 
 from pydantic import Field, ValidationError
 
+from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, first_fault
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
@@ -92,11 +93,12 @@ class AcceptedName(Section):
 
 
 class OfferSource(Section):
-    """Sender of an offer, its number in the order of arrival, and the second at which it came first."""
+    """Sender of an offer, its number in the order of arrival, when it came first, and the topic's QoS."""
 
     sender: str
     number: int
     received_unix_s: float
+    qos: OfferedQos | None = None
 
 
 class ShareState(Section):
@@ -114,6 +116,7 @@ class Offer:
     delegation: Delegation
     sender: str
     received_unix_s: float
+    qos: OfferedQos | None = None
 
     @property
     def kind(self) -> str:
@@ -195,8 +198,8 @@ class StateFolder:
         for name, source in sorted(state.offers.items(), key=lambda item: item[1].number):
             file = self.folder / _OFFERS / f"{name}.delegation"
             if file.exists():
-                sender, received_unix_s = source.sender, source.received_unix_s
-                yield Offer(delegation=load_delegation(file), sender=sender, received_unix_s=received_unix_s)
+                stated = source.model_dump(include={"sender", "received_unix_s"})
+                yield Offer(delegation=load_delegation(file), qos=source.qos, **stated)
 
     def save_offer(self, state: ShareState, delegation: Delegation, sender: str, unix_s: float) -> ShareState:
         """Store an offer, in place of an earlier one of the same name; return the state that lists it.
@@ -215,6 +218,14 @@ class StateFolder:
         number = max((each.number for each in state.offers.values()), default=0) + 1
         first = before or OfferSource(sender=sender, number=number, received_unix_s=unix_s)
         return state.model_copy(update={"offers": {**state.offers, name: first}})
+
+    def set_qos(self, state: ShareState, name: Name, sender: str, qos: OfferedQos) -> ShareState:
+        """Return the state with the QoS of an offer. Raises ``LocalError``: the sender has not offered the name."""
+        text = name.to_text()
+        source = state.offers.get(text)
+        if source is None or source.sender != sender:
+            raise LocalError(f"QoS of {name.short}, which {sender} has not offered")
+        return state.model_copy(update={"offers": {**state.offers, text: source.model_copy(update={"qos": qos})}})
 
     def remove_offer(self, state: ShareState, name: Name) -> ShareState:
         """Remove an offer; return the state without it."""

@@ -22,6 +22,7 @@ from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.exposed_service import ExposedService
@@ -36,6 +37,7 @@ from proxy.bridge.status_topic import StatusTopic, open_status_topics
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphEntity, Role, RosEndpoint, proxy_node_name
+from proxy.serial.channel import Qos
 
 __all__ = ["Bridge", "BridgeRules", "FlowChange"]
 
@@ -233,6 +235,15 @@ class Bridge:
         return [flow_spec for key, flow_spec in self._undelegated.items() if key in self._failed]
 
     @property
+    def offered_qos(self) -> list[tuple[FlowSpec, Qos]]:
+        """Return the QoS of the live topics that are exposed, or only lack a delegation for it; unknown ones miss."""
+        found = [(spec, flow.profile) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
+        lacking = [spec for spec in self.undelegated if spec.is_exposed and spec.rule.kind == "topic"]
+        for view in [_View(graph, self._me) for graph in self.graphs()] if lacking else ():
+            found += [(spec, LiveQos(spec.rule, view.ends(Role.PUBLISHES, spec)).profile) for spec in lacking]
+        return [(spec, profile) for spec, profile in found if profile is not None]
+
+    @property
     def denied(self) -> list[DeniedName]:
         """Return the local names that rules are about, and that ``deny`` keeps local."""
         found = list[DeniedName]()
@@ -418,7 +429,7 @@ class Bridge:
             return
         wished.add(key)
         if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
-            self._end(key)
+            self._change(key, flow_spec)
         if not self._is_ready(key, flow_spec, now_s):
             if key in self._flows:
                 self._finish(key)
@@ -527,6 +538,16 @@ class Bridge:
             self._finishing[flow_spec.name] = _Finishing(flow_spec, flow, self._now_s + _FINISH_S)
         else:
             self._close(flow_spec, flow)
+
+    def _change(self, key: _Key, flow_spec: FlowSpec) -> None:
+        """End a flow whose rule has changed; a topic whose QoS as stated by the far side has changed continues."""
+        before, flow = self._flows[key]
+        is_same = before.rule.model_copy(update={"offered": flow_spec.rule.offered}) == flow_spec.rule
+        if is_same and isinstance(flow, ImportedTopic):
+            self._flows[key] = flow_spec, flow
+            flow.set_offered(flow_spec)
+        else:
+            self._end(key)
 
     def _end(self, key: _Key) -> None:
         """End a flow at once."""

@@ -26,7 +26,7 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Qos
 from proxy.wire.message import RosMessage
 
 __all__ = ["ExposedTopic"]
@@ -151,6 +151,11 @@ class ExposedTopic:
             return []
         names = publisher.reader_names()
         return [Party("reader", name.to_text(), is_silent=publisher.is_silent(name)) for name in names]
+
+    @property
+    def profile(self) -> Qos | None:
+        """Return the QoS that its local publishers offer; None: not known."""
+        return self._qos.profile
 
     @property
     def depth(self) -> int:

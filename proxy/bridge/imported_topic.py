@@ -143,6 +143,11 @@ class ImportedTopic:
         if self._is_joined:
             self._context.member.renew(topic)
 
+    def set_offered(self, flow_spec: FlowSpec) -> None:
+        """Replace the QoS that the far side states; it holds until a publisher is known."""
+        self._flow_spec = flow_spec
+        self._output.set_offered(flow_spec)
+
     def count_losses(self) -> None:
         """Update the losses in the topic's statistics."""
         self.stats.losses = losses = Losses()

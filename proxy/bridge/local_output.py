@@ -62,6 +62,9 @@ class LocalOutput(Protocol):
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""
 
+    def set_offered(self, flow_spec: FlowSpec) -> None:
+        """Replace the QoS that the far side states; it holds until a publisher is known."""
+
     def drop_kept(self) -> None:
         """Drop messages kept for late joiners, when the last local reader has left."""
 
@@ -117,6 +120,12 @@ class MergedPublisher:
         if self._channel is not None:
             self._offer(self._channel)
 
+    def set_offered(self, flow_spec: FlowSpec) -> None:
+        """Offer the QoS that the far side states, until a publisher is known."""
+        self._flow_spec = flow_spec
+        if self._channel is not None and not self._far:
+            self._offer(self._channel)
+
     def drop_kept(self) -> None:
         """Close a latched publisher: its messages become outdated, and arrive again with the next reader."""
         if self._channel is not None and self._channel.latched:
@@ -138,7 +147,8 @@ class MergedPublisher:
     def _offer(self, channel: Channel) -> None:
         """Create the publisher with the remote QoS, within what local readers allow; replace it where they change."""
         rule = self._flow_spec.rule
-        far, latched, reliable = tuple(self._far.values()), rule.wants_latched, rule.wants_reliable
+        stated = () if rule.offered is None else (Qos(**rule.offered.model_dump()),)
+        far, latched, reliable = tuple(self._far.values()) or stated, rule.wants_latched, rule.wants_reliable
         profile = offer(far, self._wants, is_latched=latched, is_reliable=reliable)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
@@ -193,6 +203,9 @@ class ChannelPublishers:
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Ignore the readers: a recording reads everything."""
+
+    def set_offered(self, flow_spec: FlowSpec) -> None:
+        """Ignore it: every channel is recorded as its publisher describes it."""
 
     def drop_kept(self) -> None:
         """Drop nothing: a recording keeps everything."""

@@ -15,7 +15,7 @@ import typer
 from gdp.cli import delegate as group
 from gdp.cli.completion import allow_completion
 from gdp.cli.node import Json, emit, failing_clearly
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.config.yaml_source import read_yaml
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError, StatementError
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         allow_completion("gdp-delegate")
         group.main()
     else:
-        app(args=list(arguments), prog_name="gdp delegate rules")
+        versioned(app)(args=list(arguments), prog_name="gdp delegate rules")
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:

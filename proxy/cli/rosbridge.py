@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
-from gdp.cli.version import HELP, Version
+from gdp.cli.version import HELP, Version, versioned
 from gdp.links.uplink import wait_for_device
 from proxy.cli.door_token import NoToken, TokenFile, door_token
 from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
@@ -80,7 +80,7 @@ def rosbridge(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ``arguments``: by default those of this process."""
-    app(args=None if arguments is None else list(arguments), prog_name="gdp rosbridge")
+    versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp rosbridge")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import yaml
 from gdp.cli import options
 from gdp.cli.output import show
 from gdp.cli.salt import NAME_SALT
+from gdp.cli.version import versioned
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
@@ -164,7 +165,7 @@ def _done(what: str, side: RuleList, name: str, *, is_running: bool, as_json: bo
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; arguments as after ``gdp rule``."""
     try:
-        app(args=None if arguments is None else list(arguments), prog_name="gdp rule")
+        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp rule")
     except GdpError as error:
         echo(f"error: {error}", err=True)
         sys.exit(2)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
+from gdp.cli.version import versioned
 from gdp.names import Name
 from gdp.trust.right import Right
 from proxy.cli.node_options import Delegations, Iface
@@ -48,7 +49,7 @@ Values = Annotated[
 
 @app.callback()
 def _service() -> None:
-    """Keep ``call`` a command of its own: typer would run a single one without its name."""
+    """Call a service through the overlay, as a member."""  # a group: typer would run a single command without its name
 
 
 @app.command(
@@ -152,7 +153,7 @@ class _Call:
 
 def main() -> None:
     """Run the command."""
-    app(prog_name="gdp service")
+    versioned(app)(prog_name="gdp service")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import typer
 
 from gdp import terminal
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
+from gdp.cli.version import versioned
 from gdp.errors import RemoteError
 from gdp.trust.right import Right
 from proxy.cli.node_options import Delegations, Iface
@@ -306,7 +307,7 @@ def _measure(
 
 def main() -> None:
     """Run the commands."""
-    app(prog_name="gdp topic")
+    versioned(app)(prog_name="gdp topic")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
+from gdp.cli.version import versioned
 from gdp.errors import GdpError, LocalError
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.ros_names import covers, is_name, is_pattern
@@ -137,7 +138,7 @@ def _print(event: LivelinessEvent, *, as_json: bool) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; arguments as after ``gdp watch``."""
     try:
-        app(args=None if arguments is None else list(arguments), prog_name="gdp watch")
+        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp watch")
     except GdpError as error:
         echo(f"error: {error}", err=True)
         sys.exit(2)

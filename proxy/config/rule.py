@@ -24,6 +24,7 @@ from pydantic.config import JsonDict, JsonValue
 from pydantic_core import PydanticCustomError
 
 from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
+from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
@@ -67,7 +68,7 @@ DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTP
 
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
-_OF_TOPICS: Final = ("reliable", "latched", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
+_OF_TOPICS: Final = ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
 _OF_CALLS: Final = ("timeout_s", "on_timeout", "replication", "readiness", "sign")
 _OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
 _FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
@@ -227,6 +228,9 @@ class Rule(Section):
     )
     wants_latched: bool | None = Field(
         default=None, alias="latched", description="Topics: late joiners get the last message. `null`: by QoS."
+    )
+    offered: OfferedQos | None = Field(
+        default=None, description="Imported topics, by `gdp import`: QoS until a publisher is known."
     )
     history: SomeHistory = Field(
         default=None, description="Exposed topics: what is kept for late joiners; a number: messages."

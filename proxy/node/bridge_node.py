@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.cli.node import emit, emit_wait
+from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
@@ -30,6 +31,7 @@ from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
 from proxy.node.otel_tracer import open_tracer
 from proxy.node.state_answer import answer_for_proxy
+from proxy.serial.channel import Qos
 
 __all__ = ["run"]
 
@@ -71,6 +73,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             node.local_name = lambda name: _local_names(bridge).get(name) or local_name(name)
             node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
             node.undelegated = lambda: [_described(each) for each in bridge.undelegated]
+            node.qos = lambda: [_qos_fields(*each) for each in bridge.offered_qos]
             node.liveliness = lambda: [each.to_fields() for each in bridge.liveliness(time.monotonic())]
             node.unready = lambda: [{"local": local, "reason": reason} for local, reason in bridge.unready]
             node.denied = lambda: [
@@ -199,6 +202,12 @@ def _described(flow_spec: FlowSpec) -> dict[str, str]:
         "type": flow_spec.type_name,
         "name": flow_spec.name.to_text(),
     }
+
+
+def _qos_fields(flow_spec: FlowSpec, profile: Qos) -> dict[str, object]:
+    depth = min(max(profile.depth, 1), OFFERED_DEPTH_MAX)
+    policies = {"reliability": profile.reliability, "durability": profile.durability, "depth": depth}
+    return {"name": flow_spec.name.to_text(), **policies}
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:

@@ -59,6 +59,7 @@ BEST_EFFORT_MAX: Final = 32  # topics in one status; each has less than 1 KiB
 CALLED_MAX: Final = 256  # services in one status; each has less than 128 bytes
 DENIED_MAX: Final = 50  # names in one status; each has less than 1.5 KiB
 LIVELINESS_BYTES: Final = 96 << 10  # of a status, whose response has 256 KiB
+QOS_MAX: Final = 256  # topics in one status; each has less than 200 bytes
 UNDELEGATED_MAX: Final = 100  # flows in one status; each has less than 2 KiB of a response's 256
 _GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
@@ -74,6 +75,7 @@ class ProxyNode:
         topics: returns the topics that are carried now, for metrics.
         best_effort: returns what became of best-effort messages of exposed topics.
         undelegated: returns the flows that only lack a delegation, as fields of the status.
+        qos: returns the QoS of exposed topics, as fields of the status.
         liveliness: returns who publishes, reads, serves and calls each name, as fields of the status.
         unready: returns local servers whose readiness probe does not pass, as fields of the status.
         denied: returns the local names that stay local because of ``deny``, as fields of the status.
@@ -95,6 +97,7 @@ class ProxyNode:
     best_effort: Callable[[], Sequence[SentStats]] = tuple
     topic_counts: Callable[[], Sequence[TopicCounts]] = tuple
     undelegated: Callable[[], Sequence[Mapping[str, str]]] = tuple
+    qos: Callable[[], Sequence[Mapping[str, object]]] = tuple
     denied: Callable[[], Sequence[Mapping[str, str]]] = tuple
     unready: Callable[[], Sequence[Mapping[str, str]]] = tuple
     liveliness: Callable[[], Sequence[Mapping[str, object]]] = tuple
@@ -155,6 +158,7 @@ class ProxyNode:
                     for service, (ended, total_ms) in list(self.traffic.answered.items())[:CALLED_MAX]
                 },
                 "undelegated": missing,
+                "qos": list(self.qos())[:QOS_MAX],
                 "names": len(names),
                 "liveliness": _bounded(names),
                 "unready": list(self.unready())[:UNDELEGATED_MAX],

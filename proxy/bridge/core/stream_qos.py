@@ -43,6 +43,10 @@ class StreamQos(Protocol):
         """Return the number of messages for late joiners."""
 
     @property
+    def profile(self) -> Qos | None:
+        """Return one profile that all publishers fulfil, for machines that do not read yet; None: not known."""
+
+    @property
     def options(self) -> SendOptions:
         """Return how fresh, how much and how often messages leave."""
 
@@ -96,6 +100,14 @@ class LiveQos:
             shared = DEPTH_MAX if self._is_latched and self._publishers > 1 else 1
             return max(kept(self._offers, self._found_depth), shared)
         return kept(self._offers, self._found_depth)
+
+    @property
+    def profile(self) -> Qos | None:
+        """Return the profile that matches every local publisher, with what late joiners get."""
+        if self.depth:
+            reliable = not self._offers or request(self._offers).reliability == "reliable"
+            return default(reliable=reliable, latched=True, depth=self.depth)
+        return self.request
 
     @property
     def asks_depth(self) -> bool:
@@ -157,6 +169,11 @@ class RecordedQos:
         if self._rule.history is not None:
             return self._rule.history.messages
         return max(self._recorded_depth, int(self._rule.latched))
+
+    @property
+    def profile(self) -> Qos | None:
+        """Return None: no machine shares the names of a recording."""
+        return None
 
     @property
     def options(self) -> SendOptions:

@@ -212,3 +212,8 @@ def test_the_help_of_every_group_gives_each_command_its_name(gdp: Run) -> None:
         out = gdp("", *path, "--help").out
         names = {leaf[len(path)] for leaf in leaves(get_command(app)) if leaf[: len(path)] == path}
         assert names == {name for name in names if re.search(rf"(?m)^\W*{name}\s", out)}
+
+
+@pytest.mark.parametrize(("group", "commands"), [("unit", {"install", "remove", "status"}), ("service", {"call"})])
+def test_units_of_systemd_and_calls_of_services_are_commands_of_their_own(group: str, commands: set[str]) -> None:
+    assert {leaf[1] for leaf in leaves(get_command(app)) if leaf[0] == group} == commands

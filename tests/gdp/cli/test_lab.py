@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from gdp.config.config import RibConfig, SwitchConfig
 from gdp.crypto.certificates import Role
 from gdp.nodes.membership import load_member
 from gdp.session.settings import settings_of
+from tests.pages import ROOT, blocks
 
 
 @pytest.fixture(autouse=True)
@@ -120,3 +124,22 @@ def test_programs_need_a_directory_without_a_lab(there: str) -> None:
     Path(there).mkdir()
     assert _lab("--program robot") == 2
     assert [path.name for path in Path().iterdir()] == [there]
+
+
+def test_the_pages_commands_make_two_domains_that_trust_each_other_and_name_the_rib_above() -> None:
+    (block,) = (each for each in blocks(ROOT / "docs/how-to/ribs.md") if "--domain backbone" in each.text)
+    here = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-ec", block.text], env={**os.environ, **here}, capture_output=True, text=True, timeout=120, check=True
+    )
+    hub = RibConfig.load(Path("hub/rib.yaml"))
+    above, _ = load_member(hub.identity, hub.domain, Role.RIB)
+    assert f"name         {above.name.to_text()}" in done.stdout.splitlines()
+    with Path("robot/rib.yaml").open("a") as file:
+        file.write(f"upper: {above.name.to_text()}\n")
+    robot = RibConfig.load(Path("robot/rib.yaml"))
+    assert robot.upper == (above.name,)
+    for ours, other in (("robot", "hub"), ("hub", "robot")):
+        for config in (_switch(ours), RibConfig.load(Path(ours, "rib.yaml"))):
+            (trusted,) = config.domain.trusts
+            assert trusted.read_bytes() == Path(other, "rib/root.crt").read_bytes()

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from gdp.cli.gdp import main
+from gdp.errors import StoreError
 from gdp.sharing.folder_exchange import FolderExchange
 from gdp.stores.issue import succeed_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, OWNER_SALT, load_card, load_salt
@@ -62,10 +63,14 @@ def test_two_commands_share_a_topic(robot: Machine, server: Machine, run: Run) -
         server.start(stack)
         code, text, _ = run("expose", "robot", "/camera/image", "--type", IMAGE, "--to", "server")
         assert (code, text.splitlines()[0]) == (0, "/camera/image: now")
-        assert run("import", "server", "/camera/image", "--from", "robot")[1].splitlines() == [
+        code, text, _ = run("import", "server", "/camera/image", "--from", "robot")
+        first, head, row = text.splitlines()
+        assert (code, first, head.split()) == (
+            0,
             "/camera/image: now",
-            f"  /camera/image [{IMAGE}] from robot",
-        ]
+            ["name", "type", "from", "rights", "until", "state"],
+        )
+        assert (row.split()[:4], row.split()[-1]) == (["/camera/image", IMAGE, "robot", "read"], "used")
     assert (robot.rights(), server.rights()) == ({"/camera/image": {"publish"}}, {"/camera/image": {"read"}})
 
 
@@ -119,11 +124,36 @@ def test_a_second_robots_equal_name_is_listed_as_not_used_with_what_to_do(
     run("import", "server", "/*")
     run("expose", "arm", "/state", "--type", STRING, "--to", "server")
     code, text, errors = run("import", "server", "/state")
-    assert f"  /state [{STRING}] from robot\n  /state [{STRING}] from arm: not used\n" in text
-    assert (code, "state prefix: in the proxy.yaml of arm" in errors) == (0, True)
-    states = [line.split()[-2:] for line in run("import", "server", "--list")[1].splitlines()]
-    assert [each[-1] for each in states] == ["state", "used", "used"]
-    assert states[2] == ["not", "used"]
+    why = "not used: another owner's /state is in use; state prefix: in the proxy.yaml of arm"
+    _, _, first, second = text.splitlines()
+    assert (first.endswith("  used"), second.endswith(f"  {why}")) == (True, True)
+    assert (code, errors) == (1, "error: /state: 1 of the names above are not in force\n")
+    assert run("import", "server", "--list")[1].splitlines() == text.splitlines()[1:]
+    assert [each["state"] for each in listed(run("import", "server", "--list", "--json"))["offers"]] == ["used", why]
+
+
+def test_what_an_import_lists_as_json_is_what_it_lists_as_text(
+    site: Site, robot: Machine, server: Machine, run: Run
+) -> None:
+    arm = site.add("arm")
+    FolderExchange(site.folder / "common", load_card(arm.folder / "proxy" / CARD))
+    for machine in ("robot", "arm"):
+        run("expose", machine, "/state", "--type", STRING, "--to", "server")
+    code, text, _ = run("import", "server", "/state", "--json")
+    states = [each["state"].partition(":")[0] for each in json.loads(text)["offers"]]
+    assert (code, states) == (1, ["used", "not used"])
+
+
+def test_a_delegation_that_cannot_be_delivered_yet_ends_the_command_with_1(
+    robot: Machine, server: Machine, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise StoreError("the folder is not there")
+
+    monkeypatch.setattr(FolderExchange, "send", fail)
+    code, text, errors = run("expose", "robot", "/state", "--type", STRING, "--to", "server")
+    assert (code, text.splitlines()[-1].split()[-3:]) == (1, ["waits", "for", "delivery"])
+    assert errors.endswith("error: /state: 1 of the names above are not in force\n")
 
 
 def test_a_name_is_taken_back_through_the_switch_of_the_machine(robot: Machine, server: Machine, run: Run) -> None:
@@ -203,7 +233,7 @@ def test_a_robot_with_a_prefix_shares_its_names_under_it(site: Site, server: Mac
         server.start(stack)
         code, text, error = run("expose", "robot", "/camera/**", "--to", "server")
         assert (code, error) == (0, "")
-        assert f"/robot1/camera/image [{IMAGE}] to server" in text
+        assert f"/robot1/camera/image  {IMAGE}  server  read" in text
         run("import", "server", "/robot1/camera/image")
     assert robot.rules("expose") == [("/camera/**", "")]
     assert server.rules("import") == [("/robot1/camera/image", IMAGE)]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from gdp.config.offered_qos import OfferedQos
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError, StoreError
 from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
@@ -82,6 +83,7 @@ class Machine:
 
     Attributes:
         graph: what its local nodes publish or serve: kind, name and type.
+        qos: of local topics, by name.
         reloads: how often the proxy has reloaded.
         refusal: why the proxy refuses to reload, empty: it validates the files.
     """
@@ -90,6 +92,7 @@ class Machine:
     folder: Path
     directory: Directory
     graph: list[tuple[str, str, str]] = field(default_factory=list)
+    qos: dict[str, OfferedQos] = field(default_factory=dict)
     reloads: int = 0
     refusal: str = ""
     config: ProxyConfig | None = None
@@ -145,16 +148,18 @@ class Machine:
 
     def _status(self) -> dict[str, object]:
         held = {each.name for each in self.held}
-        listed = []
+        listed, qos = [], []
         for kind, local, type_name in self.graph:
             rules = self.config.expose if self.config is not None else ()
             rule = choose(rules, kind, local, type_name)  # type: ignore[arg-type]
             name = None if rule is None else rule.overlay_name_of(local, type_name)
+            if name is not None and local in self.qos:
+                qos.append({"name": name.to_text(), **self.qos[local].model_dump()})
             if name is not None and name not in held:
                 shared = local if rule is None else rule.global_name_of(local)
                 fields = {"side": "expose", "kind": kind, "local": local, "shared": shared, "type": type_name}
                 listed.append({**fields, "name": name.to_text()})
-        return {"undelegated": listed}
+        return {"undelegated": listed, "qos": qos}
 
 
 @dataclass(slots=True)

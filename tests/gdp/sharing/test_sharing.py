@@ -212,7 +212,7 @@ def test_of_two_owners_names_the_first_one_stays_in_use(site: Site, robot: Machi
     )
     assert [(offer.sender, state) for offer, state in server.sharing.offers()] == [
         ("robot", "used"),
-        ("arm", "not used"),
+        ("arm", f"not used: {problem.removeprefix('/state from arm: ')}"),
     ]
     assert (len(server.held), server.rules("import")) == (1, [("/state", STRING)])
 

@@ -62,6 +62,52 @@ def test_an_importing_rule_states_the_qos_until_a_reader_makes_the_far_one_known
     assert (offered(server).reliability, offered(server).durability) == ("best_effort", "transient_local")
 
 
+STATED = ", offered: {{reliability: {0.reliability}, durability: {0.durability}, depth: {0.depth}}}"
+
+
+@pytest.mark.parametrize("qos", [default(), BEST_EFFORT, LATCHED], ids=["reliable", "best effort", "latched"])
+def test_the_qos_of_an_offer_is_here_before_any_reader_and_its_publisher_stays(sites: Sites, qos: Qos) -> None:
+    robot = sites.add(ROBOT, expose=[CHATTER])
+    talker = robot.graph.publish("/talker", "/chatter", STRING, qos)
+    sites.run(1)
+    ((_, profile),) = robot.bridge.offered_qos
+    server = sites.add(SERVER, imports=[CHATTER + STATED.format(profile)])
+    sites.run(1)
+    before = virtual(server)
+    assert (offered(server).reliability, offered(server).durability) == (qos.reliability, qos.durability)
+    ear = Ear(server.graph, "/chatter", qos=qos)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    assert virtual(server) == before
+
+
+def test_another_qos_of_an_offer_replaces_the_publisher_until_the_far_one_is_known(sites: Sites) -> None:
+    robot, server = pair(sites)
+    sites.run(1)
+    sites.reload(server, imports=[CHATTER + STATED.format(LATCHED)])
+    sites.run(1)
+    assert offered(server).durability == "transient_local"
+    ear, talker = Ear(server.graph, "/chatter"), robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("1"))
+    assert sites.run(1, lambda: ear.texts == ["1"])
+    before = virtual(server)
+    sites.reload(server, imports=[CHATTER + STATED.format(BEST_EFFORT)])
+    sites.run(1)
+    talker.publish(string("2"))
+    assert sites.run(1, lambda: ear.texts == ["1", "2"])
+    assert virtual(server) == before
+
+
+def test_the_qos_of_a_topic_that_only_lacks_a_delegation_is_known(sites: Sites) -> None:
+    robot = sites.add(ROBOT, expose=[CHATTER], holds=[])
+    robot.graph.publish("/talker", "/chatter", STRING, LATCHED)
+    sites.run(1)
+    ((spec, profile),) = robot.bridge.offered_qos
+    assert (spec.local, profile.durability, profile.depth) == ("/chatter", "transient_local", 1)
+
+
 def test_a_ros_1_publisher_is_not_replaced_because_the_far_qos_differs(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
     ear = Ear(server.graph, "/chatter")

@@ -1,4 +1,4 @@
-"""``gdp service``: systemd units of this machine's nodes, and calls of services as a member.
+"""``gdp unit``: systemd units of this machine's nodes.
 
 I/O. Exit codes: 0 done, 1 a unit is not up, 2 wrong input, 3 no unit is installed.
 """
@@ -10,12 +10,11 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Optional
+from typing import Annotated, Final, Optional
 
 import typer
 
 from gdp.cli import options
-from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.machine import say
 from gdp.cli.output import show
 from gdp.enrolment.machine_programs import check_program, read_machine
@@ -32,14 +31,7 @@ _JOURNAL_S: Final = 30.0
 _ETC: Final = Path("/etc/gdp")
 
 
-class _Services(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {"call": "service"}
-
-
-app = typer.Typer(
-    cls=_Services, help="systemd units of this machine's nodes; service calls as a member.", no_args_is_help=True
-)
-app.command("call", context_settings=ANY_ARGUMENTS)(placeholder)
+app = typer.Typer(help="systemd units of this machine's nodes.", no_args_is_help=True)
 
 Where = Annotated[
     Optional[Path],  # noqa: UP045
@@ -47,7 +39,7 @@ Where = Annotated[
 ]
 Whose = Annotated[
     Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp service installed."),
+    typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp unit installed."),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the files, and change nothing.")]
 
@@ -61,9 +53,9 @@ def install(path: Where = None, dry_run: DryRun = False, as_json: options.Json =
 
     \b
     Examples:
-      gdp service install /srv/robot
-      gdp service install /srv/robot --dry-run
-      gdp service install
+      gdp unit install /srv/robot
+      gdp unit install /srv/robot --dry-run
+      gdp unit install
     """
     machine = read_machine(_ETC if path is None else path, with_fog=True)
     if machine.missing_proxy is not None:
@@ -85,12 +77,12 @@ def install(path: Where = None, dry_run: DryRun = False, as_json: options.Json =
     except LocalError as error:
         shown = [_last_words(each) for each in units]
         remove_units(list(units))
-        text = "\n".join([f"service install: {error}; all units are removed again", *filter(None, shown)])
+        text = "\n".join([f"unit install: {error}; all units are removed again", *filter(None, shown)])
         raise LocalError(text) from error
     states = [unit_state(each) for each in units]
     result = {"directory": str(machine.directory), "units": [asdict(each) for each in states], "removed": older}
     show(result, as_json=as_json, plain=_table(states))
-    say("started, now and at each boot; gdp service status shows them, gdp service remove takes them away")
+    say("started, now and at each boot; gdp unit status shows them, gdp unit remove takes them away")
 
 
 @app.command()
@@ -99,8 +91,8 @@ def remove(directory: Whose = None, as_json: options.Json = False) -> None:
 
     \b
     Examples:
-      gdp service remove /srv/robot
-      gdp service remove
+      gdp unit remove /srv/robot
+      gdp unit remove
     """
     where = None if directory is None else _folder(directory)
     units = installed_units(where)
@@ -117,8 +109,8 @@ def status(directory: Whose = None, as_json: options.Json = False) -> None:
 
     \b
     Examples:
-      gdp service status
-      gdp service status /srv/robot --json
+      gdp unit status
+      gdp unit status /srv/robot --json
     """
     where = None if directory is None else _folder(directory)
     _require_systemd("status")
@@ -129,7 +121,7 @@ def status(directory: Whose = None, as_json: options.Json = False) -> None:
     show({"units": [{**asdict(each), "well": each.is_well} for each in states]}, as_json=as_json, plain=_table(states))
     if not all(each.is_well for each in states):
         first = next(each for each in states if not each.is_well)
-        say(f"gdp: {first.unit} is not well; its log: journalctl --unit={first.unit}")
+        say(f"error: {first.unit} is not well; its log: journalctl --unit={first.unit}")
         raise typer.Exit(_NOT_WELL)
 
 
@@ -139,14 +131,14 @@ def _folder(path: Path) -> Path:
 
 def _nothing_there(directory: Path | None) -> typer.Exit:
     of = "" if directory is None else f" for {directory}"
-    say(f"gdp: no unit is installed{of}; gdp service install {directory or 'PATH'} makes them")
+    say(f"error: no unit is installed{of}; gdp unit install {directory or 'PATH'} makes them")
     return typer.Exit(_NOTHING)
 
 
 def _require_systemd(what: str) -> None:
     if not has_systemd():
         raise LocalError(
-            f"service {what}: systemd does not run this host (there is no /run/systemd/system); gdp up runs the same"
+            f"unit {what}: systemd does not run this host (there is no /run/systemd/system); gdp up runs the same"
             " nodes in the foreground, for a container or another service manager"
         )
 
@@ -154,7 +146,7 @@ def _require_systemd(what: str) -> None:
 def _require_rights(what: str) -> None:
     _require_systemd(what.partition(" ")[0])
     if os.geteuid() != 0:
-        raise LocalError(f"service: units of the system need root; run: sudo gdp service {what}")
+        raise LocalError(f"unit: units of the system need root; run: sudo gdp unit {what}")
 
 
 def _refuse_foreign(units: Mapping[str, str]) -> None:

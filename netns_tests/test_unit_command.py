@@ -1,4 +1,4 @@
-"""``gdp service`` on a booted Debian: the units run, survive a reboot, and leave nothing once they are removed."""
+"""``gdp unit`` on a booted Debian: the units run, survive a reboot, and leave nothing once they are removed."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def files(machine: BootedMachine) -> list[str]:
 
 def command(machine: BootedMachine, *words: str) -> str:
     try:
-        return machine.run(f"/{PREFIX}/bin/gdp", "service", *words)
+        return machine.run(f"/{PREFIX}/bin/gdp", "unit", *words)
     except subprocess.CalledProcessError as error:
         pytest.fail(f"{error.stdout}{error.stderr}{machine.run('journalctl', '--no-pager', '--lines=60')}")
 
 
 def states(machine: BootedMachine) -> dict[str, dict[str, Any]]:
-    done = machine.run("sh", "-c", f"/{PREFIX}/bin/gdp service status --json || true")
+    done = machine.run("sh", "-c", f"/{PREFIX}/bin/gdp unit status --json || true")
     return {each["unit"]: each for each in json.loads(done)["units"]}
 
 
