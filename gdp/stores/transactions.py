@@ -5,7 +5,6 @@ I/O. Source: https://www.sqlite.org/lang_transaction.html.
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -34,7 +33,7 @@ class TransactionFile:
         self.path = path
         self._lock = threading.Lock()
         with self._translated():
-            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+            path.touch(0o600)  # opens no present file: to close it would drop the locks that this process has on it
             self._file = sqlite3.connect(path, timeout=_LOCKED_S, isolation_level=None, check_same_thread=False)
             try:
                 self._file.execute("PRAGMA journal_mode=WAL")
