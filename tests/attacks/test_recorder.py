@@ -28,6 +28,7 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.wire.message import CHANNELS_MAX, RosMessage, TopicDescription
 
 TOPIC = Name(b"t" * 32)
+RULE = Rule.model_construct(name="/chatter", max_bytes=1 << 20)
 
 
 class Sink:
@@ -56,10 +57,9 @@ class Recorder:
         self.sink = Sink()
         self.faults = Faults()
         member = SimpleNamespace(losses_of=lambda _: Losses())
-        rule = SimpleNamespace(name="/chatter", max_hz=None, max_bytes=1 << 20)
         self.endpoint = RecordingEndpoint(cast(BagWriter, self.sink), [("/chatter", "a/msg/B")])
         context = BridgeContext(cast(Participant, member), Traffic(), self.faults)
-        flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, cast(Rule, rule))
+        flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, RULE)
         self.flow = ImportedTopic(
             context, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
         )

@@ -44,6 +44,7 @@ from tests.fuzzing.decoder import Decoder
 __all__ = ["DECODERS"]
 
 _NAME: Final = Name(b"t" * 32)
+_RULE: Final = Rule.model_construct(name="/t", max_bytes=1 << 20)
 _LINE: Final = "=" * 80 + "\n"
 _INNER: Final = f"{_LINE}MSG: a/I\nint8[0] a\n{_LINE}MSG: a/Nothing\n"
 _DEFINITIONS: Final = (
@@ -154,10 +155,9 @@ def _receive(data: bytes) -> object:
     wire = RosMessage(0, 1, body, steps).to_wire()
     for is_live in (True, False):
         member = SimpleNamespace(losses_of=lambda _: Losses())
-        rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None, wants_reliable=None)
         context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
         dispatcher = EndpointDispatcher(cast(RosEndpoint, _Endpoint(is_live=is_live)))
-        flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, cast(Rule, rule))
+        flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, _RULE)
         flow = ImportedTopic(context, dispatcher, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
         for number in range(2):
             delivered = Delivered(b"p" * 32, 1, number, wire, 1, 1)

@@ -1,8 +1,9 @@
 """Machines behind NATs and a border in a simulation: the links of real switches over a model of WireGuard and NATs.
 
 ``TunnelLinks``, ``Tunnels`` and ``OwnEndpoints`` are those of the product. A device of the model sends to the endpoint
-that it was given, or to where the last packet of the peer came from, through the NATs of ``tests.gdp.switch.nat``. A
-machine whose network blocks UDP has the link of a relay instead.
+that it was given, or to where the last packet of the peer came from, through the NATs of ``tests.gdp.switch.nat``. Two
+devices begin a session only with equal preshared keys. A machine whose network blocks UDP has the link of a relay
+instead.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from unittest import mock
 
 from gdp.config.config import LinksConfig
 from gdp.control.endpoints import Endpoint
+from gdp.control.preshared_key import NO_KEY
 from gdp.control.tunnel_plan import TunnelId, tunnel_ifname
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
@@ -37,6 +39,7 @@ DELAY_S: Final = 0.02
 COST, RELAY_COST = 10, 1_000
 LISTEN: Final = 51_820
 _PUBLIC: Final = Endpoint("203.0.113.1", LISTEN)
+_REKEY_AFTER_S, _REJECT_AFTER_S = 120.0, 180.0  # of a session; WireGuard's whitepaper, section 6.1
 
 
 @dataclass(slots=True)
@@ -51,6 +54,13 @@ class TunnelLink(SimLink):
         return not self.passes(to)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """Session of WireGuard between two devices, which both hold."""
+
+    made_s: float
+
+
 @dataclass(slots=True)
 class Device:
     """WireGuard device of one process of a switch."""
@@ -62,6 +72,8 @@ class Device:
     is_ended: bool = False
     endpoints: dict[bytes, Endpoint | None] = field(default_factory=dict)  # by public key of the peer
     heard_unix_s: dict[bytes, float] = field(default_factory=dict)  # first packet since the peer was made
+    preshared: dict[bytes, bytes] = field(default_factory=dict)
+    sessions: dict[bytes, Session] = field(default_factory=dict)
 
     @property
     def listen_port(self) -> int:
@@ -70,9 +82,15 @@ class Device:
     def set_peer(self, key: bytes, *, endpoint: Endpoint | None, **_: object) -> None:
         self.endpoints[key] = endpoint or self.endpoints.get(key)
 
+    def set_preshared_key(self, public_key: bytes, preshared_key: bytes) -> bool:
+        is_new = public_key in self.endpoints and self.preshared.get(public_key, NO_KEY) != preshared_key
+        if is_new:
+            self.preshared[public_key] = preshared_key
+        return is_new
+
     def remove_peer(self, key: bytes) -> None:
-        self.endpoints.pop(key, None)
-        self.heard_unix_s.pop(key, None)
+        for known in (self.endpoints, self.heard_unix_s, self.preshared, self.sessions):
+            known.pop(key, None)
 
     def retry_handshake(self, key: bytes) -> None:
         """Hellos follow by themselves."""
@@ -222,7 +240,7 @@ class Tunnelled:
             source = _PUBLIC
         if to.label != BORDER and not to.gateway.admits(source, at.port, now.mono_s):
             return False
-        if sender.key not in to.device.endpoints:
+        if sender.key not in to.device.endpoints or not _has_session(sender, to, now.mono_s):
             return False
         to.device.endpoints[sender.key] = source
         to.device.heard_unix_s.setdefault(sender.key, now.unix_s)
@@ -271,6 +289,17 @@ class Tunnelled:
             self._close(machine)
 
 
+def _has_session(one: Machine, other: Machine, now_s: float) -> bool:
+    """Return whether two devices have a session, which begins or is renewed only with equal preshared keys."""
+    session, theirs = one.device.sessions.get(other.key), other.device.sessions.get(one.key)
+    age_s = now_s - session.made_s if session is not None and session is theirs else _REJECT_AFTER_S
+    ours, far = (a.device.preshared.get(b.key, NO_KEY) for a, b in ((one, other), (other, one)))
+    if age_s >= _REKEY_AFTER_S and ours == far:
+        one.device.sessions[other.key] = other.device.sessions[one.key] = Session(now_s)
+        return True
+    return age_s < _REJECT_AFTER_S
+
+
 @dataclass(slots=True)
 class Loop:
     """Runtime of one machine: its ports are those of the simulation."""
@@ -312,7 +341,9 @@ def tunnelled(
         bed = Tunnelled(Path(folder), nats, other_rib, leaves, seed)
         stack.callback(bed.close)
         now = SimpleNamespace(
-            monotonic=lambda: bed.network.now.mono_s, time_ns=lambda: int(bed.network.now.unix_s * 1e9)
+            monotonic=lambda: bed.network.now.mono_s,
+            time=lambda: bed.network.now.unix_s,
+            time_ns=lambda: int(bed.network.now.unix_s * 1e9),
         )
         for name in ("make_vxlan", "remove_link", "set_link_mtu"):
             stack.enter_context(mock.patch(f"gdp.links.tunnels.{name}"))
