@@ -134,6 +134,7 @@ def _described(reply: Mapping[str, object], number: int) -> dict[str, object]:
         "cut": bool(reply.get("cut")),
         "in": facts.get("in"),
         "out": facts.get("out"),
+        "needs_right": facts.get("w"),
         "branches": facts.get("branches", []),
     }
 

@@ -27,6 +27,8 @@ def path_lines(name: str, path: Mapping[str, object]) -> Iterator[str]:
         yield f"{end}, which does not answer"
     for hop in hops:
         yield from _hop_lines(hop)
+    if any(hop.get("needs_right") for hop in hops):
+        yield "     branches are told to switches, and to nodes with a right on the name"
 
 
 def _hop_lines(hop: Mapping[str, object]) -> Iterator[str]:

@@ -191,6 +191,13 @@ class Attachment:
             subject=subject, right=right, chain=chain, is_global=is_global, paths=paths, is_session=is_session
         )
 
+    def evidence_of(self, name: Name) -> dict[str, object]:
+        """Return the fields that show this node's right on a name that it advertises; empty if it does not."""
+        for (its, right), each in self._advertisements.items():
+            if its == name:
+                return each.subject.to_fields() | {"right": right.value, "chain": list(each.chain)}
+        return {}
+
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
         """Replace the delegation of an advertised name by a newer one, and advertise it at once."""
         for (its, _), pending_advertisement in self._advertisements.items():

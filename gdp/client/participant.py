@@ -91,6 +91,7 @@ class Participant:
             lambda frames, _to, _now: self.attachment.send(frames),
         )  # fmt: skip
         self.diagnostics.register("ping", self._answer_ping, for_foreign=True)
+        self.diagnostics.evidence_of = self.attachment.evidence_of
 
     @property
     def name(self) -> Name:

@@ -43,6 +43,7 @@ _WINDOW: Final = 256  # requests of one member that may overtake each other
 _PENDING_MAX: Final = 1_024  # requests of our own without a reply yet
 _WAITING_MAX: Final = 64  # questions that wait for a RIB
 _FIRST_LINK_BYTES: Final = 1_500  # ``ControlFragmenter`` splits for the smallest link anyway
+_SHOWS_RIGHT: Final = "trace"  # the kind of request that shows a right on its name
 _NO_BODY: Final[Mapping[str, object]] = {}
 
 
@@ -142,6 +143,7 @@ class Diagnostics:
 
     Attributes:
         drops: what was refused, by reason.
+        evidence_of: returns the fields that show this node's right on a name.
     """
 
     def __init__(
@@ -161,6 +163,7 @@ class Diagnostics:
         self._requests = TokenBuckets(DIAGNOSTICS_PER_S, DIAGNOSTICS_BURST)
         self._reassembler = ControlReassembler()
         self._drops: Counter[DropReason] = Counter()
+        self.evidence_of: Callable[[Name], Mapping[str, object]] = lambda _: _NO_BODY
         self.register("ping", lambda _question, _now: {}, for_foreign=True)
 
     @property
@@ -213,6 +216,8 @@ class Diagnostics:
             )
             self._answer(_Asked(own, self._sequence, 0, True, until_s, on_reply, now.mono_s), now)
             return
+        if ask == _SHOWS_RIGHT:
+            body = {**body, **self.evidence_of(name)}
         if len(self._pending) >= _PENDING_MAX:
             raise LocalError("too many diagnostic requests are under way; wait for their replies")
         is_limited = hops < HOPS_MAX  # so anyone may answer, and have no certificate of ours

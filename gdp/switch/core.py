@@ -149,7 +149,7 @@ class SwitchCore:
         self.diagnostic_answers = DiagnosticAnswers(
             me=identity.name, hello_protocol=self.hello_protocol, table=table, multicast=self.multicast,
             attached=self.attached, resolver=self.resolver, paths=self._paths, wake=self._wake,
-            diagnostics=self.diagnostics,
+            verifier=self._verifier, diagnostics=self.diagnostics,
         )  # fmt: skip
         self.boundary = ErrorBoundary()
         self._join_paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)

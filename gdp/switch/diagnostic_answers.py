@@ -11,6 +11,10 @@ from typing import Final
 from gdp.control.diagnostics import Diagnostics, Question
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.crypto.certificates import Role
+from gdp.crypto.subject import Subject
+from gdp.errors import DropReason, StatementError
+from gdp.limits import CHAIN_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements
@@ -19,6 +23,7 @@ from gdp.switch.name_resolver import NameResolver
 from gdp.switch.paths import Paths
 from gdp.switch.table import Table
 from gdp.trust.right import Right
+from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["DiagnosticAnswers"]
 
@@ -46,9 +51,11 @@ class DiagnosticAnswers:
         resolver: NameResolver,
         paths: Paths,
         wake: Callable[[], None],
+        verifier: AdvertisementVerifier,
         diagnostics: Diagnostics,
     ) -> None:
         self._me = me
+        self._verifier = verifier
         self._hello_protocol = hello_protocol
         self._table = table
         self._multicast = multicast
@@ -60,11 +67,12 @@ class DiagnosticAnswers:
         diagnostics.register("trace", self.trace)
         diagnostics.register("resolve", self.resolve)
 
-    def trace(self, question: Question, _now: Timestamps) -> Mapping[str, object]:
+    def trace(self, question: Question, now: Timestamps) -> Mapping[str, object]:
         """Return the link that the request came by, the next one towards its target, and the tree branches of its name.
 
         The body may name one publisher (``p``); without it the branches of all publishers come. It may also name the
-        end of the path (``t``), where that is not the member that was asked.
+        end of the path (``t``), where that is not the member that was asked. A proxy whose
+        request shows no right on the name gets the reason (``w``) instead of branches.
         """
         result: dict[str, object] = {}
         if question.port is not None:
@@ -73,6 +81,10 @@ class DiagnosticAnswers:
         hops = self._table.entries.get(end + question.asker.name) or self._table.entries.get(end)
         if end != self._me and hops:
             result["out"] = self._link(hops[0][0], hops[0][1][:_MAC_BYTES])
+        try:
+            self._check_right(question, now)
+        except StatementError as error:
+            return result | {"w": error.reason.label}
         wanted = Name(question.body.bytes_("p", NAME_BYTES)) if "p" in question.body else ZERO
         result["branches"] = [
             {"p": tree.publisher, **self._link(port, mac)}
@@ -82,6 +94,16 @@ class DiagnosticAnswers:
             if branch.is_active and (port, mac) != tree.upstream
         ]
         return result
+
+    def _check_right(self, question: Question, now: Timestamps) -> None:
+        """Return if the asker carries traffic, or shows a right on the name. Raises ``StatementError``: neither."""
+        body, name, asker = question.body, question.name, question.asker
+        if asker.role is not Role.PROXY or name == ZERO:
+            return
+        if "right" not in body:
+            raise StatementError(DropReason.NOT_DELEGATED, "no right on the name")
+        subject, right = Subject.from_fields(body, name), Right.from_wire(body.text("right"))
+        self._verifier.verify_right(subject, right, body.byte_strings("chain", CHAIN_MAX), asker, now.unix_s)
 
     def resolve(self, question: Question, now: Timestamps) -> Mapping[str, object] | None:
         """Return who advertises a name, for a node that is attached here; None: the RIB is being queried."""

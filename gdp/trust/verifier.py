@@ -8,11 +8,13 @@ and revocation are checked every time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.statements import Statement, parse
+from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
@@ -80,7 +82,7 @@ class AdvertisementVerifier:
             raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
         statement.verify(member.key)
         rtcert = self._rtcerts.verified(body.rtcert, member.name, member.key)
-        chain = self._chain(body, member)
+        chain = self._chain(body.subject, body.right, body.chain, member)
         advertisement = Advertisement(
             subject=body.subject,
             right=body.right,
@@ -109,13 +111,25 @@ class AdvertisementVerifier:
         self.policy.check_member(advertisement.member, unix_s)
         self._check_evidence(advertisement, unix_s)
 
-    def _chain(self, body: UnverifiedAdvertisement, member: Membership) -> Chain:
+    def verify_right(
+        self, subject: Subject, right: Right, chain: Sequence[bytes], member: Membership, unix_s: float
+    ) -> None:
+        """Return if a member has a right on a name now.
+
+        Args:
+            chain: the AdCerts from the owner to the member; empty where it owns the name.
+
+        Raises:
+            StatementError: NOT_DELEGATED, BAD_SIGNATURE, EXPIRED, REVOKED or MALFORMED.
+        """
+        self._chain(subject, right, chain, member).check(right, unix_s, self.revoked)
+
+    def _chain(self, subject: Subject, right: Right, chain: Sequence[bytes], member: Membership) -> Chain:
         """Return the proof that the member may act on the name, its links verified."""
-        subject = body.subject
-        if body.right is Right.ATTACH and subject.name != member.name:
+        if right is Right.ATTACH and subject.name != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "a node attaches under its own name only")
-        if body.chain:
-            return Chain.traverse(body.chain, subject, member.subject, self._adcerts)
+        if chain:
+            return Chain.traverse(chain, subject, member.subject, self._adcerts)
         owns = subject.owner_key == member.key.compressed or (not subject.owner_key and self._allow_unowned)
         if not owns:
             raise StatementError(DropReason.NOT_DELEGATED, "no delegation from the owner")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import pytest
 
@@ -18,6 +19,7 @@ from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 from gdp.trust.domain import Policy
 from lab.simulation import Simulation
+from lab.topology import MTU_BYTES, flat_topology
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
 pytestmark = pytest.mark.momentary("a request and its reply take milliseconds")
@@ -126,6 +128,24 @@ def test_a_switch_of_our_domain_tells_links_and_branches(flow: Flow) -> None:
     assert (out["to"], out["role"], str(out["port"])[:3]) == (world.switches["nuc2"].name, "switch", "eth")
     assert branch["to"] == world.switches["nuc2"].name
     assert branch["p"] == world.members[ROBOT].name
+
+
+def test_branches_are_told_to_those_with_a_right_on_the_name_and_to_switches() -> None:
+    world = Simulation(topology=flat_topology(pairwise("abcd"), mtu=MTU_BYTES, rib="b", members="abc"))
+    assert world.run_until_attached()
+    name = flowing(world, source="a/end", readers=("b/end",)).topic.name
+    target = world.switches["b"].name  # where the tree has its branch to the reader
+    told = {}
+    for label in ("a/end", "b/end", "c/end", "d"):
+        reply = Asker(world, label).ask(target, "trace", name, reply_bytes=2_000)
+        assert reply is not None
+        told[label] = len(reply.result.maps("branches", 9)) if "branches" in reply.result else 0
+    assert told == {"a/end": 1, "b/end": 1, "c/end": 0, "d": 1}
+    thief = world.members["c/end"]
+    thief.diagnostics.evidence_of = world.members["b/end"].attachment.evidence_of
+    reply = Asker(world, "c/end").ask(target, "trace", name, reply_bytes=2_000)
+    assert reply is not None
+    assert ("branches" in reply.result, reply.result["w"]) == (False, DropReason.NOT_DELEGATED.label)
 
 
 def test_a_switch_of_another_domain_tells_nothing_but_that_it_is_there(flow: Flow) -> None:

@@ -257,6 +257,21 @@ def test_branches_below_are_indented() -> None:
     ]
 
 
+def test_branches_that_a_right_would_show_are_mentioned() -> None:
+    hop = {
+        "hop": 1,
+        "state": "answered",
+        "label": "nuc2",
+        "role": "switch",
+        "domain_label": "lab",
+        "needs_right": "not-delegated",
+    }
+    path = {"right": "publish", "node": ROBOT, "answered": False, "hops": [hop]}
+    assert list(path_lines("/scan", path))[2:] == [
+        "     branches are told to switches, and to nodes with a right on the name"
+    ]
+
+
 class Refusing(Node):
     """A process that is no member, such as a relay: it refuses diagnostic requests and keeps no names."""
 
