@@ -85,6 +85,7 @@ class DropReason(IntEnum):
     SECOND_COPY = 47  # a copy of a frame that is here: the other path, or one sent again against loss, brought it
     LIFESPAN = 48  # a best-effort message that could not leave in time, before a frame of it was sealed
     UNUSED_PARITY = 49  # a parity frame whose block lost nothing, or was filled before
+    UNPROVEN = 50  # a reader's count of frames that its receipts do not prove; more count as lost
 
     @property
     def label(self) -> str:

@@ -489,7 +489,8 @@ class Publisher:
             self._striper.handle_share(header.source, report.share)
         if not header.hops_left & SECOND_PATH:
             self._under_way.handle_hops(header.source, header.hops_left, now_s)
-        self._under_way.handle_report(header.source, report, now_s, waited_s)
+        if self._under_way.handle_report(header.source, report, now_s, waited_s):
+            self.drops[DropReason.UNPROVEN] += 1
         self.redundancy.handle_report(header.source, report, is_new=is_new)
         self.parity.handle_report({each.number for each in report.missing})
         self._measure_loss(now_s)

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.message.acknack import AckNack
+from gdp.message.receipts import ReceiptCheck, samples_of
 
 __all__ = ["SentFrames"]
 
@@ -57,6 +58,7 @@ class _Reader:
     unseen: int = 0  # frames sent before it began to count
     repairs: int = 0  # frames sent again to several readers, which are in no flight
     lost: int = 0
+    receipts: ReceiptCheck = field(default_factory=ReceiptCheck)
 
 
 class SentFrames:
@@ -84,10 +86,12 @@ class SentFrames:
             self.keep(names)
         if again and len(names) > 1:
             size = sum(map(len, frames[:again]))
+            samples = samples_of(frames[:again])
             for name in names:
                 self._paths.path(name, now_s).controller.charge(size, now_s)
                 if name in self._readers:
                     self._readers[name].repairs += again
+                    self._readers[name].receipts.sent(samples, is_repair=True)
             for frame in frames[:again]:
                 number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
                 if number in self._runs:
@@ -105,6 +109,7 @@ class SentFrames:
         for first in range(0, len(frames), _FLIGHT_FRAMES):
             flight = frames[first : first + _FLIGHT_FRAMES]
             size = sum(map(len, flight))
+            samples = samples_of(flight, self._count + 1)
             count = self._count = self._count + len(flight)
             for name in names:
                 path, reader = self._paths.path(name, now_s), self._readers.get(name)
@@ -112,6 +117,7 @@ class SentFrames:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
                 number = path.sent(size, len(flight), now_s)
                 reader.flights.append(_Flight(count, len(flight), number, is_repair))
+                reader.receipts.sent(samples, is_repair=is_repair)
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
@@ -141,16 +147,21 @@ class SentFrames:
         if path is not None:
             path.handle_hops(hops, now_s)
 
-    def handle_report(self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0) -> None:
-        """Confirm on the reader's path what a report shows, which came ``waited_s`` before."""
+    def handle_report(self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0) -> bool:
+        """Confirm on the reader's path what a report shows, which came ``waited_s`` before.
+
+        Return whether its receipts prove fewer frames than it counts.
+        """
+        is_unproven = False
         reader, path = self._readers.get(name), self._paths.get(name)
         if path is not None:
             if reader is not None and acknack.received:
-                self._confirm(reader, path, acknack, now_s, waited_s)
+                is_unproven = self._confirm(reader, path, acknack, now_s, waited_s)
                 self._forget_places()
             path.handle_heard()
+        return is_unproven
 
-    def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> None:
+    def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> bool:
         while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
             reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
         came = (acknack.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
@@ -158,10 +169,12 @@ class SentFrames:
         newest = acknack.newest, acknack.newest_part
         (place, is_repair), is_newer = self._find(*newest), newest != reader.newest
         reader.received, reader.newest = acknack.received, newest
+        if has_begun:
+            reader.receipts.begin(acknack.receipts, place)
         if not is_newer:
             self._confirm_repairs(reader, path, 0 if has_begun else came, place, now_s)
         if not is_newer or place <= reader.resolved:  # what came now was given up before
-            return
+            return False
         before, numbers, reader.partial = reader.resolved, [], 0
         while reader.flights and reader.flights[0].end <= place:
             flight = reader.flights.popleft()
@@ -173,13 +186,19 @@ class SentFrames:
         if not numbers:
             if reader.flights and reader.flights[0].end - reader.flights[0].frames < place:  # a part of it came
                 path.handle_part(reader.flights[0].number, held_s, now_s)
-            return
+            return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
-        lost = min(new_lost, reader.resolved - before - 1) if self._counts_losses else 0
+        frames = reader.resolved - before
+        judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost)
+        is_unproven = self._counts_losses and judged > new_lost
+        if is_unproven and held_s is not None:
+            held_s = waited_s  # nor is it believed how long it held its report
+        lost = min(judged, frames - 1) if self._counts_losses else 0
         path.handle_held(acknack.held_us / 1e6)
         path.acknowledged(numbers, max(lost, 0), held_s, now_s)
+        return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:
         """Confirm frames that came, though none was newer than before: they were sent again.

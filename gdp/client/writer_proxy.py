@@ -51,6 +51,7 @@ from gdp.message.late_repairs import LateRepairs
 from gdp.message.loss import Losses, LossReason
 from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.receipts import RECEIPTS_MASK, sum_of_samples
 from gdp.message.renumbering import Renumbering
 from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.message.striping import StripedPaths
@@ -172,6 +173,7 @@ class WriterProxy:
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
         self._deferred = DeferredRequests()
         self._received = 0  # verified DATA frames
+        self._receipts = 0  # the sum of the samples among them
         self._newest = (0, -1, now_s)  # the highest of them: number, fragment, and when it came
         self._late = LateRepairs(self._data, self._lag_s, self._recovery.awaited_s)
         self._is_reliable: bool | None = None
@@ -297,6 +299,7 @@ class WriterProxy:
             self._recovery.keep_run(arrivals, at, taken, now_s)
             self._schedule.count(taken * len(arrivals[at].frame))
             self._received += taken
+            self._receipts += sum_of_samples(arrival.frame for arrival in arrivals[at : at + taken])
             number, part = NUMBER_AND_PART.unpack_from(arrivals[at + taken - 1].frame, NUMBER_AT)
             self._note_newest(number, part, now_s - arrivals[at + taken - 1].waited_s)
             if self.state is WriterProxyState.LIVE:
@@ -357,7 +360,7 @@ class WriterProxy:
         acknack = AckNack(
             AckNackFlag.NONE, expected, part, missing or late, sequence, self.lost, share,
             self._received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
-            (self._data.frames - self._recovery.recovered) & FRAMES_MASK,
+            (self._data.frames - self._recovery.recovered) & FRAMES_MASK, self._receipts & RECEIPTS_MASK,
         )  # fmt: skip
         return self._over_paths(self._sealer.seal_all(acknack, now_s))
 
@@ -452,6 +455,7 @@ class WriterProxy:
                 self._recovery.recovered += 1
             else:
                 self._received += 1
+                self._receipts += sum_of_samples((frame,))
             if reassembled is None:
                 self._recovery.keep(header, frame, now_s)
             self._note_newest(header.number, header.part, came_s)

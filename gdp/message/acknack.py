@@ -3,7 +3,7 @@
 Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian::
 
     flags (1) | share (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | received (4)
-    | newest number (8) | newest part (4) | held (4) | frames (4) | ranges (2)
+    | newest number (8) | newest part (4) | held (4) | frames (4) | receipts (8) | ranges (2)
     for each range: number (8) | first part (4) | last part (4)
 """
 
@@ -18,7 +18,7 @@ from gdp.limits import NACKS_PER_REPORT
 
 __all__ = ["FRAMES_MASK", "AckNack", "AckNackFlag", "MissingRange"]
 
-_HEAD: Final = struct.Struct("!BBQIQQIQIIIH")
+_HEAD: Final = struct.Struct("!BBQIQQIQIIIQH")
 _U32_MAX: Final = (1 << 32) - 1
 _U64_MAX: Final = (1 << 64) - 1
 FRAMES_MASK: Final = (1 << 32) - 1
@@ -52,7 +52,8 @@ class AckNack(NamedTuple):
     newest_part), which came ``held_us`` microseconds before this report left. The writer measures the path by them. In
     a report flagged NEW, ``held_us`` is for how long its reader has waited for a publisher.
 
-    ``frames`` counts the frames of messages that came, copies included, modulo 2**32.
+    ``frames`` counts the frames of messages that came, copies included, modulo 2**32. ``receipts`` is the sum of the
+    samples among the frames that ``received`` counts.
     """
 
     flags: AckNackFlag
@@ -67,12 +68,20 @@ class AckNack(NamedTuple):
     newest_part: int = 0
     held_us: int = 0
     frames: int = 0
+    receipts: int = 0
 
     def to_wire(self) -> bytes:
         """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
         ranges = self.missing[:NACKS_PER_REPORT]
         counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
-        path = self.received & _U32_MAX, self.newest, self.newest_part, min(self.held_us, _U32_MAX), self.frames
+        path = (
+            self.received & _U32_MAX,
+            self.newest,
+            self.newest_part,
+            min(self.held_us, _U32_MAX),
+            self.frames,
+            self.receipts,
+        )
         head = _HEAD.pack(self.flags, self.share, self.next_number, self.next_part, *counts, *path, len(ranges))
         return head + b"".join(_RANGE.pack(*each) for each in ranges)
 

@@ -18,7 +18,9 @@ U64 = st.integers(0, (1 << 64) - 1)
 U32 = st.integers(0, (1 << 32) - 1)
 MISSING = st.lists(st.builds(MissingRange, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
 FLAGS = st.sampled_from([AckNackFlag.NONE, AckNackFlag.NEW, AckNackFlag.BYE])
-REPORTS = st.builds(AckNack, FLAGS, U64, U32, MISSING, U64, U64, st.integers(0, SHARE_WHOLE), U32, U64, U32, U32, U32)
+REPORTS = st.builds(
+    AckNack, FLAGS, U64, U32, MISSING, U64, U64, st.integers(0, SHARE_WHOLE), U32, U64, U32, U32, U32, U64
+)
 MOVES = st.lists(
     st.builds(lambda first, span, gap: Renumbering(first, span, first + span + gap), *[st.integers(1, 1 << 60)] * 3),
     max_size=MOVES_MAX,
