@@ -14,30 +14,22 @@ from collections.abc import Awaitable, Callable, Generator, Sequence
 from types import TracebackType
 from typing import TypeVar
 
-from gdp.client.participant import Topic
-from gdp.client.send_options import Priority, SendOptions, is_urgent
-from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.loop_driver import LoopDriver
 from gdp.session.node import open_node
-from gdp.session.protocol.core import QUEUE_MESSAGES
 from gdp.session.protocol.errors import ClosedError
-from gdp.session.protocol.messages import Message, NameLike, Request, Response
+from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
-from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import message_to_wire
 from gdp.session.session import (
     ATTACH_TIMEOUT_S,
     CALL_TIMEOUT_S,
     GOODBYE_S,
     LINGER_S,
-    Paths,
-    Sign,
     checked_response,
 )
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
-from gdp.trust.right import Right
 
 __all__ = ["AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription", "open_session_async"]
 
@@ -97,14 +89,6 @@ class AsyncPublisher(BasePublisher[LoopDriver], _ClosedOnExit):
         if not await self._driver.wait(self._publisher.is_acknowledged, _deadline_s(timeout_s)):
             raise self._unconfirmed(timeout_s)
 
-    def close(self) -> None:
-        """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._session.forget(self)
-            self._session.core.member.withdraw(self.name)
-            self._driver.schedule()
-
 
 class AsyncSubscription(BaseSubscription[LoopDriver], _ClosedOnExit):
     """Messages of one name as an asynchronous iterator; made by ``AsyncSession.subscribe``."""
@@ -134,24 +118,14 @@ class AsyncSubscription(BaseSubscription[LoopDriver], _ClosedOnExit):
         except ClosedError:
             raise StopAsyncIteration from None
 
-    def close(self) -> None:
-        """Unsubscribe. Idempotent."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._session.forget(self)
-            self._session.core.unsubscribe(self._inbox)
-            self._driver.schedule()
-
 
 Handler = Callable[[Request], Awaitable[bytes]]
 
 
-class AsyncServer(BaseServer[LoopDriver]):
+class AsyncServer(BaseServer[LoopDriver, Handler]):
     """Server of one name with a coroutine function; made by ``AsyncSession.serve``."""
 
-    def __init__(self, session: AsyncSession, topic: Topic, server: ServerCore, handler: Handler, workers: int) -> None:
-        super().__init__(session, topic, server)
-        self._handler = handler
+    def _start(self, workers: int) -> None:
         self._tasks = [asyncio.create_task(self._work()) for _ in range(workers)]
 
     async def close(self, linger_s: float = LINGER_S) -> None:
@@ -203,99 +177,10 @@ class AsyncServer(BaseServer[LoopDriver]):
             return f"{type(error).__name__}: {error}"
 
 
-class AsyncSession(BaseSession[LoopDriver]):
-    """A node of the overlay in this process; made by ``gdp.open_async``. See ``Session`` for the options."""
+class AsyncSession(BaseSession[LoopDriver, AsyncPublisher, AsyncSubscription, AsyncServer, Handler]):
+    """A node of the overlay in this process; made by ``gdp.open_async``."""
 
-    def publisher(
-        self,
-        name: NameLike,
-        *,
-        reliable: bool = True,
-        priority: Priority = "normal",
-        latched: int = 0,
-        is_global: bool = True,
-        description: bytes = b"",
-        paths: Paths = 1,
-        deadline_s: float | None = None,
-        weight: int = 1,
-        max_bits_s: float | None = None,
-        repairs: bool = True,
-    ) -> AsyncPublisher:
-        """Publish a name from now on; see ``Session.publisher``.
-
-        Raises:
-            DelegationError: the node may not publish it.
-            LocalError: the session publishes it already, or an option is out of bounds.
-        """
-        self.driver.check()
-        topic = self.core.resolve(name, Right.PUBLISH)
-        made = self.core.advertise(
-            topic,
-            reliable=reliable,
-            urgent=is_urgent(priority),
-            latched=latched,
-            is_global=is_global,
-            description=description,
-            paths=paths_value(paths),
-            options=SendOptions(
-                deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
-            ),
-        )
-        publisher = AsyncPublisher(self, topic, made, reliable=reliable)
-        self._opened.append(publisher)
-        self.driver.schedule()
-        return publisher
-
-    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES, paths: Paths = 1) -> AsyncSubscription:
-        """Subscribe to a name; see ``Session.subscribe``.
-
-        Raises:
-            DelegationError: the node may not read it.
-            LocalError: the session subscribes to it already.
-        """
-        self.driver.check()
-        if queue < 1:
-            raise LocalError(f"queue is at least 1, not {queue}")
-        topic = self.core.resolve(name, Right.READ)
-        subscription = AsyncSubscription(self, topic, self.core.subscribe(topic, queue, paths_value(paths)))
-        self._opened.append(subscription)
-        self.driver.schedule()
-        return subscription
-
-    def serve(
-        self,
-        name: NameLike,
-        handler: Handler,
-        *,
-        workers: int = 1,
-        priority: Priority = "normal",
-        is_global: bool = True,
-        paths: Paths = 1,
-        sign: Sign = "always",
-    ) -> AsyncServer:
-        """Serve a name; ``workers`` is how many requests are handled at one time. See ``Session.serve``.
-
-        Raises:
-            DelegationError: the node may not serve it.
-            LocalError: the session serves, calls or reads it already.
-        """
-        self.driver.check()
-        if workers < 1:
-            raise LocalError(f"workers is at least 1, not {workers}")
-        topic = self.core.resolve(name, Right.SERVE)
-        core = self.core.serve(
-            topic,
-            at_once=workers,
-            is_global=is_global,
-            urgent=is_urgent(priority),
-            options=SendOptions(priority=priority),
-            paths=paths_value(paths),
-            is_session=session_value(sign),
-        )
-        server = AsyncServer(self, topic, core, handler, workers)
-        self._opened.append(server)
-        self.driver.schedule()
-        return server
+    _publisher_type, _subscription_type, _server_type = AsyncPublisher, AsyncSubscription, AsyncServer
 
     async def call(
         self,
@@ -323,15 +208,6 @@ class AsyncSession(BaseSession[LoopDriver]):
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")
         return call.response
-
-    def reload(self) -> None:
-        """Read the delegations again; see ``Session.reload``.
-
-        Raises:
-            LocalError: a file is malformed, or readable for others.
-        """
-        self._node.reload()
-        self.driver.schedule()
 
     async def close(self, linger_s: float = LINGER_S) -> None:
         """Close all publishers, subscriptions and servers, and leave the overlay. Idempotent."""

@@ -9,7 +9,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeVar
 
 from gdp.client.publisher import Publisher
 from gdp.ports.netdev import NetdevPlane
@@ -20,6 +20,8 @@ from gdp.session.protocol.errors import ClosedError
 __all__ = ["LoopDriver"]
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 _STEPS_MAX: Final = 8  # before the program's other tasks run
 
@@ -40,6 +42,17 @@ class LoopDriver:
         self._error: Exception | None = None
         self._loop.add_reader(plane.fileno(), self._work)
         self.schedule()
+
+    def now_s(self) -> float:
+        """Return the present monotonic second."""
+        return time.monotonic()
+
+    def run(self, command: Callable[[], T]) -> T:
+        """Run a command on the node and return what it returns. Raises ``ClosedError``: the session is closed."""
+        self.check()
+        result = command()
+        self.schedule()
+        return result
 
     def publish(self, publisher: Publisher, message: bytes) -> None:
         """Publish a message now.

@@ -13,23 +13,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Final, Literal, TypeVar
+from typing import Final, TypeVar
 
-from gdp.client.participant import Topic
-from gdp.client.send_options import Priority, SendOptions, is_urgent
-from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
 from gdp.session.node import SessionNode, open_node
-from gdp.session.protocol.core import QUEUE_MESSAGES
 from gdp.session.protocol.errors import ClosedError, SessionTimeoutError
-from gdp.session.protocol.messages import Message, NameLike, Request, Response
+from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
-from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import message_to_wire
 from gdp.session.settings import settings_of
 from gdp.trust.advertisement import paths_value, session_value
-from gdp.trust.right import Right
 
 __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
 
@@ -39,8 +33,6 @@ ATTACH_TIMEOUT_S: Final = 10.0
 CALL_TIMEOUT_S: Final = 10.0
 LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
-Paths = Literal[1, 2, "spread"]
-Sign = Literal["always", "session"]
 
 _C = TypeVar("_C")
 
@@ -101,13 +93,6 @@ class Publisher(BasePublisher[Driver], _ClosedOnExit):
         if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(self._driver, timeout_s)):
             raise self._unconfirmed(timeout_s)
 
-    def close(self) -> None:
-        """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._session.forget(self)
-            self._driver.run(partial(self._session.core.member.withdraw, self.name))
-
 
 class Subscription(BaseSubscription[Driver], _ClosedOnExit):
     """Messages of one name as an iterator that waits for the next; made by ``Session.subscribe``."""
@@ -154,28 +139,17 @@ class Subscription(BaseSubscription[Driver], _ClosedOnExit):
         except ClosedError:
             raise StopIteration from None
 
-    def close(self) -> None:
-        """Unsubscribe. Idempotent."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._session.forget(self)
-            self._driver.run(partial(self._session.core.unsubscribe, self._inbox))
+
+Handler = Callable[[Request], bytes]
 
 
-class Server(BaseServer[Driver], _ClosedOnExit):
+class Server(BaseServer[Driver, Handler], _ClosedOnExit):
     """Server of one name with a handler; made by ``Session.serve``."""
 
-    def __init__(
-        self, session: Session, topic: Topic, server: ServerCore, handler: Callable[[Request], bytes], workers: int
-    ) -> None:
-        super().__init__(session, topic, server)
-        self._handler = handler
-        self._threads = [
-            threading.Thread(target=self._work, name=f"gdp-serve-{topic.name.short}-{number}", daemon=True)
-            for number in range(workers)
-        ]
-        for thread in self._threads:
-            thread.start()
+    def _start(self, workers: int) -> None:
+        for number in range(workers):
+            name = f"gdp-serve-{self.name.short}-{number}"
+            threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def close(self, linger_s: float = LINGER_S) -> None:
         """Stop serving: direct clients to other servers, finish active requests, then withdraw. Idempotent.
@@ -215,89 +189,14 @@ class Server(BaseServer[Driver], _ClosedOnExit):
             return
 
 
-class Session(BaseSession[Driver]):
+class Session(BaseSession[Driver, Publisher, Subscription, Server, Handler]):
     """A node of the overlay in this process; made by ``gdp.open``.
 
     Use it as a context manager, or call ``close``: then readers get the published messages, and the overlay learns at
     once that the node has left.
     """
 
-    def publisher(
-        self,
-        name: NameLike,
-        *,
-        reliable: bool = True,
-        priority: Priority = "normal",
-        latched: int = 0,
-        is_global: bool = True,
-        description: bytes = b"",
-        paths: Paths = 1,
-        deadline_s: float | None = None,
-        weight: int = 1,
-        max_bits_s: float | None = None,
-        repairs: bool = True,
-    ) -> Publisher:
-        """Publish a name from now on.
-
-        Args:
-            name: ``name`` of its metadata, such as ``"camera"``; 64 hex digits; a ``Name``; or the ``Metadata``.
-            reliable: whether readers get every message, in order; otherwise lost messages stay lost.
-            priority: one of seven, ``"urgent"`` to ``"background"``; ``"urgent"`` precedes others in every queue.
-            latched: how many of the last messages late readers get.
-            is_global: whether other domains can find the name.
-            description: information that readers need to decode the messages; it travels sealed.
-            paths: 2: each frame travels over two disjoint paths. ``spread``: large messages are striped over them. The
-                readers subscribe with either as well.
-            deadline_s: without ``reliable``: a message that cannot leave whole within this time is dropped, above 0 and
-                at most 3600. None: a message that has waited for 50 ms gives way to a newer one.
-            weight: share of a full path, next to other names of the same priority, 1 to 100.
-            max_bits_s: most bits of frames a second, 1e3 to 1e12. None: what the path carries.
-            repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.
-
-        Raises:
-            DelegationError: the node may not publish it.
-            LocalError: the session publishes it already, or an option is out of bounds.
-        """
-        topic = self.core.resolve(name, Right.PUBLISH)
-        urgent = is_urgent(priority)
-        made = self.driver.run(
-            lambda: self.core.advertise(
-                topic,
-                reliable=reliable,
-                urgent=urgent,
-                latched=latched,
-                is_global=is_global,
-                description=description,
-                paths=paths_value(paths),
-                options=SendOptions(
-                    deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
-                ),
-            )
-        )
-        publisher = Publisher(self, topic, made, reliable=reliable)
-        self._opened.append(publisher)
-        return publisher
-
-    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES, paths: Paths = 1) -> Subscription:
-        """Subscribe to a name; iterate over the returned object.
-
-        Args:
-            name: as for ``publisher``.
-            queue: most messages that wait for the program; beyond it, and beyond 64 MiB, the oldest one is dropped.
-            paths: 2 or ``spread``: frames come over two disjoint paths, as the publisher says if it uses two as well.
-
-        Raises:
-            DelegationError: the node may not read it.
-            LocalError: the session subscribes to it already.
-        """
-        if queue < 1:
-            raise LocalError(f"queue is at least 1, not {queue}")
-        topic = self.core.resolve(name, Right.READ)
-        subscription = Subscription(
-            self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue, paths_value(paths)))
-        )
-        self._opened.append(subscription)
-        return subscription
+    _publisher_type, _subscription_type, _server_type = Publisher, Subscription, Server
 
     def receive_any(
         self, subscriptions: Collection[Subscription], timeout_s: float | None = None
@@ -317,51 +216,6 @@ class Session(BaseSession[Driver]):
             if not any(each in self._opened for each in subscriptions):
                 raise ClosedError("every subscription is closed; subscribe again")
         raise SessionTimeoutError(f"no message on {len(subscriptions)} subscription(s) within {timeout_s:g} s")
-
-    def serve(
-        self,
-        name: NameLike,
-        handler: Callable[[Request], bytes],
-        *,
-        workers: int = 1,
-        priority: Priority = "normal",
-        is_global: bool = True,
-        paths: Paths = 1,
-        sign: Sign = "always",
-    ) -> Server:
-        """Serve a name: ``handler`` gets each request and returns the response.
-
-        Args:
-            name: as for ``publisher``.
-            handler: called in a worker thread. If it raises, the client gets the error's text, and may call another
-            server.
-            workers: number of threads, and so of requests that are handled at the same time.
-            paths: 2: requests and responses travel over two disjoint paths, of clients with 2 as well.
-            sign: ``session``: responses, and requests to one server, have no signature where the client says the same.
-            They prove their writer to the other end, and to no third party.
-
-        Raises:
-            DelegationError: the node may not serve it.
-            LocalError: the session serves, calls or reads it already.
-        """
-        if workers < 1:
-            raise LocalError(f"workers is at least 1, not {workers}")
-        topic = self.core.resolve(name, Right.SERVE)
-        urgent, options = is_urgent(priority), SendOptions(priority=priority)
-        core = self.driver.run(
-            lambda: self.core.serve(
-                topic,
-                at_once=workers,
-                is_global=is_global,
-                urgent=urgent,
-                options=options,
-                paths=paths_value(paths),
-                is_session=session_value(sign),
-            )
-        )
-        server = Server(self, topic, core, handler, workers)
-        self._opened.append(server)
-        return server
 
     def call(
         self,
@@ -398,14 +252,6 @@ class Session(BaseSession[Driver]):
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")
         return call.response
-
-    def reload(self) -> None:
-        """Read the delegations again: renewed ones and new names take effect without a message lost.
-
-        Raises:
-            LocalError: a file is malformed, or readable for others.
-        """
-        self.driver.run(self._node.reload)
 
     def close(self, linger_s: float = LINGER_S) -> None:
         """Close all publishers, subscriptions and servers, and leave the overlay. Idempotent.

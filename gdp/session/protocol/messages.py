@@ -6,14 +6,16 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias, Union
+from typing import Literal, NamedTuple, TypeAlias, Union
 
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.right import Right
 
-__all__ = ["DelegatedName", "Message", "NameLike", "Request", "Response", "describe"]
+__all__ = ["DelegatedName", "Message", "NameLike", "Paths", "Request", "Response", "Sign", "describe"]
 
+Paths = Literal[1, 2, "spread"]
+Sign = Literal["always", "session"]
 NameLike: TypeAlias = Union[str, Name, Metadata]  # noqa: UP007 (typing.get_type_hints on 3.10)
 """A name: the ``name`` of its metadata, 64 hex digits, a ``Name``, or the metadata."""
 

@@ -1,29 +1,47 @@
 """State that sessions for threads and for asyncio have in common: what they opened, its counters, its errors.
 
-Sans-I/O; ``session.py`` and ``aio.py`` add the calls that wait.
+Sans-I/O, by its driver; ``session.py`` and ``aio.py`` add the calls that wait.
 """
 
 from __future__ import annotations
 
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import Priority, SendOptions, is_urgent
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.replication import Replication
 from gdp.session.protocol.client_core import Call
-from gdp.session.protocol.core import Inbox, SessionCore, replication_of
+from gdp.session.protocol.core import QUEUE_MESSAGES, Inbox, SessionCore, replication_of
 from gdp.session.protocol.errors import AttachError, ClosedError, SessionTimeoutError
-from gdp.session.protocol.messages import DelegatedName, NameLike
+from gdp.session.protocol.messages import DelegatedName, NameLike, Paths, Sign
 from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import PAYLOAD_MAX_BYTES
+from gdp.trust.advertisement import paths_value, session_value
 from gdp.trust.right import Right
 
-__all__ = ["BasePublisher", "BaseServer", "BaseSession", "BaseSubscription", "Node", "Opened"]
+__all__ = ["BasePublisher", "BaseServer", "BaseSession", "BaseSubscription", "Node", "Opened", "Runner"]
 
-_D = TypeVar("_D")
+T = TypeVar("T")
+
+
+class Runner(Protocol):
+    """Interface of a driver to what a session opened."""
+
+    def run(self, command: Callable[[], T]) -> T:
+        """Run a command on the node and return what it returns; it must not block."""
+
+
+_D = TypeVar("_D", bound=Runner)
+_P = TypeVar("_P", bound="BasePublisher[Any]")
+_S = TypeVar("_S", bound="BaseSubscription[Any]")
+_V = TypeVar("_V", bound="BaseServer[Any, Any]")
+_H = TypeVar("_H")
 
 
 class Node(Protocol):
@@ -46,8 +64,12 @@ class Node(Protocol):
         """Close the device."""
 
 
-class BaseSession(Generic[_D]):
-    """A session with a driver of type ``_D``."""
+class BaseSession(Generic[_D, _P, _S, _V, _H]):
+    """A session with a driver of type ``_D``, what it opens, and its handlers of requests."""
+
+    _publisher_type: type[_P]
+    _subscription_type: type[_S]
+    _server_type: type[_V]
 
     def __init__(self, node: Node, driver: _D) -> None:
         self.core = node.core
@@ -70,6 +92,135 @@ class BaseSession(Generic[_D]):
     def is_attached(self) -> bool:
         """Return whether a switch has accepted the node and its advertisements."""
         return self.core.member.attachment.is_attached
+
+    def publisher(
+        self,
+        name: NameLike,
+        *,
+        reliable: bool = True,
+        priority: Priority = "normal",
+        latched: int = 0,
+        is_global: bool = True,
+        description: bytes = b"",
+        paths: Paths = 1,
+        deadline_s: float | None = None,
+        weight: int = 1,
+        max_bits_s: float | None = None,
+        repairs: bool = True,
+    ) -> _P:
+        """Publish a name from now on.
+
+        Args:
+            name: ``name`` of its metadata, such as ``"camera"``; 64 hex digits; a ``Name``; or the ``Metadata``.
+            reliable: whether readers get every message, in order; otherwise lost messages stay lost.
+            priority: one of seven, ``"urgent"`` to ``"background"``; ``"urgent"`` precedes others in every queue.
+            latched: how many of the last messages late readers get.
+            is_global: whether other domains can find the name.
+            description: information that readers need to decode the messages; it travels sealed.
+            paths: 2: each frame travels over two disjoint paths. ``spread``: large messages are striped over them. The
+                readers subscribe with either as well.
+            deadline_s: without ``reliable``: a message that cannot leave whole within this time is dropped, above 0 and
+                at most 3600. None: a message that has waited for 50 ms gives way to a newer one.
+            weight: share of a full path, next to other names of the same priority, 1 to 100.
+            max_bits_s: most bits of frames a second, 1e3 to 1e12. None: what the path carries.
+            repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.
+
+        Raises:
+            DelegationError: the node may not publish it.
+            LocalError: the session publishes it already, or an option is out of bounds.
+        """
+        topic = self.core.resolve(name, Right.PUBLISH)
+        urgent = is_urgent(priority)
+        made = self.driver.run(
+            lambda: self.core.advertise(
+                topic,
+                reliable=reliable,
+                urgent=urgent,
+                latched=latched,
+                is_global=is_global,
+                description=description,
+                paths=paths_value(paths),
+                options=SendOptions(
+                    deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
+                ),
+            )
+        )
+        publisher = self._publisher_type(self, topic, made, reliable=reliable)
+        self._opened.append(publisher)
+        return publisher
+
+    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES, paths: Paths = 1) -> _S:
+        """Subscribe to a name; iterate over the returned object.
+
+        Args:
+            name: as for ``publisher``.
+            queue: most messages that wait for the program; beyond it, and beyond 64 MiB, the oldest one is dropped.
+            paths: 2 or ``spread``: frames come over two disjoint paths, as the publisher says if it uses two as well.
+
+        Raises:
+            DelegationError: the node may not read it.
+            LocalError: the session subscribes to it already.
+        """
+        if queue < 1:
+            raise LocalError(f"queue is at least 1, not {queue}")
+        topic = self.core.resolve(name, Right.READ)
+        inbox = self.driver.run(lambda: self.core.subscribe(topic, queue, paths_value(paths)))
+        subscription = self._subscription_type(self, topic, inbox)
+        self._opened.append(subscription)
+        return subscription
+
+    def serve(
+        self,
+        name: NameLike,
+        handler: _H,
+        *,
+        workers: int = 1,
+        priority: Priority = "normal",
+        is_global: bool = True,
+        paths: Paths = 1,
+        sign: Sign = "always",
+    ) -> _V:
+        """Serve a name: ``handler`` gets each request and returns the response.
+
+        Args:
+            name: as for ``publisher``.
+            handler: called in a worker thread; with asyncio a coroutine function. If it raises, the client gets the
+                error's text, and may call another server.
+            workers: number of threads or tasks, and so of requests that are handled at the same time.
+            paths: 2: requests and responses travel over two disjoint paths, of clients with 2 as well.
+            sign: ``session``: responses, and requests to one server, have no signature where the client says the same.
+            They prove their writer to the other end, and to no third party.
+
+        Raises:
+            DelegationError: the node may not serve it.
+            LocalError: the session serves, calls or reads it already.
+        """
+        if workers < 1:
+            raise LocalError(f"workers is at least 1, not {workers}")
+        topic = self.core.resolve(name, Right.SERVE)
+        urgent, options = is_urgent(priority), SendOptions(priority=priority)
+        core = self.driver.run(
+            lambda: self.core.serve(
+                topic,
+                at_once=workers,
+                is_global=is_global,
+                urgent=urgent,
+                options=options,
+                paths=paths_value(paths),
+                is_session=session_value(sign),
+            )
+        )
+        server = self._server_type(self, topic, core, handler, workers)
+        self._opened.append(server)
+        return server
+
+    def reload(self) -> None:
+        """Read the delegations again: renewed ones and new names take effect without a message lost.
+
+        Raises:
+            LocalError: a file is malformed, or readable for others.
+        """
+        self.driver.run(self._node.reload)
 
     def why_not(self, name: Name, otherwise: str) -> str:
         """Return the end of an error's sentence: why no data flows on a name, as far as this node knows."""
@@ -98,7 +249,7 @@ class BaseSession(Generic[_D]):
 class Opened(Generic[_D]):
     """An object that a session opened for one name."""
 
-    def __init__(self, session: BaseSession[_D], topic: Topic) -> None:
+    def __init__(self, session: BaseSession[_D, Any, Any, Any, Any], topic: Topic) -> None:
         self._session = session
         self._driver = session.driver
         self._topic = topic
@@ -117,7 +268,9 @@ class Opened(Generic[_D]):
 class BasePublisher(Opened[_D]):
     """Publisher of one name."""
 
-    def __init__(self, session: BaseSession[_D], topic: Topic, publisher: Publisher, *, reliable: bool) -> None:
+    def __init__(
+        self, session: BaseSession[_D, Any, Any, Any, Any], topic: Topic, publisher: Publisher, *, reliable: bool
+    ) -> None:
         super().__init__(session, topic)
         self._publisher = publisher
         self._is_reliable = reliable
@@ -162,6 +315,13 @@ class BasePublisher(Opened[_D]):
         """Return whether large messages get parity against loss: the rule allows it, and NumPy is installed."""
         return self._publisher.parity.is_enabled and self._publisher.parity.is_available
 
+    def close(self) -> None:
+        """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._session.forget(self)
+            self._driver.run(partial(self._session.core.member.withdraw, self.name))
+
     def _check(self, payload: bytes) -> None:
         """Return if a message may be published."""
         if self._is_closed:
@@ -190,7 +350,7 @@ class BasePublisher(Opened[_D]):
 class BaseSubscription(Opened[_D]):
     """Messages of one name."""
 
-    def __init__(self, session: BaseSession[_D], topic: Topic, inbox: Inbox) -> None:
+    def __init__(self, session: BaseSession[_D, Any, Any, Any, Any], topic: Topic, inbox: Inbox) -> None:
         super().__init__(session, topic)
         self._inbox = inbox
         self._messages = inbox.messages
@@ -214,6 +374,13 @@ class BaseSubscription(Opened[_D]):
         """Return whether ``receive`` would return, or raise, at once."""
         return bool(self._messages) or self._is_closed
 
+    def close(self) -> None:
+        """Unsubscribe. Idempotent."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._session.forget(self)
+            self._driver.run(partial(self._session.core.unsubscribe, self._inbox))
+
     def _no_message(self, timeout_s: float | None) -> SessionTimeoutError:
         hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
         return SessionTimeoutError(f"{self._label}: no message within {timeout_s:g} s{hint}")
@@ -222,12 +389,25 @@ class BaseSubscription(Opened[_D]):
         return ClosedError(f"the subscription to {self._label} is closed; subscribe again")
 
 
-class BaseServer(Opened[_D]):
-    """Server of one name."""
+class BaseServer(Opened[_D], Generic[_D, _H]):
+    """Server of one name with ``workers`` that call a handler."""
 
-    def __init__(self, session: BaseSession[_D], topic: Topic, server: ServerCore) -> None:
+    def __init__(
+        self,
+        session: BaseSession[_D, Any, Any, Any, Any],
+        topic: Topic,
+        server: ServerCore,
+        handler: _H,
+        workers: int,
+    ) -> None:
         super().__init__(session, topic)
         self._core = server
+        self._handler = handler
+        self._start(workers)
+
+    def _start(self, workers: int) -> None:
+        """Start the workers."""
+        raise NotImplementedError
 
     @property
     def clients(self) -> int:
