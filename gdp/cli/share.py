@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Optional
@@ -17,7 +17,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.machine import directory_of
-from gdp.cli.output import moment, show
+from gdp.cli.output import moment, show, table
 from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
@@ -201,7 +201,7 @@ def import_names(
             offers = [_offer_fields(*each) for each in sharing.offers()]
             accepted = [each.model_dump() for each in sharing.state().accepted]
             fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
-            show(fields, as_json=as_json, plain=_table(offers, _OFFER_COLUMNS))
+            show(fields, as_json=as_json, plain=table(offers, _OFFER_COLUMNS))
         elif name is None:
             raise LocalError("import: state a NAME, or --list")
         elif remove:
@@ -250,7 +250,7 @@ def share(
             state = sharing.state()
             issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
             fields = {"exposed": _exposed_fields(state), "shared": issued}
-            show(fields, as_json=as_json, plain=_table(issued, _ISSUED_COLUMNS))
+            show(fields, as_json=as_json, plain=table(issued, _ISSUED_COLUMNS))
             return
         if renew:
             _show_change("all", sharing.work(time.time()), as_json=as_json)
@@ -355,8 +355,8 @@ def _show_change(
         "delegated": delegated,
         "problems": report.problems,
     }
-    tables = [_table(delegated, _ISSUED_COLUMNS)] if delegated else []
-    tables += [_table(taken, _OFFER_COLUMNS)] if taken else []
+    tables = [table(delegated, _ISSUED_COLUMNS)] if delegated else []
+    tables += [table(taken, _OFFER_COLUMNS)] if taken else []
     show(fields, as_json=as_json, plain="\n".join([f"{name}: {applied}", *tables]))
     lacking = [str(each["state"]) for each in (*delegated, *taken) if str(each["state"]).startswith(_NOT_IN_FORCE)]
     for text in report.problems:
@@ -397,17 +397,3 @@ def _offer_fields(offer: Offer, state: str) -> dict[str, object]:
 
 def _exposed_fields(state: ShareState) -> list[dict[str, object]]:
     return [{"kind": each.kind, "name": each.name, "to": each.to, "days": each.days} for each in state.exposed]
-
-
-def _table(rows: Sequence[Mapping[str, object]], keys: Sequence[str]) -> str:
-    """Return rows as aligned columns under their keys."""
-    cells = [list(keys), *([_cell(row[key]) for key in keys] for row in rows)]
-    widths = [max(len(row[at]) for row in cells) for at in range(len(keys))]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
-    return "\n".join(lines)
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
