@@ -20,8 +20,10 @@ _PAGE = ROOT / "docs/tutorials/library.md"
 def test_the_tutorial_of_the_library_does_what_it_says() -> None:
     shown = blocks(_PAGE)
     make, delegate, nodes = (block.text for block in shown if block.language == "bash")
+    (rights,) = (block for block in shown if block.language == "yaml")
     subscribe, publish, serve, call, subscribe_async = (block.text for block in shown if block.language == "python")
     with session_lab({}) as lab:
+        (lab.folder / rights.title).write_text(rights.text)
         for script in (make, delegate):
             lab.output(lab.start_command(["bash", "-e", "-c", script]))
         for line in nodes.splitlines():

@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 
 from gdp.crypto.certificates import Role
+from gdp.management.control_client import ask_node, find_control_socket
 from gdp.metadata import Metadata
+from gdp.state.control_protocol import Command
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS
 from gdp.trust.right import Right
@@ -228,3 +230,21 @@ def test_the_far_graph_shows_a_publishers_qos_before_any_reader_and_the_first_la
     site.listener.tell("!read_latched('/robot_description')")
     site.listener.waits_for("got['/robot_description']", ["a robot"])
     assert site.listener.tell("incompatible") == []
+
+
+def test_a_name_that_its_machine_no_longer_exposes_leaves_the_far_graph_and_comes_back(site: Site) -> None:
+    def imported() -> set[object]:
+        names = ask_node(find_control_socket(site.home / "server" / "proxy"), Command.STATUS, PATIENCE_S).result
+        return {each["local"] for each in names["liveliness"] if each["side"] == "import"}  # type: ignore[attr-defined]
+
+    topic, expose = "/clock", ("expose", "robot", "/clock", "--to", "server", "--wait", str(PATIENCE_S))
+    assert site.gdp("import", "server", topic)["is_running"] is True
+    for _ in range(2):
+        assert site.gdp(*expose)["delegated"]
+        assert site.gdp("import", "server", "--list")["offers"][0]["state"] == "used"
+        site.listener.waits_for(f"offered('{topic}')", [["BEST_EFFORT", "VOLATILE"]])
+        assert topic in imported()
+        assert site.gdp("expose", "robot", topic, "--remove")["problems"] == []
+        assert site.gdp("import", "server", "--list")["offers"][0]["state"] == "withdrawn: robot no longer exposes it"
+        site.listener.waits_for(f"offered('{topic}')", [])
+        assert topic not in imported()

@@ -25,6 +25,7 @@ from gdp.cli.output import (
     show,
     span,
 )
+from gdp.cli.rights_file import delegate_rights
 from gdp.cli.salt import SaltFile
 from gdp.cli.version import HELP, versioned
 from gdp.crypto.statements import parse
@@ -60,8 +61,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings=HELP,
-    help="Let nodes act on names: all that proxies need by their files, or one name; or a switch attract a node's"
-    " traffic. The command rules is the default: gdp delegate --owner owner robot/proxy.yaml",
+    help="Let nodes act on names: all that proxies need by their files, a file of rights, or one name; or a switch"
+    " attract a node's traffic. The command rules is the default: gdp delegate --owner owner robot/proxy.yaml",
 )
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
@@ -78,6 +79,7 @@ NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's
 
 
 app.command(_RULES, context_settings=ANY_ARGUMENTS)(rules_of_proxies)
+app.command("rights", no_args_is_help=True)(delegate_rights)
 app.command("ls", no_args_is_help=True)(ls)
 app.command("show", no_args_is_help=True)(show_file)
 

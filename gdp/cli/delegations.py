@@ -21,7 +21,7 @@ from gdp.stores.keyring import DELEGATIONS, load_delegation
 from gdp.trust.adcert import AdCert
 from gdp.trust.delegation import Delegation
 
-__all__ = ["described", "ls", "show_file"]
+__all__ = ["described", "ls", "show_file", "until"]
 
 _MEANING: Final = ("kind", "name", "type")
 
@@ -71,12 +71,17 @@ def described(delegation: Delegation) -> dict[str, object]:
     }
 
 
+def until(delegation: Delegation) -> str | None:
+    """Return when the first link of a delegation ends; None: it has no end."""
+    end_unix_s = min((each.not_after_unix_s for each in _validities(delegation)), default=None)
+    return None if end_unix_s is None else moment(end_unix_s)
+
+
 def _row(file: Path, delegation: Delegation) -> dict[str, object]:
     known: Mapping[str, str | int] = delegation.metadata or {}
-    until_unix_s = min((each.not_after_unix_s for each in _validities(delegation)), default=None)
     return {
         "state": _state(delegation, time.time()),
-        "until": None if until_unix_s is None else moment(until_unix_s),
+        "until": until(delegation),
         "rights": sorted(right.value for right in delegation.rights),
         **{f"ros_{key}" if key == "name" else key: known.get(key) for key in _MEANING},
         "name": delegation.name.to_text(),

@@ -14,11 +14,21 @@ from gdp.cli.salt import NAME_SALT, read_salt
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import SALT, Metadata
+from gdp.state.columns import columns
 from gdp.terminal import echo
 from gdp.trust.grants import EPOCH_MAX
 from gdp.trust.right import Right
 
-__all__ = ["epochs_from_text", "items_from_text", "metadata_from_options", "moment", "rights_from_text", "show", "span"]
+__all__ = [
+    "epochs_from_text",
+    "items_from_text",
+    "metadata_from_options",
+    "moment",
+    "rights_from_text",
+    "show",
+    "span",
+    "table",
+]
 
 
 def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = None) -> None:
@@ -31,6 +41,11 @@ def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = Non
         width = max(map(len, result))
         for key, value in result.items():
             echo(f"{key:<{width}}  {_text(value)}")
+
+
+def table(rows: Sequence[Mapping[str, object]], keys: Sequence[str]) -> str:
+    """Return rows as aligned columns under their keys."""
+    return "\n".join(columns(keys, [[_text(row[key]) for key in keys] for row in rows]))
 
 
 def moment(unix_s: int) -> str:

@@ -17,7 +17,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.machine import directory_of
-from gdp.cli.output import moment, show
+from gdp.cli.output import moment, show, table
 from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
@@ -28,7 +28,7 @@ from gdp.sharing.proxy_files import ProxyFiles, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.revocations import publish_revocations
 from gdp.sharing.rules import kind_from_text
-from gdp.sharing.sharing import NOT_USED, Sharing
+from gdp.sharing.sharing import NOT_USED, WITHDRAWN, Sharing
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, load_card, load_owner
@@ -43,7 +43,7 @@ _OWNER: Final = "owner"
 _POLL_S: Final = 0.1
 _PARTLY: Final = 1
 _WAITS: Final = "waits for delivery"
-_NOT_IN_FORCE: Final = (NOT_USED, _WAITS)  # states begin so
+_NOT_IN_FORCE: Final = (NOT_USED, WITHDRAWN, _WAITS)  # states begin so
 _ISSUED_COLUMNS: Final = ("name", "type", "node", "rights", "until", "state")
 _OFFER_COLUMNS: Final = ("name", "type", "from", "rights", "until", "state")
 
@@ -198,17 +198,20 @@ def import_names(
     with _sharing(directory, exchange, None) as sharing:
         if show_list:
             report = sharing.work(time.time())
-            offers = [_offer_fields(*each) for each in sharing.offers()]
-            accepted = [each.model_dump() for each in sharing.state().accepted]
-            fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
-            show(fields, as_json=as_json, plain=_table(offers, _OFFER_COLUMNS))
+            accepted = sharing.state().accepted
+            offers = [_offer_fields(*each, accepted) for each in sharing.offers()]
+            listed = [each.model_dump() for each in accepted]
+            fields = {"offers": offers, "accepted": listed, "problems": report.problems}
+            show(fields, as_json=as_json, plain=table(offers, _OFFER_COLUMNS))
         elif name is None:
             raise LocalError("import: state a NAME, or --list")
         elif remove:
             _show_change(name, sharing.stop_accepting("import", name, time.time()), as_json=as_json)
         else:
             report = sharing.accept(AcceptedName(side="import", name=name, source=source), time.time())
-            found = [each for each in sharing.offers() if each[1] != "offered" and fits(name, each[0].ros_name)]
+            accepted = sharing.state().accepted
+            offers = [_offer_fields(*each, accepted) for each in sharing.offers()]
+            found = [each for each in offers if each["accepted"] and fits(name, str(each["name"]))]
             _show_change(name, report, as_json=as_json, offers=found, awaited="as soon as a node offers it")
 
 
@@ -250,7 +253,7 @@ def share(
             state = sharing.state()
             issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
             fields = {"exposed": _exposed_fields(state), "shared": issued}
-            show(fields, as_json=as_json, plain=_table(issued, _ISSUED_COLUMNS))
+            show(fields, as_json=as_json, plain=table(issued, _ISSUED_COLUMNS))
             return
         if renew:
             _show_change("all", sharing.work(time.time()), as_json=as_json)
@@ -337,15 +340,16 @@ def _show_change(
     report: ShareReport,
     *,
     as_json: bool,
-    offers: Sequence[tuple[Offer, str]] | None = None,
+    offers: Sequence[Mapping[str, object]] | None = None,
     awaited: str = "",
 ) -> None:
     """Print what a change did; problems go to stderr."""
     delegated = [_issued_fields(each) for each in report.granted]
-    taken = [_offer_fields(*each) for each in offers or ()]
+    taken = offers or ()
     given = {} if offers is None else {"offers": taken}
+    is_awaited = not delegated and all(str(each["state"]).startswith(WITHDRAWN) for each in taken)
     applied = {True: "now", False: "at the next start of the proxy", None: "nothing to apply"}[report.is_running]
-    if awaited and not delegated and not offers and report.is_running is not False:
+    if awaited and is_awaited and report.is_running is not False:
         applied = awaited
     fields = {
         "name": name,
@@ -355,8 +359,8 @@ def _show_change(
         "delegated": delegated,
         "problems": report.problems,
     }
-    tables = [_table(delegated, _ISSUED_COLUMNS)] if delegated else []
-    tables += [_table(taken, _OFFER_COLUMNS)] if taken else []
+    tables = [table(delegated, _ISSUED_COLUMNS)] if delegated else []
+    tables += [table(taken, _OFFER_COLUMNS)] if taken else []
     show(fields, as_json=as_json, plain="\n".join([f"{name}: {applied}", *tables]))
     lacking = [str(each["state"]) for each in (*delegated, *taken) if str(each["state"]).startswith(_NOT_IN_FORCE)]
     for text in report.problems:
@@ -381,7 +385,7 @@ def _issued_fields(issued: IssuedDelegation) -> dict[str, object]:
     }
 
 
-def _offer_fields(offer: Offer, state: str) -> dict[str, object]:
+def _offer_fields(offer: Offer, state: str, accepted: Sequence[AcceptedName]) -> dict[str, object]:
     return {
         "kind": offer.kind,
         "name": offer.ros_name,
@@ -390,24 +394,10 @@ def _offer_fields(offer: Offer, state: str) -> dict[str, object]:
         "rights": sorted(right.value for right in offer.delegation.rights),
         "until": moment(offer.until_unix_s),
         "owner": offer.owner.compressed.hex(),
-        "accepted": state != "offered",
+        "accepted": any(offer.fits(each) for each in accepted),
         "state": state,
     }
 
 
 def _exposed_fields(state: ShareState) -> list[dict[str, object]]:
     return [{"kind": each.kind, "name": each.name, "to": each.to, "days": each.days} for each in state.exposed]
-
-
-def _table(rows: Sequence[Mapping[str, object]], keys: Sequence[str]) -> str:
-    """Return rows as aligned columns under their keys."""
-    cells = [list(keys), *([_cell(row[key]) for key in keys] for row in rows)]
-    widths = [max(len(row[at]) for row in cells) for at in range(len(keys))]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
-    return "\n".join(lines)
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -10,23 +10,29 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from gdp.config.yaml_source import read_yaml
+from gdp.crypto.cbor import decode, encode
 from gdp.crypto.certificates import Role, Root
+from gdp.crypto.fields import Fields
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["Exchange", "Mail", "MailKind", "load_groups", "proxies_of", "resolve_recipients"]
+__all__ = ["Exchange", "Exposure", "Mail", "MailKind", "load_groups", "proxies_of", "resolve_recipients"]
+
+
+_EXPOSURE_MAX_BYTES: Final = 256
 
 
 class MailKind(str, Enum):
-    """Kind of a mail between the parties of a delegation; QoS comes after the delegation of its topic."""
+    """Kind of a mail between the parties of a delegation; QoS and exposure come after the delegation of their name."""
 
     DELEGATION = "share"
     REVOCATION = "share-revocation"
     QOS = "share-qos"
+    EXPOSURE = "share-exposure"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +47,25 @@ class Mail:
     sender: str
     kind: str
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Whether the machine that offered a name exposes it: body of a mail, which is sent where that changes."""
+
+    name: Name
+    is_exposed: bool
+
+    def to_wire(self) -> bytes:
+        """Return the body of the mail."""
+        return encode({"name": self.name, "exposed": self.is_exposed})
+
+    @classmethod
+    def from_wire(cls, wire: bytes) -> Exposure:
+        """Read the body of a mail. Raises ``StatementError``: it is malformed."""
+        value = decode(wire, _EXPOSURE_MAX_BYTES)
+        fields = Fields(value if isinstance(value, dict) else {})
+        return cls(fields.name("name"), fields.flag("exposed"))
 
 
 class Exchange(Protocol):

@@ -16,7 +16,7 @@ from gdp.crypto.certificates import Root
 from gdp.errors import GdpError
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
-from gdp.sharing.exchange import Exchange, MailKind, proxies_of, resolve_recipients
+from gdp.sharing.exchange import Exchange, Exposure, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
 from gdp.sharing.report import ShareReport
@@ -29,6 +29,7 @@ from gdp.trust.right import Right
 __all__ = ["GIVING", "TAKING", "Grants", "described"]
 
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+_GIVES: Final = frozenset(GIVING.values())
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
 
 
@@ -156,21 +157,27 @@ class Grants:
         self.report.granted.append(issued)
         return issued
 
-    def renew(self, owners: Iterable[IssuedStore], qos: Mapping[Name, OfferedQos]) -> None:
+    def renew(self, owners: Iterable[IssuedStore], state: ShareState, qos: Mapping[Name, OfferedQos]) -> None:
         """Renew delegations after two thirds of their life, grant tomorrow's epoch, and deliver what waits.
 
         A node that has left the domain gets nothing.
 
         Args:
+            state: nodes that take a name learn when its last rule here goes, and when one comes again.
             qos: of the topics that the live proxy exposes; nodes that may read one learn what is new of it.
         """
         for store in owners:
             issued_of, held = list(store), defaultdict[Name, set[int]](set)
+            given_to_others = set[Name]()
             for each in issued_of:
                 held[each.delegation.name] |= set() if each.is_revoked else set(each.delegation.grants)
+                if not each.is_own and not each.is_revoked and each.delegation.rights & _GIVES:
+                    given_to_others.add(each.delegation.name)
             for issued in issued_of:
                 try:
                     self._renew(store, issued, held[issued.delegation.name])
+                    is_exposed = issued.delegation.name in given_to_others or self._is_exposed(issued.metadata, state)
+                    self._send_exposure(store, issued, is_exposed=is_exposed)
                     self._send_qos(store, issued, qos)
                 except GdpError as error:
                     self.report.problems.append(
@@ -201,14 +208,35 @@ class Grants:
         qos, is_reader = offered.get(name), not issued.is_own and Right.READ in issued.delegation.rights
         if qos is None or qos == issued.qos or not is_reader:
             return
-        latest = store.find(name, issued.descriptor.name)  # a renewal may have written another
+        self._inform(store, issued, MailKind.QOS, qos.to_wire(name), {"qos": qos})
+
+    def _send_exposure(self, store: IssuedStore, issued: IssuedDelegation, *, is_exposed: bool) -> None:
+        """Tell a node that takes a name whether it is exposed, where that has changed; a new delegation says it is."""
+        known, takes = issued.is_exposed, issued.delegation.rights - _GIVES
+        if issued.is_own or not takes or is_exposed is bool(known):
+            return
+        wire = Exposure(issued.delegation.name, is_exposed).to_wire()
+        self._inform(store, issued, MailKind.EXPOSURE, None if known is None else wire, {"is_exposed": is_exposed})
+
+    def _inform(
+        self, store: IssuedStore, issued: IssuedDelegation, kind: MailKind, wire: bytes | None, known: dict[str, object]
+    ) -> None:
+        """Send a mail, if there is one, and record what the node then knows; what fails is reported."""
+        latest = store.find(issued.delegation.name, issued.descriptor.name)  # a renewal may have written another
         if latest is None or not latest.is_delivered or latest.is_revoked:
             return
         try:
-            self.exchange.send(issued.descriptor.name, MailKind.QOS.value, qos.to_wire(name))
-            store.save(latest.model_copy(update={"qos": qos}))
+            if wire is not None:
+                self.exchange.send(issued.descriptor.name, kind.value, wire)
+            store.save(latest.model_copy(update=known))
         except GdpError as error:
             self.report.add_problem(error)
+
+    def _is_exposed(self, metadata: Metadata, state: ShareState) -> bool:
+        """Return whether a rule of this machine may mean a name; what its metadata are does not matter."""
+        rules = [(each.kind, each.name) for each in self.files.rules if each.side == "expose"]
+        rules += [(each.kind, each.name) for each in state.exposed]
+        return any(kind == metadata["kind"] and fits(name, str(metadata["name"])) for kind, name in rules)
 
     def _has_daily_epochs(self, metadata: Metadata) -> bool:
         """Return whether a name gets them; holders of a plain one may have delegations that a person wrote."""

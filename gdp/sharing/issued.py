@@ -54,6 +54,7 @@ class IssuedDelegation(Section):
         is_delivered: whether it was installed here, or left in the node's mailbox.
         is_revoked: whether the owner took it back.
         qos: of the topic, as last sent to the node; None: not yet.
+        is_exposed: whether the name is exposed, as the node knows it; None: it never was, here or by another node.
     """
 
     label: str
@@ -68,6 +69,7 @@ class IssuedDelegation(Section):
     is_delivered: bool = False
     is_revoked: bool = False
     qos: OfferedQos | None = None
+    is_exposed: bool | None = None
 
     @property
     def delegation(self) -> Delegation:
@@ -161,6 +163,7 @@ class IssuedStore:
                 OpenLink(fingerprint=link.fingerprint.hex(), until_unix_s=link.validity.not_after_unix_s),
             ),
             is_own=is_own,
+            is_exposed=None if before is None or before.is_revoked else before.is_exposed,
         )
         self.save(issued)
         return issued

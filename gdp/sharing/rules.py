@@ -85,9 +85,11 @@ def check_accepted(files: ProxyFiles, state: ShareState, offers: Sequence[Offer]
 def usable(
     files: ProxyFiles, state: ShareState, offers: Sequence[Offer], unused: dict[Name, str]
 ) -> Iterator[tuple[Side, Offer]]:
-    """Yield the accepted offers with their side; ``unused`` gets the reason of each that cannot be used."""
+    """Yield the accepted offers with their side, except withdrawn ones; ``unused`` gets why another cannot be used."""
     taken = set[tuple[str, str]]()
     for offer in offers:
+        if offer.is_withdrawn:
+            continue
         key = (offer.kind, offer.ros_name)
         sides = {each.side for each in state.accepted if offer.fits(each)}
         for side in sides:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -18,7 +19,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
-from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
+from gdp.sharing.exchange import Exchange, Exposure, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import LiveNames, ProxyFiles, Side, StatedRule, fits
@@ -31,10 +32,11 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["GROUPS", "NOT_USED", "RevocationsSink", "Sharing"]
+__all__ = ["GROUPS", "NOT_USED", "WITHDRAWN", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
 NOT_USED: Final = "not used"  # begins the state of an accepted offer that conflicts
+WITHDRAWN: Final = "withdrawn"  # begins the state of an offer whose name the other machine no longer exposes
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
@@ -106,11 +108,13 @@ class Sharing:
             LocalError: it is not exposed, or the proxy refuses the change.
         """
         with self._change(unix_s) as at:
-            kept = tuple(each for each in at.state.exposed if (each.kind, each.name) != (kind, name))
-            if len(kept) == len(at.state.exposed):
+            removed = [each for each in at.state.exposed if (each.kind, each.name) == (kind, name)]
+            if not removed:
                 raise LocalError(f"{name} is not exposed by 'gdp expose'; a rule of {self._path.name} is removed there")
+            kept = tuple(each for each in at.state.exposed if each not in removed)
             at.state = at.state.model_copy(update={"exposed": kept})
             self._apply(at, is_required=True)
+            self._attempt(at, partial(self._renew, more=[each.owner for each in removed]))
         return at.report
 
     def accept(self, wanted: AcceptedName, unix_s: float) -> ShareReport:
@@ -211,7 +215,7 @@ class Sharing:
         return at.report
 
     def offers(self) -> list[tuple[Offer, str]]:
-        """Return the offers, each with its state: ``offered``, ``used``, or ``not used: `` and the reason.
+        """Return the offers, each with its state: ``offered``, ``used``, or ``not used``, ``withdrawn`` and the reason.
 
         Raises:
             LocalError: a file is invalid.
@@ -222,6 +226,8 @@ class Sharing:
         used = [each for _, each in usable(ProxyFiles.read(self._path), state, offers, unused)]
 
         def state_of(offer: Offer) -> str:
+            if offer.is_withdrawn:
+                return f"{WITHDRAWN}: {offer.sender} no longer exposes it"
             why = unused.get(offer.delegation.name)
             return "used" if offer in used else "offered" if why is None else f"{NOT_USED}: {why}"
 
@@ -304,9 +310,9 @@ class Sharing:
             at.grants.grant_exposed(at.state, at.live.undelegated, restored)
         self._reload_changed(at)
 
-    def _renew(self, at: _Pass) -> None:
-        folders = dict.fromkeys([*(each.owner for each in at.state.exposed), *self._owners])
-        at.grants.renew([IssuedStore(folder) for folder in folders], at.live.qos)
+    def _renew(self, at: _Pass, more: Sequence[Path] = ()) -> None:
+        folders = dict.fromkeys([*(each.owner for each in at.state.exposed), *self._owners, *more])
+        at.grants.renew([IssuedStore(folder) for folder in folders], at.state, at.live.qos)
         self._reload_changed(at)
 
     def _reload_changed(self, at: _Pass) -> None:
@@ -364,7 +370,12 @@ class Sharing:
                     self._take_revocation(at, mail)
                 elif mail.kind == MailKind.QOS.value:
                     name, qos = OfferedQos.from_wire(mail.data)
-                    at.state = self._folder.set_qos(at.state, name, mail.sender, qos)
+                    at.state = self._folder.update_offer(at.state, name, mail.sender, qos=qos)
+                    at.offers = list(self._folder.offers(at.state))
+                elif mail.kind == MailKind.EXPOSURE.value:
+                    stated = Exposure.from_wire(mail.data)
+                    is_withdrawn = not stated.is_exposed
+                    at.state = self._folder.update_offer(at.state, stated.name, mail.sender, is_withdrawn=is_withdrawn)
                     at.offers = list(self._folder.offers(at.state))
             except GdpError as error:
                 at.report.problems.append(f"mail from {mail.sender} is not taken: {error}")

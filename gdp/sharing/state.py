@@ -93,12 +93,18 @@ class AcceptedName(Section):
 
 
 class OfferSource(Section):
-    """Sender of an offer, its number in the order of arrival, when it came first, and the topic's QoS."""
+    """Sender of an offer, its number in the order of arrival, when it came first, and what the sender said later.
+
+    Args:
+        qos: of a topic; None: not known.
+        is_withdrawn: the sender no longer exposes the name.
+    """
 
     sender: str
     number: int
     received_unix_s: float
     qos: OfferedQos | None = None
+    is_withdrawn: bool = False
 
 
 class ShareState(Section):
@@ -117,6 +123,7 @@ class Offer:
     sender: str
     received_unix_s: float
     qos: OfferedQos | None = None
+    is_withdrawn: bool = False
 
     @property
     def kind(self) -> str:
@@ -198,7 +205,7 @@ class StateFolder:
         for name, source in sorted(state.offers.items(), key=lambda item: item[1].number):
             file = self.folder / _OFFERS / f"{name}.delegation"
             if file.exists():
-                stated = source.model_dump(include={"sender", "received_unix_s"})
+                stated = source.model_dump(include={"sender", "received_unix_s", "is_withdrawn"})
                 yield Offer(delegation=load_delegation(file), qos=source.qos, **stated)
 
     def save_offer(self, state: ShareState, delegation: Delegation, sender: str, unix_s: float) -> ShareState:
@@ -219,13 +226,13 @@ class StateFolder:
         first = before or OfferSource(sender=sender, number=number, received_unix_s=unix_s)
         return state.model_copy(update={"offers": {**state.offers, name: first}})
 
-    def set_qos(self, state: ShareState, name: Name, sender: str, qos: OfferedQos) -> ShareState:
-        """Return the state with the QoS of an offer. Raises ``LocalError``: the sender has not offered the name."""
+    def update_offer(self, state: ShareState, name: Name, sender: str, **news: object) -> ShareState:
+        """Return the state with fields of an offer's source. Raises ``LocalError``: the sender has not offered it."""
         text = name.to_text()
         source = state.offers.get(text)
         if source is None or source.sender != sender:
-            raise LocalError(f"QoS of {name.short}, which {sender} has not offered")
-        return state.model_copy(update={"offers": {**state.offers, text: source.model_copy(update={"qos": qos})}})
+            raise LocalError(f"news of {name.short}, which {sender} has not offered")
+        return state.model_copy(update={"offers": {**state.offers, text: source.model_copy(update=news)}})
 
     def remove_offer(self, state: ShareState, name: Name) -> ShareState:
         """Remove an offer; return the state without it."""

@@ -18,7 +18,8 @@ from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.errors import LocalError
+from gdp.errors import LocalError, StatementError
+from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
@@ -48,6 +49,7 @@ from gdp.stores.keyring import (
 )
 from gdp.stores.ledger import append_issued
 from gdp.stores.private_keys import Storage
+from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.audit import Action
 from gdp.trust.delegation import Delegation
 from gdp.trust.grants import SECRET_BYTES
@@ -71,6 +73,8 @@ __all__ = [
     "renew",
     "renew_node",
     "succeed_owner",
+    "valid_delegation",
+    "widened",
 ]
 
 DAY_S: Final = 86_400
@@ -333,6 +337,41 @@ def delegate(
     who, about = given.node.to_text(), given.name.to_text()
     note_once(owner, Action.ACCEPTED, "delegation", who=who, about=about, unix_s=_now(unix_s))
     return given
+
+
+def valid_delegation(
+    delegations: Iterable[Delegation], node: Recipient, name: Name, unix_s: float
+) -> Delegation | None:
+    """Return the node's delegation of a name, if it is valid at that time. Revocations are checked elsewhere."""
+    for delegation in delegations:
+        if delegation.name == name:
+            try:
+                chain = Chain.traverse(delegation.chain, delegation.subject, node.subject, AdCertCache(CHAIN_MAX))
+                for right in delegation.rights:
+                    chain.check(right, unix_s)
+            except StatementError:
+                return None  # expired, or of an earlier node here: a new one replaces it
+            return delegation
+    return None
+
+
+def widened(
+    owner: Path,
+    node: Recipient,
+    metadata: Metadata,
+    rights: Collection[Right],
+    held: Delegation | None,
+    epochs: Iterable[int] = (),
+    *,
+    days: float,
+) -> Delegation:
+    """Return a delegation of these rights and epochs, and of those that the node holds; by default epoch 0.
+
+    Raises:
+        LocalError: as ``delegate``.
+    """
+    before, known = (frozenset[Right](), ()) if held is None else (held.rights, held.grants.keys())
+    return delegate(owner, node, metadata, before.union(rights), {*known, *epochs} or (0,), days=days)
 
 
 def install_delegation(node: Path, delegation: Delegation, *, force: bool = False, unix_s: float | None = None) -> Path:

@@ -31,6 +31,7 @@ from gdp.crypto.keys import PublicKey
 from gdp.crypto.x509_profile import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.stores.checkout import ignore_folder, refuse_work_tree
 from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
 from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
@@ -49,6 +50,7 @@ __all__ = [
     "ROOT_CERTIFICATE",
     "ROOT_KEY",
     "SUCCESSION",
+    "delegation_file",
     "load_card",
     "load_delegation",
     "load_delegations",
@@ -231,9 +233,14 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
     Args:
         directory: a node's ``delegations``, or another directory from which it is copied there.
     """
-    name = delegation.name.to_text() + _DELEGATION_SUFFIX
-    _write_keys(directory, {name: private(delegation.to_wire())}, force=force)
-    return directory / name
+    file = delegation_file(directory, delegation.name)
+    _write_keys(directory, {file.name: private(delegation.to_wire())}, force=force)
+    return file
+
+
+def delegation_file(directory: Path, name: Name) -> Path:
+    """Return the file of a name's delegation in a directory of delegations."""
+    return directory / f"{name.to_text()}{_DELEGATION_SUFFIX}"
 
 
 def load_delegation(path: Path) -> Delegation:

@@ -15,7 +15,7 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.trust.delegation import Delegation
-from proxy.check.core.explain import explain
+from proxy.check.core.explain import explain, unknown_qos
 from proxy.check.core.finding import Finding
 from proxy.check.graph_snapshot import read_graphs
 from proxy.check.table import table
@@ -39,7 +39,7 @@ def check_proxy(path: Path, settings: ProxyConfig, *, json: bool) -> int:
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)
     held = DelegationStore(settings.delegations, identity)
     delegations = {topic.name: topic.delegation for topic in held}
-    lacking = 0
+    lacking, without_qos = 0, unknown_qos(settings.imports) if settings.ros else []
     if settings.ros:
         for at, (label, graph) in enumerate(read_graphs(settings.ros, identity.name.to_text(), "check")):
             findings = _findings(settings, at, graph, delegations)
@@ -49,8 +49,14 @@ def check_proxy(path: Path, settings: ProxyConfig, *, json: bool) -> int:
         open_topics(settings, held)
         _tell("", explain(settings.expose, settings.imports, None, delegations), json=json)
     if json:
-        emit("checked", name=identity.name.to_text(), undelegated=lacking)
-    elif lacking:
+        emit("checked", name=identity.name.to_text(), undelegated=lacking, unknown_qos=without_qos)
+        return lacking
+    if without_qos:
+        shown = ", ".join(without_qos)
+        console().print(
+            f"import {shown}: reliable and volatile until a publisher is known; 'offered' states another QoS"
+        )
+    if lacking:
         names = "1 name lacks a delegation" if lacking == 1 else f"{lacking} names lack a delegation"
         console().print(
             f"configuration valid: proxy {identity.name.short}, but {names};"

@@ -6,7 +6,7 @@ I/O; ``gdp`` starts it, since the package ``gdp`` does not know ``proxy``. ``gdp
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -18,13 +18,10 @@ from gdp.cli.node import Json, emit, failing_clearly
 from gdp.cli.version import HELP, Version, versioned
 from gdp.config.yaml_source import read_yaml
 from gdp.crypto.keys import PublicKey
-from gdp.errors import LocalError, StatementError
-from gdp.limits import CHAIN_MAX
-from gdp.stores.issue import DELEGATION_DAYS, delegate
+from gdp.errors import LocalError
+from gdp.stores.issue import DELEGATION_DAYS, valid_delegation, widened
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner, save_delegation
 from gdp.terminal import echo
-from gdp.trust.adcert import AdCertCache, Chain
-from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from proxy.check.core.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.check.graph_snapshot import read_graphs
@@ -70,10 +67,11 @@ def delegate_what_is_needed(
         ]
         for file, machine, card, found in zip(files, machines, cards, needs(machines, key), strict=True):
             for need in found:
-                held = _held(machine.held, card, need)
+                held = valid_delegation(machine.held, card, need.name, time.time())
                 is_new = renew or held is None or not need.rights <= held.rights
                 if is_new:
-                    save_delegation(machine.config.delegations, _made(owner, card, need, held, days), force=True)
+                    made = widened(owner, card, need.metadata, need.rights, held, days=days)
+                    save_delegation(machine.config.delegations, made, force=True)
                 _tell(file, need, is_new=is_new, json=json)
             for rule in unmet([*machine.config.expose, *machine.config.imports], key, found):
                 echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
@@ -113,28 +111,6 @@ def _owners_named(file: Path) -> str:
 
 def _graphs(config: ProxyConfig, card: NodeDescriptor) -> list[Graph]:
     return [graph for _, graph in read_graphs(config.ros, card.name.to_text(), "delegate")]
-
-
-def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: RequiredDelegation) -> Delegation | None:
-    """Return the node's delegation of a name, if it is valid now."""
-    for delegation in delegations:
-        if delegation.name == need.name:
-            try:
-                chain = Chain.traverse(delegation.chain, delegation.subject, card.subject, AdCertCache(CHAIN_MAX))
-                for right in delegation.rights:
-                    chain.check(right, time.time())
-            except StatementError:
-                return None  # expired, or of an earlier node here: a new one replaces it
-            return delegation
-    return None
-
-
-def _made(
-    owner: Path, card: NodeDescriptor, need: RequiredDelegation, held: Delegation | None, days: float
-) -> Delegation:
-    """Return a delegation of the needed right; it includes the rights given before."""
-    rights, epochs = (held.rights, held.grants.keys()) if held is not None else (frozenset(), (0,))
-    return delegate(owner, card, need.metadata, need.rights | rights, epochs, days=days)
 
 
 def _tell(file: Path, need: RequiredDelegation, *, is_new: bool, json: bool) -> None:

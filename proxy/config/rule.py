@@ -230,7 +230,7 @@ class Rule(Section):
         default=None, alias="latched", description="Topics: late joiners get the last message. `null`: by QoS."
     )
     offered: OfferedQos | None = Field(
-        default=None, description="Imported topics, by `gdp import`: QoS until a publisher is known."
+        default=None, description="Imported topics: QoS until a publisher is known; by `gdp import`, or by hand."
     )
     history: SomeHistory = Field(
         default=None, description="Exposed topics: what is kept for late joiners; a number: messages."

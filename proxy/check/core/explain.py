@@ -22,7 +22,7 @@ from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.core.qos import is_depth_unknown
 from proxy.serial.channel import Qos
 
-__all__ = ["Delegated", "explain"]
+__all__ = ["Delegated", "explain", "unknown_qos"]
 
 _NAMES_SHOWN: Final = 10
 _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which ``gdp delegate`` has an option
@@ -69,6 +69,14 @@ def explain(
     """
     both: tuple[tuple[Direction, Sequence[Rule]], ...] = (("expose", expose), ("import", imports))
     return [_Look(direction, rules, rule, graph, held).finding() for direction, rules in both for rule in rules]
+
+
+def unknown_qos(imports: Sequence[Rule]) -> list[str]:
+    """Return the imported topics whose QoS no rule states: it is known with the first message for a local reader.
+
+    Advertisements have no QoS, which RIBs could read there; it comes sealed, to subscribers.
+    """
+    return [rule.name for rule in imports if (rule.kind, rule.offered, rule.wants_latched) == ("topic", None, None)]
 
 
 class _Look:

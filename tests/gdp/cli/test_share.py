@@ -144,6 +144,26 @@ def test_what_an_import_lists_as_json_is_what_it_lists_as_text(
     assert (code, states) == (1, ["used", "not used"])
 
 
+def test_a_name_that_the_other_machine_no_longer_exposes_is_listed_as_withdrawn(
+    robot: Machine, server: Machine, run: Run
+) -> None:
+    words, state = ("expose", "robot", "/state", "--type", STRING, "--to", "server"), "withdrawn: robot no longer"
+    with ExitStack() as stack:
+        robot.start(stack)
+        server.start(stack)
+        run(*words)
+        run("import", "server", "/*")
+        assert run("expose", "robot", "/state", "--remove")[:2] == (0, "/state: now\n")
+        (offer,) = listed(run("import", "server", "--list", "--json"))["offers"]
+        assert (offer["accepted"], offer["state"].startswith(state), server.rules("import")) == (True, True, [])
+        code, text, errors = run("import", "server", "/state")
+        assert (code, text.splitlines()[0]) == (1, "/state: as soon as a node offers it")
+        assert errors == "error: /state: 1 of the names above are not in force\n"
+        run(*words)
+        (offer,) = listed(run("import", "server", "--list", "--json"))["offers"]
+        assert (offer["state"], server.rules("import")) == ("used", [("/state", STRING)])
+
+
 def test_a_delegation_that_cannot_be_delivered_yet_ends_the_command_with_1(
     robot: Machine, server: Machine, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

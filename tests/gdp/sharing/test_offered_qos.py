@@ -111,7 +111,7 @@ def test_only_the_sender_of_an_offer_states_its_qos(site: Site, robot: Machine, 
     name, to = server.held[0].name, load_card(server.folder / "proxy" / CARD).name
     site.directory.of("stranger").send(to, MailKind.QOS.value, CLOCK.to_wire(name))
     (problem,) = server.sharing.work(site.now_s).problems
-    assert problem.startswith("mail from stranger is not taken: QoS of ")
+    assert problem.startswith("mail from stranger is not taken: news of ")
     assert offered(server) == [LATCHED]
 
 

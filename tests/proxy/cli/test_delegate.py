@@ -14,6 +14,7 @@ from gdp.cli.gdp import main
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import load_delegations, save_delegation
 from gdp.trust.right import Right
+from proxy.check import command
 from proxy.cli.delegate import app
 from proxy.cli.proxy import app as proxy_app
 from proxy.config.config import ProxyConfig
@@ -154,6 +155,16 @@ def test_a_directory_without_delegations_is_said(capsys: pytest.CaptureFixture[s
             alias(["ls", directory])
         output = capsys.readouterr()
         assert (leaving.value.code or 0, said in output.out + output.err) == (code, True)
+
+
+def test_the_check_names_imports_without_qos_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "read_graphs", lambda *_: [("ROS 2", frozenset())])
+    more = "  - {name: /odom, type: nav_msgs/msg/Odometry, owner: owner.pub}\n"
+    Path("server/proxy.yaml").write_text(f"{_HEAD}ros: {{endpoint: ros2, domain: 0}}\nimport:\n{_MAP}{more}")
+    done = CliRunner().invoke(proxy_app, ["--config", "server/proxy.yaml", "--check"])
+    assert "import /map, /odom: reliable and volatile until a publisher is known" in done.output
+    done = CliRunner().invoke(proxy_app, ["--config", "server/proxy.yaml", "--check", "--json"])
+    assert json.loads(done.output.splitlines()[-1])["unknown_qos"] == ["/map", "/odom"]
 
 
 def test_a_recording_that_exists_is_refused_by_the_check_too() -> None:

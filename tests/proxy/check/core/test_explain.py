@@ -17,7 +17,7 @@ from gdp.cli import gdp
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.right import Right
-from proxy.check.core.explain import explain
+from proxy.check.core.explain import explain, unknown_qos
 from proxy.check.core.finding import Finding, Match
 from proxy.check.table import table
 from proxy.endpoints.core.endpoint import GraphEntity, Role, proxy_node_name
@@ -237,6 +237,23 @@ def test_a_latched_depth_that_dds_does_not_tell_is_named(place: Path) -> None:
     )
     match = only(place, "expose", f"name: /image, type: {IMAGE}, history: 5", [end(Role.PUBLISHES, qos=unknown)])
     assert match.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("more", "is_named"),
+    [
+        ("", True),
+        (", reliable: true", True),
+        (", latched: false", False),
+        (", latched: true", False),
+        (", offered: {reliability: reliable, durability: transient_local, depth: 1}", False),
+    ],
+)
+def test_an_import_whose_first_qos_no_rule_states_is_named(place: Path, more: str, is_named: bool) -> None:
+    config = proxy(
+        place, f"ros: {{endpoint: ros2}}\nimport:\n{rules('kind: service, name: /plan', 'name: /map' + more)}"
+    )
+    assert unknown_qos(config.imports) == ["/map"] * is_named
 
 
 def test_an_action_is_known_by_its_goals(place: Path) -> None:
