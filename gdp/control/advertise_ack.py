@@ -6,10 +6,10 @@ Sans-I/O.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import NAME, REASON, Body, Keyed, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason
 from gdp.names import Name
 
@@ -17,8 +17,8 @@ __all__ = ["AdvertiseAck"]
 
 
 @dataclass(frozen=True, slots=True)
-class AdvertiseAck:
-    """Reply of a RIB or a switch to an advertisement or a withdrawal.
+class AdvertiseAck(Body):
+    """Reply of a RIB or a switch to an advertisement or a withdrawal: shorter than these, so it cannot amplify.
 
     Args:
         refused: None when it was accepted.
@@ -26,29 +26,8 @@ class AdvertiseAck:
             number.
     """
 
-    name: Name
-    advertiser: Name
-    refused: DropReason | None
-    sequence: int
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement; shorter than any advertisement, it is useless for amplification."""
-        body = {
-            "n": self.name,
-            "a": self.advertiser,
-            "r": 255 if self.refused is None else int(self.refused),
-            "s": self.sequence,
-            "c": membership,
-        }
-        return sign(StatementType.ADVERTISE_ACK, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> AdvertiseAck:
-        """Read a parsed statement's body; a reason of a later version is read as MALFORMED.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
-        reason = fields.uint("r", 255)
-        known = DropReason(reason) if reason in DropReason.__members__.values() else DropReason.MALFORMED
-        return cls(fields.name("n"), fields.name("a"), None if reason == 255 else known, fields.uint("s"))
+    TYPE = StatementType.ADVERTISE_ACK
+    name: Annotated[Name, Keyed("n", NAME)]
+    advertiser: Annotated[Name, Keyed("a", NAME)]
+    refused: Annotated[DropReason | None, Keyed("r", REASON)]
+    sequence: Annotated[int, Keyed("s", uint())]

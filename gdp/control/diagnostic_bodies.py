@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Annotated, Final
 
 from gdp.crypto.cbor import encode
-from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.schema import FLAG, MAP, NAME, NAME_OR_ZERO, OCTETS, Body, Keyed, text, uint
 from gdp.crypto.statements import StatementType, assemble, sign
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import HOPS_MASK
@@ -29,7 +29,7 @@ _NO_SIGNATURE: Final = bytes(64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DiagnosticRequest:
+class DiagnosticRequest(Body):
     """Request of one member to another.
 
     Args:
@@ -39,15 +39,21 @@ class DiagnosticRequest:
         membership: DER; empty: the target has it.
     """
 
-    ask: str
-    name: Name
-    target: Name
-    sequence: int
-    body: Mapping[str, object] = field(default_factory=dict)
-    knows_target: bool = False
-    membership: bytes = b""
+    TYPE = StatementType.DIAGNOSTIC_REQUEST
+    ask: Annotated[str, Keyed("a", text(ASK_MAX_CHARS))]
+    name: Annotated[Name, Keyed("n", NAME_OR_ZERO)]
+    target: Annotated[Name, Keyed("to", NAME)]
+    sequence: Annotated[int, Keyed("s", uint())]
+    body: Annotated[Mapping[str, object], Keyed("b", MAP)] = field(default_factory=dict)
+    knows_target: Annotated[bool, Keyed("k", FLAG)] = False
+    membership: Annotated[bytes, Keyed("c", OCTETS, absent=b"", is_omitted=True)] = b""
 
-    def to_wire(self, signer: Name, key: SigningKey, reply_bytes: int = 0) -> bytes:
+    def check(self) -> None:
+        """Return if what is asked is a word. Raises ``StatementError``: MALFORMED."""
+        if not self.ask.isprintable() or not self.ask:
+            raise StatementError(DropReason.MALFORMED, "what is asked is not printable")
+
+    def padded(self, signer: Name, key: SigningKey, reply_bytes: int = 0) -> bytes:
         """Return the signed statement, as long as the longest reply that it accepts.
 
         Raises:
@@ -57,40 +63,15 @@ class DiagnosticRequest:
             raise LocalError(
                 f"an ask has 1 to {ASK_MAX_CHARS} letters, its reply at most {DIAGNOSTIC_REPLY_MAX_BYTES} bytes"
             )
-        body: dict[str, object] = {
-            "a": self.ask,
-            "n": self.name,
-            "to": self.target,
-            "s": self.sequence,
-            "b": dict(self.body),
-            "k": self.knows_target,
-        }
-        if self.membership:
-            body["c"] = self.membership
+        body = self.to_fields()
         least = _SHORT_REPLY_BYTES + (0 if self.knows_target else _CERTIFICATE_BYTES)
-        size = len(assemble(StatementType.DIAGNOSTIC_REQUEST, body, signer, _NO_SIGNATURE))
+        size = len(assemble(self.TYPE, body, signer, _NO_SIGNATURE))
         body["z"] = bytes(max(max(reply_bytes, least) - size - _PAD_HEAD_BYTES, 0))
-        return sign(StatementType.DIAGNOSTIC_REQUEST, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> DiagnosticRequest:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        ask = fields.text("a", ASK_MAX_CHARS)
-        if not ask.isprintable() or not ask:
-            raise StatementError(DropReason.MALFORMED, "what is asked is not printable")
-        return cls(
-            ask=ask,
-            name=fields.optional_name("n"),
-            target=fields.name("to"),
-            sequence=fields.uint("s"),
-            body=fields.map_("b"),
-            knows_target=fields.flag("k"),
-            membership=fields.bytes_("c") if "c" in fields else b"",
-        )
+        return sign(self.TYPE, body, signer, key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DiagnosticReply:
+class DiagnosticReply(Body):
     """Reply to one request.
 
     Args:
@@ -102,51 +83,16 @@ class DiagnosticReply:
         membership: DER; empty: the asker has it.
     """
 
-    ask: str
-    sequence: int
-    asker: Name
-    result: Mapping[str, object] = field(default_factory=dict)
-    error: str = ""
-    is_withheld: bool = False
-    is_cut: bool = False
-    hops_left: int = 0
-    membership: bytes = b""
-
-    @property
-    def body(self) -> dict[str, object]:
-        """Return the body of the statement."""
-        body: dict[str, object] = {
-            "a": self.ask,
-            "s": self.sequence,
-            "r": self.asker,
-            "b": dict(self.result),
-            "e": self.error,
-            "w": self.is_withheld,
-            "m": self.is_cut,
-            "h": self.hops_left,
-        }
-        if self.membership:
-            body["c"] = self.membership
-        return body
-
-    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
-        """Return the signed statement."""
-        return sign(StatementType.DIAGNOSTIC_REPLY, self.body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> DiagnosticReply:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls(
-            ask=fields.text("a", ASK_MAX_CHARS),
-            sequence=fields.uint("s"),
-            asker=fields.name("r"),
-            result=fields.map_("b"),
-            error=fields.text("e", _ERROR_MAX_CHARS),
-            is_withheld=fields.flag("w"),
-            is_cut=fields.flag("m"),
-            hops_left=fields.uint("h", HOPS_MASK),
-            membership=fields.bytes_("c") if "c" in fields else b"",
-        )
+    TYPE = StatementType.DIAGNOSTIC_REPLY
+    ask: Annotated[str, Keyed("a", text(ASK_MAX_CHARS))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    asker: Annotated[Name, Keyed("r", NAME)]
+    result: Annotated[Mapping[str, object], Keyed("b", MAP)] = field(default_factory=dict)
+    error: Annotated[str, Keyed("e", text(_ERROR_MAX_CHARS))] = ""
+    is_withheld: Annotated[bool, Keyed("w", FLAG)] = False
+    is_cut: Annotated[bool, Keyed("m", FLAG)] = False
+    hops_left: Annotated[int, Keyed("h", uint(HOPS_MASK))] = 0
+    membership: Annotated[bytes, Keyed("c", OCTETS, absent=b"", is_omitted=True)] = b""
 
 
 def cut_to_fit(reply: DiagnosticReply, max_bytes: int) -> DiagnosticReply | None:
@@ -171,4 +117,4 @@ def cut_to_fit(reply: DiagnosticReply, max_bytes: int) -> DiagnosticReply | None
 
 
 def _size(reply: DiagnosticReply) -> int:
-    return len(assemble(StatementType.DIAGNOSTIC_REPLY, reply.body, ZERO, _NO_SIGNATURE))
+    return len(assemble(StatementType.DIAGNOSTIC_REPLY, reply.to_fields(), ZERO, _NO_SIGNATURE))

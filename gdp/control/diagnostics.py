@@ -230,7 +230,7 @@ class Diagnostics:
             knows_target=not is_limited and self._peers.get(target) is not None,
             membership=b"" if target in self._knows_us and not is_limited else self._identity.member.wire,
         )
-        wire = request.to_wire(self._identity.name, self._identity.key, reply_bytes)
+        wire = request.padded(self._identity.name, self._identity.key, reply_bytes)
         self._pending[self._sequence] = _Pending(target, hops, ask, now.mono_s, until_s, on_reply)
         self._put(Kind.DIAGNOSTIC_REQUEST, wire, target, now, hops)
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from gdp.control.endpoint_record import RECORD_MAX_BYTES
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import OCTETS, REASON, Body, Keyed, many, number, packed, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, LEASE_MAX_S, RECORD_OVERHEAD_BYTES
 from gdp.names import NAME_BYTES, ZERO, Name
@@ -24,12 +23,18 @@ __all__ = ["ENDPOINT_NAMES_MAX", "EndpointQuery", "EndpointResponse", "batches"]
 ENDPOINT_NAMES_MAX: Final = 64  # in one query
 RECORDS_MAX: Final = 64  # in one response
 _SEQUENCE_BYTES: Final = 8
-_TAKEN: Final = 255
 _HEAD_BYTES: Final = 330  # COSE, keys, heads, sequence number and signature
 
 
+_KNOWN: Final = packed(
+    NAME_BYTES + _SEQUENCE_BYTES,
+    lambda item: (Name(item[:NAME_BYTES]), int.from_bytes(item[NAME_BYTES:], "big")),
+    lambda known: known[0] + known[1].to_bytes(_SEQUENCE_BYTES, "big"),
+)
+
+
 @dataclass(frozen=True, slots=True)
-class EndpointQuery:
+class EndpointQuery(Body):
     """Query for the endpoint records of switches, and a watch of them for ``watch_s`` seconds.
 
     Args:
@@ -37,27 +42,18 @@ class EndpointQuery:
             domain, which only a RIB of that domain may request.
     """
 
-    known: tuple[tuple[Name, int], ...]
-    watch_s: float
+    TYPE = StatementType.ENDPOINTS_QUERY
+    known: Annotated[tuple[tuple[Name, int], ...], Keyed("n", many(_KNOWN, ENDPOINT_NAMES_MAX))]
+    watch_s: Annotated[float, Keyed("w", number(0, LEASE_MAX_S))]
 
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        names = [name + sequence.to_bytes(_SEQUENCE_BYTES, "big") for name, sequence in self.known[:ENDPOINT_NAMES_MAX]]
-        body = {"n": names, "w": float(self.watch_s), "c": membership}
-        return sign(StatementType.ENDPOINTS_QUERY, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> EndpointQuery:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        items = fields.byte_strings("n", ENDPOINT_NAMES_MAX, NAME_BYTES + _SEQUENCE_BYTES)
-        known = tuple((Name(item[:NAME_BYTES]), int.from_bytes(item[NAME_BYTES:], "big")) for item in items)
-        if any(name == ZERO for name, _ in known):
+    def check(self) -> None:
+        """Return if each is a switch. Raises ``StatementError``: MALFORMED."""
+        if any(name == ZERO for name, _ in self.known):
             raise StatementError(DropReason.MALFORMED, "a query for the endpoints of no switch")
-        return cls(known, fields.number("w", 0, LEASE_MAX_S))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointResponse:
+class EndpointResponse(Body):
     """Endpoint records of other switches, and what the RIB keeps of the receiver.
 
     Args:
@@ -66,32 +62,15 @@ class EndpointResponse:
         refused: why the RIB refused the receiver's last record; None: it did not.
     """
 
-    records: tuple[bytes, ...] = ()
-    kept_sequence: int = 0
-    refused: DropReason | None = None
+    TYPE = StatementType.ENDPOINTS_ANSWER
+    records: Annotated[tuple[bytes, ...], Keyed("e", many(OCTETS, RECORDS_MAX))] = ()
+    kept_sequence: Annotated[int, Keyed("s", uint())] = 0
+    refused: Annotated[DropReason | None, Keyed("r", REASON)] = None
 
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement. Raises ``LocalError``: it does not fit; a batch of ``batches`` does."""
-        body = {
-            "e": list(self.records),
-            "s": self.kept_sequence,
-            "r": _TAKEN if self.refused is None else int(self.refused),
-            "c": membership,
-        }
-        return sign(StatementType.ENDPOINTS_ANSWER, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> EndpointResponse:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        reason = fields.uint("r", _TAKEN)
-        try:
-            refused = None if reason == _TAKEN else DropReason(reason)
-        except ValueError:
-            refused = DropReason.MALFORMED  # a reason of a later version is a refusal all the same
-        records = fields.byte_strings("e", RECORDS_MAX)
-        if any(len(each) > RECORD_MAX_BYTES for each in records):
+    def check(self) -> None:
+        """Return if no record is too long. Raises ``StatementError``: TOO_BIG."""
+        if any(len(each) > RECORD_MAX_BYTES for each in self.records):
             raise StatementError(DropReason.TOO_BIG, "endpoint record")
-        return cls(records=tuple(records), kept_sequence=fields.uint("s"), refused=refused)
 
 
 def batches(records: Iterable[bytes], membership: bytes) -> list[tuple[bytes, ...]]:

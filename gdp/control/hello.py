@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from gdp.control.endpoints import Endpoint
 from gdp.control.preshared_key import SIZES
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import OCTETS, Body, Form, Keyed, many, octets, or_empty, packed, row, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
@@ -82,8 +81,22 @@ def echo_of(nonce: bytes, name: Name) -> bytes:
     return hashlib.sha256(b"gdp echo\0" + nonce + name).digest()[:ECHO_BYTES]
 
 
+_TIMING: Final = row(Timing, uint(INTERVAL_MAX_MS), uint(INTERVAL_MAX_MS), uint(MULTIPLIER_MAX, 1))
+_COOKIE: Final = packed(
+    NONCE_BYTES + COOKIE_BYTES, lambda each: (each[:NONCE_BYTES], each[NONCE_BYTES:]), lambda pair: pair[0] + pair[1]
+)
+_OBSERVED: Final = Form(
+    "a nonce and an endpoint",
+    lambda value: (
+        OCTETS.read(value)[:NONCE_BYTES],
+        Endpoint.from_wire(OCTETS.read(value)[NONCE_BYTES:]),
+    ),
+    lambda pair: pair[0] + pair[1].to_wire(),
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hello:
+class Hello(Body):
     """One hello on one port.
 
     Args:
@@ -103,89 +116,23 @@ class Hello:
         preshared: on a tunnel, a message of the agreement on its preshared key; empty: none.
     """
 
-    nonce: bytes
-    sequence: int
-    heard: tuple[bytes, ...]
-    mtu: int
-    digest: bytes
-    membership: bytes
-    timing: Timing = NO_KEEPALIVES
-    exchange_key: bytes = b""
-    incarnation_id: bytes = bytes(INCARNATION_BYTES)
-    conflicts: tuple[bytes, ...] = ()
-    rtcerts: tuple[bytes, ...] = ()
-    cookies: tuple[tuple[bytes, bytes], ...] = ()
-    observed: tuple[tuple[bytes, Endpoint], ...] = ()
-    preshared: bytes = field(default=b"", repr=False)
+    TYPE = StatementType.HELLO
+    nonce: Annotated[bytes, Keyed("n", octets(NONCE_BYTES))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    heard: Annotated[tuple[bytes, ...], Keyed("h", many(octets(ECHO_BYTES), HEARD_MAX))]
+    mtu: Annotated[int, Keyed("m", uint(FRAME_MAX_BYTES))]
+    digest: Annotated[bytes, Keyed("d", octets(DIGEST_BYTES))]
+    membership: Annotated[bytes, Keyed("c", OCTETS)]
+    timing: Annotated[Timing, Keyed("k", _TIMING)] = NO_KEEPALIVES
+    exchange_key: Annotated[bytes, Keyed("x", or_empty(octets(EXCHANGE_KEY_BYTES), b""))] = b""
+    incarnation_id: Annotated[bytes, Keyed("b", octets(INCARNATION_BYTES))] = bytes(INCARNATION_BYTES)
+    conflicts: Annotated[tuple[bytes, ...], Keyed("u", many(octets(ECHO_BYTES), CONFLICTS_MAX))] = ()
+    rtcerts: Annotated[tuple[bytes, ...], Keyed("r", many(OCTETS, RTCERTS_MAX))] = ()
+    cookies: Annotated[tuple[tuple[bytes, bytes], ...], Keyed("y", many(_COOKIE, COOKIES_MAX))] = ()
+    observed: Annotated[tuple[tuple[bytes, Endpoint], ...], Keyed("o", many(_OBSERVED, OBSERVED_MAX), absent=())] = ()
+    preshared: Annotated[bytes, Keyed("p", OCTETS, absent=b"", is_omitted=True)] = field(default=b"", repr=False)
 
-    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
-        """Return the signed statement."""
-        body = {
-            "n": self.nonce,
-            "s": self.sequence,
-            "h": list(self.heard[:HEARD_MAX]),
-            "m": self.mtu,
-            "d": self.digest,
-            "c": self.membership,
-            "k": list(self.timing),
-            "x": self.exchange_key,
-            "b": self.incarnation_id,
-            "u": list(self.conflicts[:CONFLICTS_MAX]),
-            "r": list(self.rtcerts[:RTCERTS_MAX]),
-            "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
-            "o": [nonce + endpoint.to_wire() for nonce, endpoint in self.observed[:OBSERVED_MAX]],
-        }
-        if self.preshared:
-            body["p"] = self.preshared
-        return sign(StatementType.HELLO, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Hello:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls(
-            nonce=fields.bytes_("n", NONCE_BYTES),
-            sequence=fields.uint("s"),
-            heard=tuple(fields.byte_strings("h", HEARD_MAX, ECHO_BYTES)),
-            mtu=fields.uint("m", FRAME_MAX_BYTES),
-            digest=fields.bytes_("d", DIGEST_BYTES),
-            membership=fields.bytes_("c"),
-            timing=_timing(fields),
-            exchange_key=fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
-            incarnation_id=fields.bytes_("b", INCARNATION_BYTES),
-            conflicts=tuple(fields.byte_strings("u", CONFLICTS_MAX, ECHO_BYTES)),
-            rtcerts=tuple(fields.byte_strings("r", RTCERTS_MAX)),
-            cookies=tuple(
-                (each[:NONCE_BYTES], each[NONCE_BYTES:])
-                for each in fields.byte_strings("y", COOKIES_MAX, NONCE_BYTES + COOKIE_BYTES)
-            ),
-            observed=_observed(fields),
-            preshared=_preshared(fields),
-        )
-
-
-def _observed(fields: Fields) -> tuple[tuple[bytes, Endpoint], ...]:
-    try:
-        return tuple(
-            (each[:NONCE_BYTES], Endpoint.from_wire(each[NONCE_BYTES:]))
-            for each in (fields.byte_strings("o", OBSERVED_MAX) if "o" in fields else ())
-        )
-    except ValueError as error:
-        raise StatementError(DropReason.MALFORMED, "an observed endpoint") from error
-
-
-def _preshared(fields: Fields) -> bytes:
-    message = fields.bytes_("p") if "p" in fields else b""
-    if len(message) not in SIZES:
-        raise StatementError(DropReason.MALFORMED, "a message about a preshared key")
-    return message
-
-
-def _timing(fields: Fields) -> Timing:
-    match fields.list_("k", 3):
-        case [int(transmit_ms), int(receive_ms), int(multiplier)] if (
-            0 <= transmit_ms <= INTERVAL_MAX_MS
-            and 0 <= receive_ms <= INTERVAL_MAX_MS
-            and 1 <= multiplier <= MULTIPLIER_MAX
-        ):
-            return Timing(transmit_ms, receive_ms, multiplier)
-    raise StatementError(DropReason.MALFORMED, "timing of keepalives")
+    def check(self) -> None:
+        """Return if the message about a preshared key has one of its sizes. Raises ``StatementError``: MALFORMED."""
+        if len(self.preshared) not in SIZES:
+            raise StatementError(DropReason.MALFORMED, "a message about a preshared key")

@@ -7,17 +7,16 @@ ends and counts up within them. So a restarted sender is accepted at once, indep
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.link_state import LINK_KEY_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import NAME, NAME_OR_ZERO, OCTETS, Body, Form, Keyed, many, number, octets, row, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S, PATHS_MAX
-from gdp.names import NAME_BYTES, ZERO, Name
+from gdp.names import ZERO, Name
 
 __all__ = ["ROUTE_MAX", "Join", "Route", "RouteLink"]
 
@@ -34,8 +33,15 @@ class RouteLink(NamedTuple):
 Route = tuple[RouteLink, ...]  # from a switch towards the publisher's, in order
 
 
+_LINK: Final = row(RouteLink, NAME, uint(LINK_KEY_MAX))
+_NAMES: Final = many(NAME, TRANSIT_MAX)
+_ALLOWED: Final = Form(
+    _NAMES.words, lambda value: frozenset(_NAMES.read(value)), lambda names: _NAMES.write(tuple(sorted(names)))
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Join:
+class Join(Body):
     """Join of one tree: a topic from one publisher.
 
     Args:
@@ -56,84 +62,25 @@ class Join:
         route: what remains of the path that the reader's switch chose; empty: the receiver follows its own.
     """
 
-    topic: Name
-    publisher: Name
-    switch: Name
-    domain: Name
-    allowed: frozenset[Name]
-    mtu: int
-    lease_s: float
-    evidence: bytes
-    session: bytes
-    sequence: int
-    version: int = 0
-    backup_for: Name = ZERO
-    sender_session: bytes = bytes(NONCE_BYTES)
-    proof: bytes = b""
-    path: int = 1
-    route: Route = ()
+    TYPE = StatementType.JOIN
+    topic: Annotated[Name, Keyed("n", NAME)]
+    publisher: Annotated[Name, Keyed("p", NAME)]
+    switch: Annotated[Name, Keyed("w", NAME)]
+    domain: Annotated[Name, Keyed("d", NAME)]
+    allowed: Annotated[frozenset[Name], Keyed("x", _ALLOWED)]
+    mtu: Annotated[int, Keyed("m", uint(FRAME_MAX_BYTES))]
+    lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
+    evidence: Annotated[bytes, Keyed("e", OCTETS)]
+    session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    version: Annotated[int, Keyed("v", uint())] = 0
+    backup_for: Annotated[Name, Keyed("b", NAME_OR_ZERO)] = ZERO
+    sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))] = bytes(NONCE_BYTES)
+    proof: Annotated[bytes, Keyed("c", OCTETS)] = b""
+    path: Annotated[int, Keyed("a", uint(PATHS_MAX, 1))] = 1
+    route: Annotated[Route, Keyed("r", many(_LINK, ROUTE_MAX))] = ()
 
-    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
-        """Return the signed statement."""
-        body = {
-            "n": self.topic,
-            "p": self.publisher,
-            "w": self.switch,
-            "d": self.domain,
-            "x": sorted(self.allowed)[:TRANSIT_MAX],
-            "m": self.mtu,
-            "l": float(self.lease_s),
-            "e": self.evidence,
-            "i": self.session,
-            "s": self.sequence,
-            "v": self.version,
-            "b": self.backup_for,
-            "o": self.sender_session,
-            "c": self.proof,
-            "a": self.path,
-            "r": [list(each) for each in self.route],
-        }
-        return sign(StatementType.JOIN, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Join:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls(
-            topic=fields.name("n"),
-            publisher=fields.name("p"),
-            switch=fields.name("w"),
-            domain=fields.name("d"),
-            allowed=frozenset(fields.names("x", TRANSIT_MAX)),
-            mtu=fields.uint("m", FRAME_MAX_BYTES),
-            lease_s=fields.number("l", 0, LEASE_MAX_S),
-            evidence=fields.bytes_("e"),
-            session=fields.bytes_("i", ECHO_BYTES),
-            sequence=fields.uint("s"),
-            version=fields.uint("v"),
-            backup_for=fields.optional_name("b"),
-            sender_session=fields.bytes_("o", NONCE_BYTES),
-            proof=fields.bytes_("c"),
-            path=_path(fields),
-            route=_route(fields),
-        )
-
-
-def _path(fields: Fields) -> int:
-    path = fields.uint("a", PATHS_MAX)
-    if not path:
-        raise StatementError(DropReason.MALFORMED, "a path of number 0")
-    return path
-
-
-def _route(fields: Fields) -> Route:
-    """Return the route. Raises ``StatementError``: MALFORMED, a switch stands twice."""
-    found = []
-    for each in fields.list_("r", ROUTE_MAX):
-        match each:
-            case [bytes(name), int(key)] if len(name) == NAME_BYTES and name != ZERO and 0 <= key <= LINK_KEY_MAX:
-                found.append(RouteLink(Name(name), key))
-            case _:
-                raise StatementError(DropReason.MALFORMED, "a link of a route")
-    if len({link.name for link in found}) < len(found):
-        raise StatementError(DropReason.MALFORMED, "a route with a loop")
-    return tuple(found)
+    def check(self) -> None:
+        """Return if the route has no loop. Raises ``StatementError``: MALFORMED, a switch stands twice."""
+        if len({link.name for link in self.route}) < len(self.route):
+            raise StatementError(DropReason.MALFORMED, "a route with a loop")

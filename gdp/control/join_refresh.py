@@ -7,25 +7,26 @@ renews the joins of many trees. A receiver that does not know a number says so, 
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Annotated, Final
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import Body, Keyed, joined, octets, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
-from gdp.names import Name
 
 __all__ = ["NUMBERS_MAX", "JoinRefresh"]
 
 NUMBERS_MAX: Final = 128  # of one statement, so that it fits into a frame of Ethernet's MTU
-_NUMBER: Final = struct.Struct(">Q")
+_NUMBERS: Final = joined(
+    8, partial(int.from_bytes, byteorder="big"), partial(int.to_bytes, length=8, byteorder="big"), NUMBERS_MAX
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JoinRefresh:
+class JoinRefresh(Body):
     """Numbers of joins that stand, or (``is_reply``) of those in a refresh that the receiver does not have.
 
     Args:
@@ -35,32 +36,23 @@ class JoinRefresh:
         sequence: rises with every join, leave and refresh of the sender within its session.
     """
 
-    numbers: tuple[int, ...]
-    session: bytes
-    sender_session: bytes
-    sequence: int
+    numbers: Annotated[tuple[int, ...], Keyed("k", _NUMBERS)]
+    session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
+    sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))]
+    sequence: Annotated[int, Keyed("s", uint())]
     is_reply: bool = False
 
-    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
-        """Return the signed statement."""
-        body = {
-            "i": self.session,
-            "o": self.sender_session,
-            "s": self.sequence,
-            "k": b"".join(map(_NUMBER.pack, self.numbers)),
-        }
-        return sign(StatementType.JOIN_UNKNOWN if self.is_reply else StatementType.JOIN_REFRESH, body, signer, key)
+    @property
+    def statement_type(self) -> StatementType:
+        """Return the type of its statement."""
+        return StatementType.JOIN_UNKNOWN if self.is_reply else StatementType.JOIN_REFRESH
 
     @classmethod
     def from_fields(cls, fields: Fields, *, is_reply: bool = False) -> JoinRefresh:
         """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        packed = fields.bytes_("k")
-        if not packed or len(packed) % _NUMBER.size or len(packed) > NUMBERS_MAX * _NUMBER.size:
-            raise StatementError(DropReason.MALFORMED, "numbers of joins")
-        return cls(
-            numbers=tuple(number for (number,) in _NUMBER.iter_unpack(packed)),
-            session=fields.bytes_("i", ECHO_BYTES),
-            sender_session=fields.bytes_("o", NONCE_BYTES),
-            sequence=fields.uint("s"),
-            is_reply=is_reply,
-        )
+        return cls.read(fields, is_reply=is_reply)
+
+    def check(self) -> None:
+        """Return if there are numbers. Raises ``StatementError``: MALFORMED."""
+        if not self.numbers:
+            raise StatementError(DropReason.MALFORMED, "no numbers of joins")

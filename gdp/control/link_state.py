@@ -11,15 +11,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final, NamedTuple, TypeVar
+from typing import Annotated, Final, NamedTuple, TypeVar
 
 from gdp.control.hello import INCARNATION_BYTES, NONCE_BYTES
 from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
-from gdp.errors import DropReason, StatementError
+from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Form, Keyed, many, octets, row, text, uint
+from gdp.crypto.statements import StatementType
 from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
-from gdp.names import ZERO, Name
+from gdp.names import Name
 
 __all__ = ["LINK_KEY_MAX", "Adjacency", "AttachedRib", "LinkState", "Scope", "link_key"]
 
@@ -89,23 +88,41 @@ class AttachedRib(NamedTuple):
         return _RIB_BYTES + len(self.membership) + len(self.rtcert)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkState:
-    """Link state of one switch in one scope."""
+_SCOPE: Final = Form("domain or border", lambda value: Scope(text(8).read(value)), lambda scope: scope.value)
+_ADJACENCY: Final = row(Adjacency, NAME, NAME, uint(COST_MAX, 1), uint(FRAME_MAX_BYTES, 1), uint(LINK_KEY_MAX))
+_RIB: Final = row(AttachedRib, NAME, NAME, octets(NONCE_BYTES), octets(INCARNATION_BYTES), OCTETS, OCTETS)
 
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkState(Body):
+    """Link state of one switch in one scope.
+
+    Args:
+        domain: of the origin, from its certificate.
+        inside: BORDER only.
+        ribs: attached here (DOMAIN), or reachable within this domain (BORDER).
+        members: BORDER only: switches of the domain that are reachable within it from here.
+        incarnation_id: mark of the origin's incarnation.
+        refused: identities refused at this switch, because an older node has them.
+        is_partial: there are members that are not listed.
+        said_unix_s: when it was signed, by the origin's wall clock.
+        is_leaf: from the origin's certificate: no path leads through it.
+    """
+
+    TYPE = StatementType.LINK_STATE
     origin: Name
-    domain: Name  # of the origin, from its certificate
-    scope: Scope
-    sequence: int
-    links: tuple[Adjacency, ...]
-    inside: tuple[Adjacency, ...]  # BORDER only
-    ribs: tuple[AttachedRib, ...]  # attached here (DOMAIN), or reachable within this domain (BORDER)
-    members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
-    incarnation_id: bytes = bytes(INCARNATION_BYTES)  # mark of the origin's incarnation
-    refused: tuple[Name, ...] = ()  # identities refused at this switch, because an older node has them
-    is_partial: bool = False  # there are members that are not listed
-    said_unix_s: int = 0  # when it was signed, by the origin's wall clock
-    is_leaf: bool = False  # from the origin's certificate: no path leads through it
+    domain: Name
+    scope: Annotated[Scope, Keyed("o", _SCOPE)]
+    sequence: Annotated[int, Keyed("s", uint())]
+    links: Annotated[tuple[Adjacency, ...], Keyed("l", many(_ADJACENCY, LINKS_MAX))]
+    inside: Annotated[tuple[Adjacency, ...], Keyed("i", many(_ADJACENCY, LINKS_MAX))]
+    ribs: Annotated[tuple[AttachedRib, ...], Keyed("r", many(_RIB, RIBS_MAX))]
+    members: Annotated[tuple[Name, ...], Keyed("m", many(NAME, MEMBERS_MAX))] = ()
+    incarnation_id: Annotated[bytes, Keyed("b", octets(INCARNATION_BYTES))] = bytes(INCARNATION_BYTES)
+    refused: Annotated[tuple[Name, ...], Keyed("u", many(NAME, RIBS_MAX))] = ()
+    is_partial: Annotated[bool, Keyed("z", FLAG)] = False
+    said_unix_s: Annotated[int, Keyed("e", uint())] = 0
+    is_leaf: bool = False
 
     def fitted(self, membership: bytes) -> LinkState:
         """Return the part of it that fits one statement with the signer's certificate: RIBs and links first."""
@@ -124,25 +141,8 @@ class LinkState:
             is_partial=len(members) < len(self.members),
         )  # fmt: skip
 
-    def to_wire(self, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement. Raises ``LocalError``: it does not fit; ``fitted`` does."""
-        body = {
-            "o": self.scope.value,
-            "s": self.sequence,
-            "l": [list(each) for each in self.links],
-            "i": [list(each) for each in self.inside],
-            "r": [list(each) for each in self.ribs],
-            "m": list(self.members),
-            "z": self.is_partial,
-            "b": self.incarnation_id,
-            "u": list(self.refused),
-            "e": self.said_unix_s,
-            "c": membership,
-        }
-        return sign(StatementType.LINK_STATE, body, self.origin, key)
-
     @classmethod
-    def from_fields(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
+    def of(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
         """Read a parsed statement's body; role and domain of the origin come from its certificate.
 
         Of a leaf, links that leave its domain are left out.
@@ -150,24 +150,8 @@ class LinkState:
         Raises:
             StatementError: MALFORMED.
         """
-        scope = fields.text("o", 8)
-        if scope not in ("domain", "border"):
-            raise StatementError(DropReason.MALFORMED, "scope")
-        return cls(
-            origin=origin,
-            domain=domain,
-            scope=Scope(scope),
-            sequence=fields.uint("s"),
-            links=tuple(each for each in _adjacencies(fields, "l") if not is_leaf or each.domain == domain),
-            inside=_adjacencies(fields, "i"),
-            ribs=_ribs(fields),
-            members=tuple(fields.names("m", MEMBERS_MAX)),
-            incarnation_id=fields.bytes_("b", INCARNATION_BYTES),
-            refused=tuple(fields.names("u", RIBS_MAX)),
-            is_partial=fields.flag("z"),
-            said_unix_s=fields.uint("e"),
-            is_leaf=is_leaf,
-        )
+        found = cls.read(fields, origin=origin, domain=domain, is_leaf=is_leaf)
+        return replace(found, links=tuple(each for each in found.links if each.domain == domain)) if is_leaf else found
 
 
 def _cut(items: tuple[_T, ...], costs: list[int], capacity: int) -> tuple[_T, ...]:
@@ -179,43 +163,3 @@ def _cut(items: tuple[_T, ...], costs: list[int], capacity: int) -> tuple[_T, ..
             break
         kept.append(item)
     return tuple(kept)
-
-
-def _ribs(fields: Fields) -> tuple[AttachedRib, ...]:
-    found = []
-    for each in fields.list_("r", RIBS_MAX):
-        match each:
-            case [
-                bytes(name),
-                bytes(domain),
-                bytes(session),
-                bytes(incarnation_id),
-                bytes(membership),
-                bytes(rtcert),
-            ] if (
-                len(name) == len(domain) == 32
-                and ZERO not in (name, domain)
-                and len(session) == NONCE_BYTES
-                and len(incarnation_id) == INCARNATION_BYTES
-            ):
-                found.append(AttachedRib(Name(name), Name(domain), session, incarnation_id, membership, rtcert))
-            case _:
-                raise StatementError(DropReason.MALFORMED, "RIB")
-    return tuple(found)
-
-
-def _adjacencies(fields: Fields, key: str) -> tuple[Adjacency, ...]:
-    found = []
-    for each in fields.list_(key, LINKS_MAX):
-        match each:
-            case [bytes(name), bytes(domain), int(cost), int(mtu), int(key_)] if (
-                len(name) == len(domain) == 32
-                and ZERO not in (name, domain)
-                and 0 < cost <= COST_MAX
-                and 0 < mtu <= FRAME_MAX_BYTES
-                and 0 <= key_ <= LINK_KEY_MAX
-            ):
-                found.append(Adjacency(Name(name), Name(domain), cost, mtu, key_))
-            case _:
-                raise StatementError(DropReason.MALFORMED, "adjacency")
-    return tuple(found)

@@ -14,13 +14,11 @@ accepted here until it is accepted there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import FLAG, NAME, Body, Form, Keyed, uint
+from gdp.crypto.statements import StatementType
 from gdp.names import Name
 
 __all__ = ["IdentityChecks", "Presence"]
@@ -30,10 +28,11 @@ _BELIEVED_S: Final = 0.5  # an answer "is there" is valid for this time, before 
 # a refusal from above is valid for this time; a refused node repeats its advertisement more often
 _REFUSED_ABOVE_S: Final = 10.0
 _CHECKS_MAX: Final = 1_024
+_NOT: Final = Form("false, or true for a query", lambda value: not FLAG.read(value), lambda flag: not flag)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Presence:
+class Presence(Body):
     """A RIB's query about a node that is attached to a switch, or the switch's response.
 
     Args:
@@ -44,37 +43,13 @@ class Presence:
         is_answer: whether this is a response; then ``is_there`` holds the result.
     """
 
-    node: Name
-    incarnation: int
-    other: Name
-    question: int
-    is_answer: bool = False
-    is_there: bool = False
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        body: Mapping[str, object] = {
-            "n": self.node,
-            "i": self.incarnation,
-            "w": self.other,
-            "s": self.question,
-            "q": not self.is_answer,
-            "y": self.is_there,
-            "c": membership,
-        }
-        return sign(StatementType.PRESENCE, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Presence:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls(
-            node=fields.name("n"),
-            incarnation=fields.uint("i"),
-            other=fields.name("w"),
-            question=fields.uint("s"),
-            is_answer=not fields.flag("q"),
-            is_there=fields.flag("y"),
-        )
+    TYPE = StatementType.PRESENCE
+    node: Annotated[Name, Keyed("n", NAME)]
+    incarnation: Annotated[int, Keyed("i", uint())]
+    other: Annotated[Name, Keyed("w", NAME)]
+    question: Annotated[int, Keyed("s", uint())]
+    is_answer: Annotated[bool, Keyed("q", _NOT)] = False
+    is_there: Annotated[bool, Keyed("y", FLAG)] = False
 
 
 @dataclass(slots=True, kw_only=True)

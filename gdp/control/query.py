@@ -6,11 +6,10 @@ Sans-I/O.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, many, number, octets, or_empty, uint
+from gdp.crypto.statements import StatementType
 from gdp.limits import LEASE_MAX_S
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
@@ -21,7 +20,7 @@ TRANSIT_MAX: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Query:
+class Query(Body):
     """Query for the advertisers of ``name``; with ``watch_s`` above zero also a watch for that time.
 
     Args:
@@ -29,24 +28,14 @@ class Query:
             differs. None: revocations do not concern the sender.
     """
 
-    name: Name
-    watch_s: float
-    revoked: bytes | None = None
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        body = {"n": self.name, "w": float(self.watch_s), "v": self.revoked or b"", "c": membership}
-        return sign(StatementType.QUERY, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Query:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        revoked = fields.bytes_("v", ID_BYTES) if "v" in fields and fields["v"] != b"" else None
-        return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S), revoked)
+    TYPE = StatementType.QUERY
+    name: Annotated[Name, Keyed("n", NAME)]
+    watch_s: Annotated[float, Keyed("w", number(0, LEASE_MAX_S))]
+    revoked: Annotated[bytes | None, Keyed("v", or_empty(octets(ID_BYTES), None), absent=None)] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Response:
+class Response(Body):
     """One advertiser of a name, none, or unknown: the RIB could not ask the tier above.
 
     Args:
@@ -59,13 +48,14 @@ class Response:
         sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
     """
 
-    name: Name
-    advertiser: Name
-    advertisement: bytes
-    domain: Name
-    transit: tuple[Name, ...]
-    lease_s: float
-    sequence: int = 0
+    TYPE = StatementType.ANSWER
+    name: Annotated[Name, Keyed("n", NAME)]
+    advertiser: Annotated[Name, Keyed("a", NAME)]
+    advertisement: Annotated[bytes, Keyed("q", OCTETS)]
+    domain: Annotated[Name, Keyed("d", NAME)]
+    transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
+    lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
+    sequence: Annotated[int, Keyed("s", uint())] = 0
 
     @property
     def is_negative(self) -> bool:
@@ -76,30 +66,3 @@ class Response:
     def is_unknown(self) -> bool:
         """Return whether the RIB could not ask those that would know."""
         return self.advertiser == self.name and not (self.advertisement or self.lease_s or self.sequence)
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        body = {
-            "n": self.name,
-            "a": self.advertiser,
-            "q": self.advertisement,
-            "d": self.domain,
-            "x": list(self.transit[:TRANSIT_MAX]),
-            "l": float(self.lease_s),
-            "s": self.sequence,
-            "c": membership,
-        }
-        return sign(StatementType.ANSWER, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Response:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls(
-            name=fields.name("n"),
-            advertiser=fields.name("a"),
-            advertisement=fields.bytes_("q"),
-            domain=fields.name("d"),
-            transit=tuple(fields.names("x", TRANSIT_MAX)),
-            lease_s=fields.number("l", 0, LEASE_MAX_S),
-            sequence=fields.uint("s"),
-        )

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, many, or_empty
+from gdp.crypto.statements import StatementType
 from gdp.names import Name
 
 __all__ = ["RelayedStatement", "relayed"]
 
 
 @dataclass(frozen=True, slots=True)
-class RelayedStatement:
+class RelayedStatement(Body):
     """An advertisement, a withdrawal or a revocation that is forwarded.
 
     Args:
@@ -30,26 +30,11 @@ class RelayedStatement:
         domain: domain of the advertisement's switch; None: the signer's domain.
     """
 
-    statement: bytes
-    transit: tuple[Name, ...]
-    membership: bytes
-    domain: Name | None = None
-
-    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
-        """Return the signed statement."""
-        body = {
-            "q": self.statement,
-            "x": list(self.transit[:TRANSIT_MAX]),
-            "d": self.domain or b"",
-            "c": self.membership,
-        }
-        return sign(StatementType.RELAY, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> RelayedStatement:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        domain = fields.name("d") if fields.bytes_("d") else None
-        return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"), domain)
+    TYPE = StatementType.RELAY
+    statement: Annotated[bytes, Keyed("q", OCTETS)]
+    transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
+    membership: Annotated[bytes, Keyed("c", OCTETS)]
+    domain: Annotated[Name | None, Keyed("d", or_empty(NAME, None))] = None
 
 
 def relayed(statement: bytes, switch: Identity, transit: Iterable[Name]) -> bytes:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.fields import Fields
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, sign
+from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Form, Keyed, inner, many, number, octets, packed, uint
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, LEASE_MAX_S
 from gdp.names import NAME_BYTES, Name
@@ -35,8 +34,14 @@ _KEY_BYTES: Final = 2 * NAME_BYTES
 Key = tuple[Name, Name]  # name, advertiser
 
 
+_PREFIX: Final = octets(most=PREFIX_MAX_BYTES)
+_NAMES: Final[Form[Key]] = packed(
+    _KEY_BYTES, lambda key: (Name(key[:NAME_BYTES]), Name(key[NAME_BYTES:])), lambda key: key[0] + key[1]
+)
+
+
 @dataclass(frozen=True, slots=True)
-class Digest:
+class Digest(Body):
     """Hashes of what a RIB holds below a prefix.
 
     Args:
@@ -45,42 +50,24 @@ class Digest:
         is_last: whether the reply to a ``Fetch`` ends here.
     """
 
-    prefix: bytes
-    hashes: bytes
-    is_last: bool
+    TYPE = StatementType.DIGEST
+    prefix: Annotated[bytes, Keyed("p", _PREFIX)]
+    hashes: Annotated[bytes, Keyed("h", OCTETS)]
+    is_last: Annotated[bool, Keyed("z", FLAG)]
 
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        body = {"p": self.prefix, "h": self.hashes, "z": self.is_last, "c": membership}
-        return sign(StatementType.DIGEST, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Digest:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        digest = cls(_prefix(fields.bytes_("p")), fields.bytes_("h"), fields.flag("z"))
-        if len(digest.hashes) not in (HASH_BYTES, FANOUT * HASH_BYTES):
+    def check(self) -> None:
+        """Return if there is one hash, or one for each next byte. Raises ``StatementError``: MALFORMED."""
+        if len(self.hashes) not in (HASH_BYTES, FANOUT * HASH_BYTES):
             raise StatementError(DropReason.MALFORMED, "a digest of another length")
-        return digest
 
 
 @dataclass(frozen=True, slots=True)
-class Fetch:
+class Fetch(Body):
     """A request for the detail of prefixes and for entries."""
 
-    prefixes: tuple[bytes, ...]
-    keys: tuple[Key, ...]
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        keys = [bytes(name) + bytes(advertiser) for name, advertiser in self.keys]
-        return sign(StatementType.FETCH, {"p": list(self.prefixes), "k": keys, "c": membership}, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Fetch:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        prefixes = tuple(_prefix(each) for each in fields.byte_strings("p", FETCH_PREFIXES_MAX))
-        keys = fields.byte_strings("k", FETCH_KEYS_MAX, _KEY_BYTES)
-        return cls(prefixes, tuple((Name(key[:NAME_BYTES]), Name(key[NAME_BYTES:])) for key in keys))
+    TYPE = StatementType.FETCH
+    prefixes: Annotated[tuple[bytes, ...], Keyed("p", many(_PREFIX, FETCH_PREFIXES_MAX))]
+    keys: Annotated[tuple[Key, ...], Keyed("k", many(_NAMES, FETCH_KEYS_MAX))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +78,16 @@ class Item:
     advertiser: Name
     sequence: int
     is_withdrawn: bool
+
+    @classmethod
+    def from_bytes(cls, line: bytes) -> Item:
+        """Return the item of a line: name, advertiser, sequence number (8), whether it is withdrawn (1)."""
+        name, advertiser = Name(line[:NAME_BYTES]), Name(line[NAME_BYTES:_KEY_BYTES])
+        return cls(name, advertiser, int.from_bytes(line[_KEY_BYTES:-1], "big"), line[-1] != 0)
+
+    def to_bytes(self) -> bytes:
+        """Return its line."""
+        return self.name + self.advertiser + self.sequence.to_bytes(8, "big") + bytes([self.is_withdrawn])
 
     @property
     def key(self) -> Key:
@@ -103,30 +100,20 @@ class Item:
         return 2 * self.sequence + self.is_withdrawn
 
 
+_ITEM: Final = packed(_KEY_BYTES + 9, Item.from_bytes, Item.to_bytes)
+
+
 @dataclass(frozen=True, slots=True)
-class Inventory:
+class Inventory(Body):
     """Names that a RIB holds, with the sequence number of each advertiser."""
 
-    items: tuple[Item, ...]
-    is_last: bool
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        lines = [
-            bytes(item.name) + bytes(item.advertiser) + item.sequence.to_bytes(8, "big") + bytes([item.is_withdrawn])
-            for item in self.items
-        ]
-        return sign(StatementType.INVENTORY, {"i": lines, "z": self.is_last, "c": membership}, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Inventory:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        lines = fields.byte_strings("i", INVENTORY_MAX, _KEY_BYTES + 9)
-        return cls(tuple(_item(line) for line in lines), fields.flag("z"))
+    TYPE = StatementType.INVENTORY
+    items: Annotated[tuple[Item, ...], Keyed("i", many(_ITEM, INVENTORY_MAX))]
+    is_last: Annotated[bool, Keyed("z", FLAG)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class Entry(Body):
     """An advertisement or a withdrawal as one RIB sends it to another.
 
     Args:
@@ -142,44 +129,15 @@ class Entry:
             advertisement.
     """
 
-    statement: bytes
-    membership: bytes
-    sender: Name
-    domain: Name
-    via: Name
-    transit: tuple[Name, ...]
-    lease_s: float
-    is_from_upstream: bool
-    until_unix_s: int = 0
-
-    def to_fields(self) -> dict[str, object]:
-        """Return the entry as a map."""
-        return {
-            "q": self.statement,
-            "m": self.membership,
-            "w": self.sender,
-            "d": self.domain,
-            "v": self.via,
-            "x": list(self.transit[:TRANSIT_MAX]),
-            "l": float(self.lease_s),
-            "u": self.is_from_upstream,
-            "t": self.until_unix_s,
-        }
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Entry:
-        """Read the map; a malformed one raises ``StatementError``."""
-        return cls(
-            statement=fields.bytes_("q"),
-            membership=fields.bytes_("m"),
-            sender=fields.name("w"),
-            domain=fields.name("d"),
-            via=fields.name("v"),
-            transit=tuple(fields.names("x", TRANSIT_MAX)),
-            lease_s=fields.number("l", 0, LEASE_MAX_S),
-            is_from_upstream=fields.flag("u"),
-            until_unix_s=fields.uint("t"),
-        )
+    statement: Annotated[bytes, Keyed("q", OCTETS)]
+    membership: Annotated[bytes, Keyed("m", OCTETS)]
+    sender: Annotated[Name, Keyed("w", NAME)]
+    domain: Annotated[Name, Keyed("d", NAME)]
+    via: Annotated[Name, Keyed("v", NAME)]
+    transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
+    lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
+    is_from_upstream: Annotated[bool, Keyed("u", FLAG)]
+    until_unix_s: Annotated[int, Keyed("t", uint())] = 0
 
     @property
     def cost_bytes(self) -> int:
@@ -188,22 +146,12 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class EntryBatch:
+class EntryBatch(Body):
     """Entries of one RIB for another, pushed when they are new or fetched."""
 
-    entries: tuple[Entry, ...]
-    is_last: bool
-
-    def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement."""
-        body = {"e": [entry.to_fields() for entry in self.entries], "z": self.is_last, "c": membership}
-        return sign(StatementType.REPLICAS, body, signer, key)
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> EntryBatch:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        entries = tuple(Entry.from_fields(each) for each in fields.maps("e", ENTRIES_MAX))
-        return cls(entries, fields.flag("z"))
+    TYPE = StatementType.REPLICAS
+    entries: Annotated[tuple[Entry, ...], Keyed("e", many(inner(Entry), ENTRIES_MAX))]
+    is_last: Annotated[bool, Keyed("z", FLAG)]
 
 
 def batches(entries: Sequence[Entry]) -> Iterator[tuple[Entry, ...]]:
@@ -221,14 +169,3 @@ def batches(entries: Sequence[Entry]) -> Iterator[tuple[Entry, ...]]:
         size += cost
     if group:
         yield tuple(group)
-
-
-def _prefix(prefix: bytes) -> bytes:
-    if len(prefix) > PREFIX_MAX_BYTES:
-        raise StatementError(DropReason.MALFORMED, "a prefix that is too long")
-    return prefix
-
-
-def _item(line: bytes) -> Item:
-    name, advertiser = Name(line[:NAME_BYTES]), Name(line[NAME_BYTES:_KEY_BYTES])
-    return Item(name, advertiser, int.from_bytes(line[_KEY_BYTES:-1], "big"), line[-1] != 0)

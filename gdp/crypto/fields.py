@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gdp.crypto.cbor import Value
 from gdp.errors import DropReason, StatementError
@@ -33,6 +33,10 @@ class Fields(Mapping[str, Value]):
 
     def __getitem__(self, key: str) -> Value:
         return self._items[key]
+
+    def get(self, key: str, default: object = None) -> Any:
+        """Return the value of a key, or ``default``."""
+        return self._items.get(key, default)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._items)

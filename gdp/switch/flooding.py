@@ -129,7 +129,7 @@ class Flooding:
         if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
         is_leaf = member.role is Role.LEAF
-        state = LinkState.from_fields(fields, member.name, member.domain, is_leaf=is_leaf)
+        state = LinkState.of(fields, member.name, member.domain, is_leaf=is_leaf)
         if is_leaf and state.scope is Scope.BORDER:
             raise StatementError(DropReason.THROUGH_LEAF, "a leaf that would be a border")
         if state.scope is Scope.DOMAIN and not self._domain == member.domain == neighbour.domain:
@@ -283,7 +283,7 @@ class Flooding:
             said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
             is_leaf=self._is_leaf,
         ).fitted(self._identity.membership)
-        wire = state.to_wire(self._identity.key, self._identity.membership)
+        wire = state.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s[scope] = now_s + LINK_STATE_REFRESH_S
         self._flood(scope, wire)

@@ -11,9 +11,10 @@ from types import MappingProxyType
 from typing import Final
 
 from gdp.crypto.fields import Fields
+from gdp.crypto.schema import Form, text
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["DELEGABLE", "HEARS", "Right", "rights_from_fields", "rights_to_wire"]
+__all__ = ["DELEGABLE", "HEARS", "RIGHT", "Right", "rights_from_fields", "rights_to_wire"]
 
 
 class Right(str, Enum):
@@ -34,6 +35,7 @@ class Right(str, Enum):
             raise StatementError(DropReason.MALFORMED, "an unknown right") from error
 
 
+RIGHT: Final = Form("a right", lambda value: Right(text(16).read(value)), lambda right: right.value)
 DELEGABLE: Final = frozenset({Right.PUBLISH, Right.SERVE, Right.CALL, Right.READ})
 HEARS: Final = MappingProxyType({Right.READ: Right.PUBLISH, Right.SERVE: Right.CALL, Right.CALL: Right.SERVE})
 """Who hears whom on one name: a node that claims the first gets what those that claim the second send to it."""

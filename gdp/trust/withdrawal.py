@@ -7,29 +7,27 @@ advertisements, so that a late one ends nothing newer.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from gdp.crypto.fields import check_sequence
-from gdp.crypto.identity import Identity
+from gdp.crypto.schema import NAME, Body, Keyed, uint
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import Name
-from gdp.trust.right import Right
+from gdp.trust.right import RIGHT, Right
 
 __all__ = ["Withdrawal"]
 
 
 @dataclass(frozen=True, slots=True)
-class Withdrawal:
+class Withdrawal(Body):
     """The name and the right that its signer advertises no more."""
 
-    name: Name
-    right: Right
-    sequence: int
-
-    def to_wire(self, node: Identity) -> bytes:
-        """Return the signed statement."""
-        return node.sign(StatementType.WITHDRAW, {"n": self.name, "right": self.right.value, "s": self.sequence})
+    TYPE = StatementType.WITHDRAW
+    name: Annotated[Name, Keyed("n", NAME)]
+    right: Annotated[Right, Keyed("right", RIGHT)]
+    sequence: Annotated[int, Keyed("s", uint())]
 
     @classmethod
     def from_statement(cls, statement: Statement, unix_s: float) -> Withdrawal:
@@ -41,6 +39,6 @@ class Withdrawal:
         fields = statement.expect(StatementType.WITHDRAW)
         if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
             raise StatementError(DropReason.TOO_BIG, "a withdrawal")
-        withdrawal = cls(fields.name("n"), Right.from_wire(fields.text("right")), fields.uint("s"))
+        withdrawal = cls.from_fields(fields)
         check_sequence(withdrawal.sequence, unix_s)
         return withdrawal

@@ -67,7 +67,7 @@ def first_to(world: Simulation, at: str, to: str) -> str | None:
 
 def say(world: Simulation, state: LinkState, liar: Identity, to: str, port: int) -> None:
     """Hand the liar's link state to a neighbour."""
-    wire = state.to_wire(liar.key, liar.membership)
+    wire = state.to_wire(liar.name, liar.key, liar.membership)
     for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject(to, port, frame, mac_of(world, to, port))
     world.network.run(1.0)
@@ -204,7 +204,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
         links=(Adjacency(right.name, right._policy.own, 1, 1_500),),
     )  # fmt: skip
     before = right.drops()[DropReason.THROUGH_LEAF]
-    wire = border.to_wire(leaf.key, leaf.membership)
+    wire = border.to_wire(leaf.name, leaf.key, leaf.membership)
     for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour forwarded it
     assert right.drops()[DropReason.THROUGH_LEAF] > before

@@ -108,7 +108,7 @@ def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest
             said_unix_s=int(world.network.now.unix_s),
         )
         frames = ControlFragmenter(liar.name, 1 << 40).split(
-            Kind.LINK_STATE, state.to_wire(liar.key, liar.membership), 1_400
+            Kind.LINK_STATE, state.to_wire(liar.name, liar.key, liar.membership), 1_400
         )
         for frame in frames:
             world.network.inject("nuc1", _port_of(world, "nuc1", "nuc2"), frame, mac_of(world, "nuc1", 0))

@@ -82,7 +82,7 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
         said_unix_s=int(world.network.now.unix_s),
     )
     world.network.inject(
-        "nuc1", 0, control(Kind.LINK_STATE, state.to_wire(liar.key, liar.membership)), mac_of(world, "nuc1")
+        "nuc1", 0, control(Kind.LINK_STATE, state.to_wire(liar.name, liar.key, liar.membership)), mac_of(world, "nuc1")
     )
     assert world.switches["nuc1"].drops()[DropReason.MALFORMED] == 1
     still_flows(flow)
@@ -122,9 +122,9 @@ def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
         members=tuple(names(MEMBERS_MAX)),
         refused=tuple(names(RIBS_MAX)),
     ).fitted(nuc1.membership)
-    wire = state.to_wire(nuc1.key, nuc1.membership)
+    wire = state.to_wire(nuc1.name, nuc1.key, nuc1.membership)
     assert len(wire) <= CONTROL_MAX_BYTES
-    read = LinkState.from_fields(parse(wire).fields, nuc1.name, nuc1.root.domain)
+    read = LinkState.of(parse(wire).fields, nuc1.name, nuc1.root.domain)
     assert read == state
     assert len(read.ribs) > 4
     assert len(read.links) > 64

@@ -75,7 +75,7 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
         EndpointResponse.from_fields,
     ),
     "diagnostic request": (
-        ASKED.to_wire(NODE.name, NODE.key, 1_000),
+        ASKED.padded(NODE.name, NODE.key, 1_000),
         ASKED,
         DiagnosticRequest.from_fields,
     ),
@@ -83,7 +83,11 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
     "join refresh": (REFRESH.to_wire(NODE.name, NODE.key), REFRESH, JoinRefresh.from_fields),
     "join unknown": (UNKNOWN.to_wire(NODE.name, NODE.key), UNKNOWN, partial(JoinRefresh.from_fields, is_reply=True)),
-    "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
+    "link state": (
+        STATE.to_wire(NODE.name, NODE.key, b"cert"),
+        STATE,
+        lambda fields: LinkState.of(fields, NODE.name, A),
+    ),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
     "query of a reader": (
         Query(A, 20.0, b"revoked!").to_wire(NODE.name, NODE.key, b"cert"),
@@ -188,5 +192,5 @@ def test_a_reply_is_cut_to_the_length_of_its_request(max_bytes: int, count: int,
 
 @pytest.mark.parametrize("length", [0, 500, 2_000, 8_000])
 def test_a_request_is_as_long_as_the_reply_that_it_accepts(length: int) -> None:
-    wire = ASKED.to_wire(NODE.name, NODE.key, length)
+    wire = ASKED.padded(NODE.name, NODE.key, length)
     assert len(wire) in range(max(length, 1_000), max(length, 1_000) + 80)

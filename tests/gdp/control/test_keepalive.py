@@ -16,7 +16,7 @@ from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import parse
+from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
@@ -353,8 +353,7 @@ def test_a_key_that_makes_a_secret_everybody_knows_is_refused() -> None:
 @pytest.mark.parametrize("timing", [[70, 70], [70, 70, 0], [70, 70, 256], [-1, 70, 3], [70, 60_001, 3], [70, "x", 3]])
 def test_a_timing_out_of_bounds_is_refused(timing: list[object]) -> None:
     hello = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=1_500, digest=bytes(8), membership=B.membership)
-    object.__setattr__(hello, "timing", timing)
-    statement = parse(hello.to_wire(B.name, B.key))
+    statement = parse(sign(StatementType.HELLO, hello.to_fields() | {"k": timing}, B.name, B.key))
     with pytest.raises(StatementError) as caught:
         Hello.from_fields(statement.fields)
     assert caught.value.reason is DropReason.MALFORMED

@@ -295,7 +295,7 @@ def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
     for number in range(10):
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
-        tell(at_rib, Withdrawal(own.name, Right.PUBLISH, 2).to_wire(ROBOT))
+        tell(at_rib, Withdrawal(own.name, Right.PUBLISH, 2).to_wire(ROBOT.name, ROBOT.key))
     assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 

@@ -81,7 +81,9 @@ class Site:
         return self.relayed(wire)
 
     def withdrawal(self, name: str, sequence: int) -> bytes:
-        return self.relayed(Withdrawal(self.subject(name).name, Right.PUBLISH, sequence).to_wire(self.robot))
+        return self.relayed(
+            Withdrawal(self.subject(name).name, Right.PUBLISH, sequence).to_wire(self.robot.name, self.robot.key)
+        )
 
     def relayed(self, statement: bytes) -> bytes:
         return RelayedStatement(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)

@@ -19,7 +19,7 @@ def say(world: Simulation, state: LinkState, by: str, to: str, port: int = 0) ->
     """Let a neighbour of ``to`` forward a link state that ``by`` signed."""
     identity = world.identities[by]
     state = replace(state, said_unix_s=int(world.network.now.unix_s))
-    wire = state.to_wire(identity.key, identity.membership)
+    wire = state.to_wire(identity.name, identity.key, identity.membership)
     header = Header(Kind.LINK_STATE, Flag.LAST, HOPS_MAX, 0, len(wire), 1 << 40, 0, 1, 9, ZERO, identity.name)
     mac = world.network._nodes[to].ports[port][2].mac
     assert len(encode(header)) == HEADER_BYTES

@@ -13,7 +13,7 @@ BODY = {"n": CAMERA.name, "right": "publish", "s": 1}
 
 def test_a_withdrawal_is_read_as_it_was_written() -> None:
     withdrawal = Withdrawal(CAMERA.name, Right.PUBLISH, 7)
-    assert Withdrawal.from_statement(parse(withdrawal.to_wire(ROBOT)), NOW) == withdrawal
+    assert Withdrawal.from_statement(parse(withdrawal.to_wire(ROBOT.name, ROBOT.key)), NOW) == withdrawal
 
 
 @pytest.mark.parametrize(
