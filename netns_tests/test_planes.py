@@ -121,6 +121,7 @@ def node(make: MakePlane) -> Plane:
 def far_end(ifname: str) -> socket.socket:
     end = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     end.setsockopt(263, 23, 1)  # SOL_PACKET, PACKET_IGNORE_OUTGOING
+    end.setsockopt(socket.SOL_SOCKET, 33, 4 << 20)  # SO_RCVBUFFORCE: a burst comes while this process waits
     end.bind((ifname, ETHERTYPE))
     end.settimeout(PATIENCE_S)
     return end
