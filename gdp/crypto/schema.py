@@ -47,6 +47,7 @@ __all__ = [
 ]
 
 _B = TypeVar("_B", bound="Body")
+_N = TypeVar("_N")
 _T = TypeVar("_T")
 _U64_MAX: Final = (1 << 64) - 1
 _REQUIRED: Final = object()
@@ -187,12 +188,12 @@ def octets(size: int = 0, *, most: int = 0) -> Form[bytes]:
     return _typed(f"{size} bytes", bytes, lambda value: len(value) == size)
 
 
-def or_empty(form: Form[_T], none: _T) -> Form[_T]:
+def or_empty(form: Form[_T], none: _N) -> Form[_T | _N]:
     """Return the form in which empty bytes stand for one value."""
     return Form(
         f"{form.words}, or empty",
         lambda value: none if value == b"" else form.read(value),
-        lambda value: b"" if value == none else form.write(value),
+        lambda value: b"" if value == none else form.write(cast("_T", value)),
     )
 
 
