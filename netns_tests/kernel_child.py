@@ -14,7 +14,8 @@ from tests.fixtures_forwarding import ENTRIES
 
 if __name__ == "__main__":
     table = Table()
-    table.install_many(ENTRIES.items(), float("inf"))
+    for key, hops in ENTRIES.items():
+        table.install(key, hops, float("inf"))
     plane = KernelPlane(sys.argv[2:], table, clsact=sys.argv[1] == "filter")
     print(*(program_id(plane._loaded.program_of(port)) for port in plane.ports), flush=True)
     while True:

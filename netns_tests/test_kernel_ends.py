@@ -99,7 +99,8 @@ def has_clsact(ifname: str) -> bool:
 
 def table() -> Table:
     made = Table()
-    made.install_many(ENTRIES.items(), float("inf"))
+    for key, hops in ENTRIES.items():
+        made.install(key, hops, float("inf"))
     return made
 
 

@@ -57,7 +57,8 @@ def ends(make_kernel: MakeKernel) -> Iterator[dict[int, socket.socket]]:
 
 def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
     table = Table()
-    table.install_many(entries.items(), float("inf"))
+    for key, hops in entries.items():
+        table.install(key, hops, float("inf"))
     return table
 
 

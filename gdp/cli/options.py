@@ -51,7 +51,7 @@ KeyUri = Annotated[
 
 
 class NameOptions(NamedTuple):
-    """Options that describe what a name is for, beside its kind."""
+    """Options that describe a name, apart from its kind."""
 
     name: Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")] = None  # noqa: UP045
     type_: Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")] = None  # noqa: UP045
