@@ -9,12 +9,10 @@ import sys
 
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.syscall import program_id
-from gdp.switch.table import Table
-from tests.fixtures_forwarding import ENTRIES
+from tests.fixtures_forwarding import filled
 
 if __name__ == "__main__":
-    table = Table()
-    table.install_many(ENTRIES.items(), float("inf"))
+    table = filled()
     plane = KernelPlane(sys.argv[2:], table, clsact=sys.argv[1] == "filter")
     print(*(program_id(plane._loaded.program_of(port)) for port in plane.ports), flush=True)
     while True:

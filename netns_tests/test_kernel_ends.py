@@ -32,7 +32,7 @@ from gdp.ports.kernel.syscall import (
 from gdp.switch.table import Table
 from netns_tests.spaces import Space
 from netns_tests.test_planes import PORT_MACS, far_end
-from tests.fixtures_forwarding import ENTRIES, MTUS, ONE, PEER_MACS, WIDE, frame, leaves
+from tests.fixtures_forwarding import MTUS, ONE, PEER_MACS, WIDE, filled, frame, leaves
 
 pytestmark = pytest.mark.netns
 
@@ -98,9 +98,7 @@ def has_clsact(ifname: str) -> bool:
 
 
 def table() -> Table:
-    made = Table()
-    made.install_many(ENTRIES.items(), float("inf"))
-    return made
+    return filled()
 
 
 def crosses(patience_s: float) -> bool:

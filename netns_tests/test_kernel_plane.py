@@ -17,14 +17,13 @@ from gdp.ports.kernel.abi import BRANCHES_MAX
 from gdp.ports.kernel.device import TxDrops
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.forwarder import Forward, decide, rewrite
-from gdp.switch.table import Hops, Table
+from gdp.switch.table import Hops
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import (
     BOTH,
     DEAD,
-    ENTRIES,
     GONE,
     HALF,
     IN,
@@ -38,6 +37,7 @@ from tests.fixtures_forwarding import (
     TO_WIDE,
     UNKNOWN,
     WIDE,
+    filled,
     frame,
 )
 
@@ -53,12 +53,6 @@ def ends(make_kernel: MakeKernel) -> Iterator[dict[int, socket.socket]]:
     yield opened
     for end in opened.values():
         end.close()
-
-
-def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
-    table = Table()
-    table.install_many(entries.items(), float("inf"))
-    return table
 
 
 def settle(plane: KernelPlane, taken: int) -> int:

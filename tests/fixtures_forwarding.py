@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from gdp.errors import DropReason
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import ETHERTYPE, Flag, Kind
-from gdp.switch.table import NOWHERE, Hops
+from gdp.switch.table import NOWHERE, Hops, Table
 
 IN, WIDE, NARROW, ABSENT = range(4)
 MTUS = {IN: 1500, WIDE: 1500, NARROW: 700}
@@ -54,6 +54,14 @@ ENTRIES: dict[bytes, Hops] = {
     CUT_OFF: ((*TO_ABSENT, *TO_ABSENT),),
     TREE: ((*TO_ABSENT, *TO_NARROW), (*TO_WIDE, *TO_ABSENT)),
 }
+
+
+def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
+    """Return a table with entries that stay."""
+    table = Table()
+    for key, hops in entries.items():
+        table.install(key, hops, float("inf"))
+    return table
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from fog.cli.views import print_json, stage
 from fog.cluster import ClusterPlan
 from fog.supervisor.background import ensure
 from fog.supervisor.infrastructure import open_provider, set_up
-from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, set_up_logging
+from gdp.cli.node import Logs, running
 from gdp.errors import LocalError
 from gdp.terminal import echo
 
@@ -151,9 +151,8 @@ def supervise(
     state: State = None,
     stay: Stay = False,
     lock: Lock = None,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
+    *,
+    logs: Logs,
 ) -> None:
     """Keep clusters as they are wanted. Other verbs start it by themselves, in the background.
 
@@ -163,8 +162,7 @@ def supervise(
     """
     from fog.supervisor.process import supervise as be_supervisor
 
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with opened(site, state, supervised=False) as (here, _):
+    with running(logs), opened(site, state, supervised=False) as (here, _):
         be_supervisor(here, stays=stay, lock=lock)
 
 

@@ -16,16 +16,15 @@ import typer
 
 from fog.host.agent import MachineAgent
 from fog.host.bundle import JOIN_FILE, TICKET_FILE
-from gdp.cli.completion import allow_completion
-from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, emit, failing_clearly, set_up_logging
-from gdp.cli.version import HELP, Version, versioned
-from gdp.terminal import echo
+from gdp.cli.node import Logs, report, running
+from gdp.cli.program import Program
 
 __all__ = ["main"]
 
 log = logging.getLogger(__name__)
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("fog-machine")
+main = app.run
 
 Home = Annotated[
     Path, typer.Option("--home", help="The machine's folder, with boot.json.", exists=True, file_okay=False)
@@ -34,24 +33,20 @@ Json = Annotated[bool, typer.Option("--json", help="Say at the end why, as a lin
 AwaitGo = Annotated[bool, typer.Option("--await-go", hidden=True)]
 
 
-@app.command(context_settings=HELP, epilog="Example: fog-machine --home /var/lib/fog/machine")
+@app.command(epilog="Example: fog-machine --home /var/lib/fog/machine")
 def machine(
     home: Home,
     json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
+    *,
+    logs: Logs,
     await_go: AwaitGo = False,
-    version: Version = False,
 ) -> None:
     """Be a machine of a cluster: enrol if there is a ticket, join if there is a token, run the programs of boot.json
     until SIGTERM. SIGUSR1 drains it first.
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
-    del version  # the option ends the command
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with failing_clearly():
+    with running(logs):
         host = MachineAgent(home.resolve())
         if await_go and not sys.stdin.readline():
             log.warning("no start command came, so no record of this machine exists")
@@ -61,10 +56,7 @@ def machine(
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # until the agent handles them
             reason = _become_member(home.resolve())
         reason = reason or asyncio.run(host.run())
-        if json:
-            emit("done", reason=reason)
-        else:
-            echo(f"machine ends: {reason}")
+        report("done", f"machine ends: {reason}", json=json, reason=reason)
 
 
 def _become_member(home: Path) -> str:
@@ -88,12 +80,6 @@ def _become_member(home: Path) -> str:
                 raise
             return f"the domain refuses it: {error}"
     return ""
-
-
-def main() -> None:
-    """Run the command."""
-    allow_completion("fog-machine")
-    versioned(app)(prog_name="fog-machine")
 
 
 if __name__ == "__main__":

@@ -13,8 +13,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
-from gdp.cli.node import emit, failing_clearly
-from gdp.terminal import echo
+from gdp.cli.node import failing_clearly, report
 
 __all__ = ["dashboard"]
 
@@ -59,11 +58,8 @@ async def _serve(nodes: tuple[Path, ...], states: tuple[Path, ...], port: int, *
     def ready() -> None:
         """Print the address."""
         found = len(server.scene.graph.nodes)
-        if as_json:
-            emit("ready", url=server.url, nodes=found)
-            return
-        echo(f"live view of {found} nodes: {server.url}")
-        if not found:
-            echo("no node runs here as far as this user may see; start one, or use sudo")
+        none = "" if found else "\nno node runs here as far as this user may see; start one, or use sudo"
+        text = f"live view of {found} nodes: {server.url}{none}"
+        report("ready", text, json=as_json, url=server.url, nodes=found)
 
     await server.run_until(ready, stop)

@@ -5,9 +5,7 @@ I/O. Files without a command are the command ``rules``, so ``gdp delegate --owne
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Optional
 
@@ -20,17 +18,15 @@ from gdp.cli.doors import rules_of_proxies
 from gdp.cli.extension import ANY_ARGUMENTS
 from gdp.cli.output import (
     epochs_from_text,
-    metadata_from_options,
     rights_from_text,
     show,
     span,
 )
+from gdp.cli.program import Program
 from gdp.cli.rights_file import delegate_rights
-from gdp.cli.salt import SaltFile
-from gdp.cli.version import HELP, versioned
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
-from gdp.errors import GdpError, LocalError
+from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
 from gdp.stores.checkout import work_tree_of
@@ -55,15 +51,14 @@ class _RulesByDefault(TyperGroup):
         return super().parse_args(ctx, [_RULES, *args] if args and args[0] not in known else args)
 
 
-app = typer.Typer(
+app = Program(
+    "gdp-delegate",
     cls=_RulesByDefault,
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings=HELP,
     help="Let nodes act on names: all that proxies need by their files, a file of rights, or one name; or a switch"
     " attract a node's traffic. The command rules is the default: gdp delegate --owner owner robot/proxy.yaml",
 )
+main = app.run
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
@@ -91,14 +86,8 @@ def name(
     right: Rights,
     kind: options.Kind,
     out: OutFile,
-    name: options.Name = None,
-    type_: options.Type = None,
-    author: options.Author = None,
-    maintainer: options.Maintainer = None,
-    description: options.Description = None,
-    pin: options.Pin = None,
-    more: options.More = [],  # noqa: B006 (the library copies it)
-    salt_file: SaltFile = None,
+    *,
+    subject: options.NameOptions,
     epochs: Epochs = "0",
     days: options.Days = DELEGATION_DAYS,
     may_delegate: MayDelegate = False,
@@ -115,17 +104,7 @@ def name(
       gdp delegate name --owner keys/lab --card server.card --right serve --kind service --name /plan \\
           --type nav_msgs/srv/GetPlan --out plan.delegation
     """
-    metadata = metadata_from_options(
-        kind=kind,
-        name=name,
-        type_=type_,
-        author=author,
-        maintainer=maintainer,
-        description=description,
-        pin=pin,
-        more=more,
-        salt_file=salt_file,
-    )
+    metadata = subject.metadata(kind)
     face = load_card(card)
     if root is not None:
         face.member_of(load_root(root), time.time())
@@ -208,12 +187,3 @@ def revoke(
     note_once(owner, Action.REVOKED, "delegation", who=who, about=about, unix_s=time.time())
     write_all(out.parent, {out.name: public(statement)}, force=force)
     show({**described(given), "revocation": str(out)}, as_json=as_json)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run these commands as the program ``gdp-delegate``; ``arguments``: by default those of this process."""
-    try:
-        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp-delegate")
-    except GdpError as error:
-        echo(f"error: {error}", err=True)
-        sys.exit(2)

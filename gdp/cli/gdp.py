@@ -5,19 +5,14 @@ I/O; each sub-command has a file of its own. Exit 0 when done, 2 when the input 
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
-import typer
-
 from gdp.cli import extension
-from gdp.cli.completion import allow_completion
 from gdp.cli.extension import ExtendedGroup
 from gdp.cli.lazy_commands import LazyCommand, LazyCommands
-from gdp.cli.version import HELP, Version, versioned
-from gdp.errors import GdpError
-from gdp.terminal import echo
+from gdp.cli.program import Program
+from gdp.cli.version import Version
 
 __all__ = ["app", "main"]
 
@@ -70,34 +65,13 @@ class _Commands(ExtendedGroup):
         self.commands = LazyCommands(_KNOWN)
 
 
-app = typer.Typer(
-    name="gdp",
-    cls=_Commands,
-    help="Names, keys and proofs of the Global Data Plane.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    context_settings=HELP,
-)
+app = Program("gdp", cls=_Commands, help="Names, keys and proofs of the Global Data Plane.", no_args_is_help=True)
+main = app.run
 
 
 @app.callback()
 def _gdp(version: Version = False) -> None:
     del version  # the option's callback ends the command
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command and exit with its code.
-
-    Args:
-        arguments: as after the program's name; by default those of this process.
-    """
-    allow_completion("gdp")
-    try:
-        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp")
-    except GdpError as error:
-        echo(f"error: {error}", err=True)
-        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import Any
 import typer
 from typer.main import get_command, get_group
 
+from gdp.cli.program import ungrouped
 from gdp.cli.version import with_version
 
 __all__ = ["LazyCommand", "LazyCommands"]
@@ -41,7 +42,9 @@ class LazyCommand:
             command = get_group(found)
         else:
             only = typer.Typer(add_completion=False)
-            only.command(name, no_args_is_help=self.no_args_is_help, context_settings=dict(self.settings))(found)
+            only.command(name, no_args_is_help=self.no_args_is_help, context_settings=dict(self.settings))(
+                ungrouped(found)
+            )
             command = get_command(only)
         command.name = name
         return with_version(command)

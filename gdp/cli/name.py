@@ -11,8 +11,7 @@ from typing import Annotated, Optional
 import typer
 
 from gdp.cli import options
-from gdp.cli.output import metadata_from_options, show
-from gdp.cli.salt import SaltFile
+from gdp.cli.output import show
 from gdp.crypto.subject import Subject
 from gdp.metadata import hidden
 from gdp.stores.keyring import load_public_key
@@ -27,14 +26,8 @@ Owner = Annotated[
 
 def name(
     kind: options.Kind,
-    name: options.Name = None,
-    type_: options.Type = None,
-    author: options.Author = None,
-    maintainer: options.Maintainer = None,
-    description: options.Description = None,
-    pin: options.Pin = None,
-    more: options.More = [],  # noqa: B006 (the library copies it)
-    salt_file: SaltFile = None,
+    *,
+    described: options.NameOptions,
     owner: Owner = None,
     as_json: options.Json = False,
 ) -> None:
@@ -46,17 +39,7 @@ def name(
       gdp name --kind action --name /navigate --type nav2_msgs/action/NavigateToPose --owner owner.pub
       gdp name --kind topic --name /camera/image --type sensor_msgs/msg/Image --owner owner.pub --salt-file camera.salt
     """
-    metadata = metadata_from_options(
-        kind=kind,
-        name=name,
-        type_=type_,
-        author=author,
-        maintainer=maintainer,
-        description=description,
-        pin=pin,
-        more=more,
-        salt_file=salt_file,
-    )
+    metadata = described.metadata(kind)
     subject = Subject.of(metadata, load_public_key(owner).compressed if owner is not None else b"")
     result = {
         "name": subject.name.to_text(),

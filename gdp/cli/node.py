@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple, TypeVar, get_args
 
 import orjson
 import typer
+from pydantic import BaseModel
 
-from gdp.config.config import UplinkPlane
 from gdp.errors import ConfigError, GdpError, LocalError
 from gdp.terminal import echo
 
@@ -32,15 +32,16 @@ __all__ = [
     "FoundConfig",
     "Json",
     "Level",
-    "LogFormat",
-    "LogLevel",
+    "Logs",
     "MemberPlane",
     "Verbose",
     "emit",
     "emit_wait",
     "failing_clearly",
-    "member_plane",
+    "report",
+    "running",
     "set_up_logging",
+    "with_plane",
 ]
 
 # NumPy's OpenBLAS starts a thread for each core as soon as it is loaded. No command uses them, and a thread that exists
@@ -81,11 +82,28 @@ class Format(str, Enum):
     JSON = "json"
 
 
-LogLevel = Annotated[
-    Level,
-    typer.Option("--log-level", help="debug: decisions; info: steps; warning: what is degraded; error: failures."),
-]
-LogFormat = Annotated[Format, typer.Option("--log-format", help="Lines on standard error: text, or objects of JSON.")]
+class Logs(NamedTuple):
+    """Options of what a node logs."""
+
+    verbose: Verbose = False
+    log_level: Annotated[
+        Level,
+        typer.Option("--log-level", help="debug: decisions; info: steps; warning: what is degraded; error: failures."),
+    ] = Level.INFO
+    log_format: Annotated[
+        Format, typer.Option("--log-format", help="Lines on standard error: text, or objects of JSON.")
+    ] = Format.TEXT
+
+
+_Settings = TypeVar("_Settings", bound=BaseModel)
+
+
+@contextlib.contextmanager
+def running(logs: Logs) -> Iterator[None]:
+    """Log as the options say; print an error of ours as one line on standard error, and exit with code 2."""
+    set_up_logging(verbose=logs.verbose, level=logs.log_level, form=logs.log_format)
+    with failing_clearly():
+        yield
 
 
 def set_up_logging(
@@ -111,17 +129,32 @@ def _is_ours_or_serious(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.WARNING or record.name.partition(".")[0] in _OURS
 
 
-def member_plane(text: str) -> UplinkPlane:
-    """Return the data plane of a RIB or proxy. Raises ``LocalError``: there is no such one."""
-    known: dict[str, UplinkPlane] = {"raw": "raw", "scapy": "scapy"}
-    if text not in known:
-        raise LocalError(f"--data-plane is {' or '.join(known)}, not {text}")
-    return known[text]
+def with_plane(settings: _Settings, data_plane: str | None) -> _Settings:
+    """Return the configuration with the data plane of the command line, None: with its own.
+
+    Raises:
+        LocalError: there is no such data plane.
+    """
+    if data_plane is None:
+        return settings
+    known = get_args(type(settings).model_fields["data_plane"].annotation)
+    if data_plane not in known:
+        separator = " or " if len(known) == 2 else ", "
+        raise LocalError(f"--data-plane is {separator.join(known)}, not {data_plane}")
+    return settings.model_copy(update={"data_plane": data_plane})
 
 
 def emit(event: str, **fields: object) -> None:
     """Write one line of JSON and flush it, because a reader waits for it."""
     echo(orjson.dumps({"event": event, **fields}).decode())
+
+
+def report(event: str, text: str, *, json: bool, **fields: object) -> None:
+    """Write an event as one line of JSON, or its text for people."""
+    if json:
+        emit(event, **fields)
+    else:
+        echo(text)
 
 
 def emit_wait(reason: str, text: str) -> None:

@@ -6,16 +6,18 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, NamedTuple, Optional
 
 import typer
 
+from gdp.cli.output import items_from_text
+from gdp.cli.salt import SaltFile, read_salt
+from gdp.errors import LocalError
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
+from gdp.metadata import Metadata
 
 __all__ = [
-    "Author",
     "Days",
-    "Description",
     "Directory",
     "Force",
     "Host",
@@ -23,23 +25,14 @@ __all__ = [
     "KeyUri",
     "Kind",
     "Label",
-    "Maintainer",
     "More",
-    "Name",
+    "NameOptions",
     "Out",
-    "Pin",
     "Protect",
-    "Type",
 ]
 
 Kind = Annotated[str, typer.Option("--kind", help="topic, service, action, switch, rib, proxy, ...")]
 # typer reads these annotations at run time, on Python 3.10 too: hence Optional.
-Name = Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")]  # noqa: UP045
-Type = Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")]  # noqa: UP045
-Author = Annotated[Optional[str], typer.Option("--author", help="who made it")]  # noqa: UP045
-Maintainer = Annotated[Optional[str], typer.Option("--maintainer", help="who looks after it")]  # noqa: UP045
-Description = Annotated[Optional[str], typer.Option("--description", help="what it is")]  # noqa: UP045
-Pin = Annotated[Optional[int], typer.Option("--pin", help="a number that people remember")]  # noqa: UP045
 More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="further metadata; may be repeated")]
 
 _DAYS_MAX = CERTIFICATE_LIFE_MAX_S / 86_400
@@ -55,3 +48,31 @@ KeyUri = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)"),
 ]
+
+
+class NameOptions(NamedTuple):
+    """Options that describe a name, apart from its kind."""
+
+    name: Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")] = None  # noqa: UP045
+    type_: Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")] = None  # noqa: UP045
+    author: Annotated[Optional[str], typer.Option("--author", help="who made it")] = None  # noqa: UP045
+    maintainer: Annotated[Optional[str], typer.Option("--maintainer", help="who looks after it")] = None  # noqa: UP045
+    description: Annotated[Optional[str], typer.Option("--description", help="what it is")] = None  # noqa: UP045
+    pin: Annotated[Optional[int], typer.Option("--pin", help="a number that people remember")] = None  # noqa: UP045
+    more: More = []  # noqa: RUF012 (the library copies it)
+    salt_file: SaltFile = None
+
+    def metadata(self, kind: str) -> Metadata:
+        """Return the metadata that the options describe; options that are not given are absent.
+
+        Raises:
+            LocalError: an unknown kind, a key given twice, a salt as an argument, or a value of the wrong form.
+        """
+        given = {"kind": kind, **self._asdict()}
+        keys = ("kind", "name", "type_", "author", "maintainer", "description", "pin")
+        items = {key.rstrip("_"): given[key] for key in keys if given[key] is not None}
+        for key, value in items_from_text(self.more).items():
+            if key in items:
+                raise LocalError(f"metadata {key!r} is given twice")
+            items[key] = value
+        return Metadata({**items, **read_salt(self.salt_file)})

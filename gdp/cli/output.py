@@ -8,12 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
-from pathlib import Path
 
-from gdp.cli.salt import NAME_SALT, read_salt
+from gdp.cli.salt import NAME_SALT
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
-from gdp.metadata import SALT, Metadata
+from gdp.metadata import SALT
 from gdp.state.columns import columns
 from gdp.terminal import echo
 from gdp.trust.grants import EPOCH_MAX
@@ -22,7 +21,6 @@ from gdp.trust.right import Right
 __all__ = [
     "epochs_from_text",
     "items_from_text",
-    "metadata_from_options",
     "moment",
     "rights_from_text",
     "show",
@@ -56,40 +54,6 @@ def moment(unix_s: int) -> str:
 def span(validity: Validity) -> dict[str, str]:
     """Return both ends of a validity, for a result."""
     return {"from": moment(validity.not_before_unix_s), "until": moment(validity.not_after_unix_s)}
-
-
-def metadata_from_options(
-    *,
-    kind: str,
-    name: str | None,
-    type_: str | None,
-    author: str | None,
-    maintainer: str | None,
-    description: str | None,
-    pin: int | None,
-    more: Sequence[str],
-    salt_file: Path | None = None,
-) -> Metadata:
-    """Return the metadata that the options of ``gdp name`` describe; options that are not given are absent.
-
-    Raises:
-        LocalError: an unknown kind, a key given twice, a salt as an argument, or a value of the wrong form.
-    """
-    given: dict[str, str | int | None] = {
-        "kind": kind,
-        "name": name,
-        "type": type_,
-        "author": author,
-        "maintainer": maintainer,
-        "description": description,
-        "pin": pin,
-    }
-    items = {key: value for key, value in given.items() if value is not None}
-    for key, value in items_from_text(more).items():
-        if key in items:
-            raise LocalError(f"metadata {key!r} is given twice")
-        items[key] = value
-    return Metadata({**items, **read_salt(salt_file)})
 
 
 def items_from_text(texts: Iterable[str]) -> dict[str, str]:

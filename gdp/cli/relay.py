@@ -9,22 +9,9 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.completion import allow_completion
-from gdp.cli.node import (
-    Check,
-    Config,
-    Format,
-    Json,
-    Level,
-    LogFormat,
-    LogLevel,
-    Verbose,
-    emit,
-    failing_clearly,
-    set_up_logging,
-)
+from gdp.cli.node import Check, Config, Json, Logs, report, running
 from gdp.cli.output import show
-from gdp.cli.version import HELP, Version, versioned
+from gdp.cli.program import Program
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -33,17 +20,16 @@ from gdp.nodes.membership import load_member
 from gdp.nodes.relay import Relay, relay_control_path, run_relay
 from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
-from gdp.terminal import echo
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp-relay")
+main = app.run
 
 _STATUS_S = 10.0
 
 
 @app.command(
-    context_settings=HELP,
     epilog="Examples: gdp-relay --config relay.yaml; gdp-relay --config relay.yaml --check prints the device of each"
     " border, which is an optional port of the switch; gdp-relay --config relay.yaml --status",
 )
@@ -52,19 +38,15 @@ def relay(
     status: Annotated[bool, typer.Option("--status", help="Show the status of the running relay, and end.")] = False,
     check: Check = False,
     json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
-    version: Version = False,
+    *,
+    logs: Logs,
 ) -> None:
     """Carry a switch's frames through TLS where the network blocks UDP, until Ctrl-C. It is slower than a tunnel.
 
     With the section server it is a border's end, with borders it is a member's end. Each connection has a TAP device,
     which has a carrier only while the connection is open.
     """
-    del version  # the option's callback ends the command
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with failing_clearly():
+    with running(logs):
         settings = RelayConfig.load(config)
         if check or status:
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
@@ -80,27 +62,17 @@ def relay(
 def _report_check(identity: Identity, settings: RelayConfig, *, json: bool) -> None:
     devices = {each.peer.to_text(): tap_name(identity.name, each.peer) for each in settings.borders}
     port = None if settings.server is None else settings.server.port
-    if json:
-        emit("checked", name=identity.name.to_text(), port=port, devices=devices)
-        return
-    echo(f"configuration good: relay of {identity.role.value} {identity.name.short}, server port {port or 'none'}")
-    for peer, device in devices.items():
-        echo(f"{device} leads to {peer}")
+    text = f"configuration good: relay of {identity.role.value} {identity.name.short}, server port {port or 'none'}"
+    leads = [f"{device} leads to {peer}" for peer, device in devices.items()]
+    name = identity.name.to_text()
+    report("checked", "\n".join([text, *leads]), json=json, name=name, port=port, devices=devices)
 
 
 def _report_ready(identity: Identity, relay: Relay, *, json: bool) -> None:
     port = None if relay.server is None else relay.server.listening_port
     devices = [dialer.port.device.ifname for dialer in relay.dialers]
-    if json:
-        emit("ready", name=identity.name.to_text(), port=port, devices=devices)
-        return
-    echo(f"relay of {identity.role.value} {identity.name.short} is up, via TLS (slower); Ctrl-C ends it")
-
-
-def main() -> None:
-    """Run the command."""
-    allow_completion("gdp-relay")
-    versioned(app)(prog_name="gdp-relay")
+    text = f"relay of {identity.role.value} {identity.name.short} is up, via TLS (slower); Ctrl-C ends it"
+    report("ready", text, json=json, name=identity.name.to_text(), port=port, devices=devices)
 
 
 if __name__ == "__main__":

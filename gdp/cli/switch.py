@@ -14,43 +14,25 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.completion import allow_completion
-from gdp.cli.node import (
-    Check,
-    Format,
-    FoundConfig,
-    Json,
-    Level,
-    LogFormat,
-    LogLevel,
-    Verbose,
-    emit,
-    emit_wait,
-    failing_clearly,
-    set_up_logging,
-)
-from gdp.cli.version import HELP, Version, versioned
-from gdp.config.config import DataPlane, SwitchConfig
+from gdp.cli.node import Check, FoundConfig, Json, Logs, emit_wait, report, running, with_plane
+from gdp.cli.program import Program
+from gdp.config.config import SwitchConfig
 from gdp.config.found_config import find_switch_config
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.enrolment.addresses import default_directory
-from gdp.errors import LocalError
 from gdp.nodes.membership import load_member
 from gdp.nodes.switch import run_switch
-from gdp.terminal import echo
 
 __all__ = ["main"]
 
 log = logging.getLogger(__name__)
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp-switch")
+main = app.run
 
 
-@app.command(
-    context_settings=HELP,
-    epilog="Examples: gdp-switch --iface eth0; gdp-switch --iface eth0 --iface eth1 --config switch.yaml",
-)
+@app.command(epilog="Examples: gdp-switch --iface eth0; gdp-switch --iface eth0 --iface eth1 --config switch.yaml")
 def switch(
     config: FoundConfig = None,
     iface: Annotated[
@@ -60,10 +42,8 @@ def switch(
     data_plane: Annotated[str | None, typer.Option(help="auto, kernel, raw or scapy; instead of the file's.")] = None,
     check: Check = False,
     json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
-    version: Version = False,
+    *,
+    logs: Logs,
 ) -> None:
     """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C.
 
@@ -71,12 +51,8 @@ def switch(
     --config it looks for the switch.yaml of this machine: here, in a folder here, as gdp lab leaves it, and where gdp
     join puts it.
     """
-    del version  # the option's callback ends the command
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with failing_clearly():
-        settings = _settings(config, iface or [])
-        if data_plane is not None:
-            settings = settings.model_copy(update={"data_plane": _data_plane(data_plane)})
+    with running(logs):
+        settings = with_plane(_settings(config, iface or []), data_plane)
         if check:
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
             _report_check(identity, len(settings.ports), json=json)
@@ -109,33 +85,18 @@ def _machine_folders() -> list[Path]:
     return folders
 
 
-def _data_plane(text: str) -> DataPlane:
-    known: dict[str, DataPlane] = {"auto": "auto", "kernel": "kernel", "raw": "raw", "scapy": "scapy"}
-    if text not in known:
-        raise LocalError(f"--data-plane is {', '.join(known)}, not {text}")
-    return known[text]
-
-
 def _report_check(identity: Identity, ports: int, *, json: bool) -> None:
-    if json:
-        emit("checked", name=identity.name.to_text(), role=identity.role.value, ports=ports)
-    else:
-        echo(f"configuration good: {identity.role.value} {identity.name.short}, {ports} ports")
+    role = identity.role.value
+    text = f"configuration good: {role} {identity.name.short}, {ports} ports"
+    report("checked", text, json=json, name=identity.name.to_text(), role=role, ports=ports)
 
 
 def _report_ready(identity: Identity, plane: str, reason: str, *, json: bool) -> None:
-    if json:
-        emit("ready", name=identity.name.to_text(), role=identity.role.value, data_plane=plane, reason=reason)
-        return
-    echo(f"{identity.role.value} {identity.name.short} is up, data plane {plane}; Ctrl-C ends it")
+    name, role = identity.name, identity.role.value
+    text = f"{role} {name.short} is up, data plane {plane}; Ctrl-C ends it"
     if reason:
-        echo(f"not the kernel data plane: {reason}")
-
-
-def main() -> None:
-    """Run the command."""
-    allow_completion("gdp-switch")
-    versioned(app)(prog_name="gdp-switch")
+        text += f"\nnot the kernel data plane: {reason}"
+    report("ready", text, json=json, name=name.to_text(), role=role, data_plane=plane, reason=reason)
 
 
 if __name__ == "__main__":

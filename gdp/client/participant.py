@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypedDict
 
 from gdp.client.attachment import Attachment
 from gdp.client.control_keys import ControlKeys
@@ -46,13 +46,34 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 _FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT), int(Kind.PARITY))
 _DIAGNOSTICS: Final = (int(Kind.DIAGNOSTIC_REQUEST), int(Kind.DIAGNOSTIC_REPLY))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
 # a participant that is called later than this, although hellos are due, was not scheduled
 _STALL_S: Final = 2 * HELLO_S
 
-__all__ = ["Message", "Participant", "Topic"]
+__all__ = ["Message", "Participant", "ServiceOptions", "Topic"]
+
+
+class ServiceOptions(TypedDict, total=False):
+    """How a name is served or called.
+
+    Attributes:
+        is_global: other domains can find the name; the default.
+        urgent: its frames go before others.
+        paths: 2: each frame twice, over two disjoint paths where they exist.
+        options: how its messages share the path.
+        is_session: a session secret authenticates streams between one client and one server, if both ask for it.
+    """
+
+    is_global: bool
+    urgent: bool
+    paths: int
+    options: SendOptions
+    is_session: bool
 
 
 class Participant:
@@ -137,61 +158,16 @@ class Participant:
         self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
         return publisher
 
-    def serve(
-        self,
-        topic: Topic,
-        description: bytes,
-        *,
-        is_global: bool = True,
-        urgent: bool = False,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
-        is_session: bool = False,
-    ) -> Publisher:
-        """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them.
+    def serve(self, topic: Topic, description: bytes, **options: Unpack[ServiceOptions]) -> Publisher:
+        """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them."""
+        return self._join_service(topic, Right.SERVE, description, **options)
 
-        Args:
-            is_session: a session secret authenticates streams to and from one client, if that client asks for it too.
-        """
-        return self._join_service(
-            topic,
-            Right.SERVE,
-            description,
-            is_global=is_global,
-            urgent=urgent,
-            paths=paths,
-            options=options,
-            is_session=is_session,
-        )
-
-    def call(
-        self,
-        topic: Topic,
-        description: bytes,
-        *,
-        is_global: bool = True,
-        urgent: bool = False,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
-        is_session: bool = False,
-    ) -> Publisher:
+    def call(self, topic: Topic, description: bytes, **options: Unpack[ServiceOptions]) -> Publisher:
         """Call a name from now on; return the stream of requests to all its servers. ``send_request`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
-
-        Args:
-            is_session: a session secret authenticates streams to and from one server, if that server asks for it too.
         """
-        return self._join_service(
-            topic,
-            Right.CALL,
-            description,
-            is_global=is_global,
-            urgent=urgent,
-            paths=paths,
-            options=options,
-            is_session=is_session,
-        )
+        return self._join_service(topic, Right.CALL, description, **options)
 
     def respond(self, service: Name, client: Name, message: bytes) -> None:
         """Send a message to one client of a name that is served here.
@@ -497,11 +473,11 @@ class Participant:
         right: Right,
         description: bytes,
         *,
-        is_global: bool,
-        urgent: bool,
-        paths: int,
-        options: SendOptions,
-        is_session: bool,
+        is_global: bool = True,
+        urgent: bool = False,
+        paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
+        is_session: bool = False,
     ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)

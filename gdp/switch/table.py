@@ -56,7 +56,6 @@ EVERY_SIDE: Final = (1 << 64) - 1
 SHARED_SIDE: Final = 63  # the bit of that port and all above
 
 _KEY_SIZES: Final = (NAME_BYTES, 2 * NAME_BYTES)
-_UNSEEN: Final[tuple[Hops, Hops | None]] = (NOWHERE, None)
 EXPIRE_MAX: Final = 4_096
 _SHARED_MAX: Final = 4_096  # hop tuples that are cached for sharing; a switch has far fewer different ones
 _SLACK: Final = 1_024  # stale heap items that are not yet worth a rebuild
@@ -83,14 +82,13 @@ class Table:
         sides: key to the mask of ports that frames may come from; what is not in it may come from everywhere.
     """
 
-    __slots__ = ("_ends", "_heap", "_latest_s", "_max", "_observer", "_shared", "entries", "sides")
+    __slots__ = ("_ends", "_heap", "_max", "_observer", "_shared", "entries", "sides")
 
     def __init__(self, max_entries: int = TABLE_MAX) -> None:
         self.entries: dict[bytes, Hops] = {}
         self.sides: dict[bytes, int] = {}
         self._ends: dict[bytes, float] = {}
         self._heap: list[tuple[float, bytes]] = []
-        self._latest_s = float("-inf")  # no end in the heap is later
         self._shared: dict[Hops, Hops] = {}
         self._max = max_entries
         self._observer: Observer | None = None
@@ -134,54 +132,12 @@ class Table:
         else:
             self.sides.pop(key, None)
         self._ends[key] = expires_s
-        self._latest_s = max(self._latest_s, expires_s)
         if known is None or expires_s < known:
             heapq.heappush(self._heap, (expires_s, key))
             self._rebuild_if_stale()
         if self._observer is not None and is_news:
             self._observer.put({key: hops})
         return True
-
-    def install_many(self, items: Iterable[tuple[bytes, Hops]], expires_s: float) -> int:
-        """Add or replace entries under one lease; return how many were taken: all, unless the table is full.
-
-        Raises:
-            LocalError: as ``install``; the items before the invalid one are stored.
-        """
-        entries, ends = self.entries, self._ends
-        news: dict[bytes, Hops] = {}
-        sooner: list[bytes] = []
-        # by identity, which costs less than a hash; the references keep the identities valid
-        seen: dict[int, tuple[Hops, Hops]] = {}
-        taken = 0
-        try:
-            for key, hops in items:
-                _, shared = seen.get(id(hops), _UNSEEN)
-                if shared is None or len(key) not in _KEY_SIZES:
-                    _check(key, hops)
-                    shared = self._share(hops)
-                    seen[id(hops)] = hops, shared
-                known = ends.get(key)
-                if known is None:
-                    if len(entries) >= self._max:
-                        continue
-                    key = bytes(key)  # noqa: PLW2901  (as in install)
-                    sooner.append(key)
-                    news[key] = shared
-                    entries[key] = shared
-                else:
-                    if expires_s < known:
-                        sooner.append(key)
-                    if entries[key] != shared or self.sides.pop(key, None) is not None:
-                        news[key] = shared
-                        entries[key] = shared
-                ends[key] = expires_s
-                taken += 1
-        finally:
-            self._expect(sooner, expires_s)
-            if self._observer is not None and news:
-                self._observer.put(news)
-        return taken
 
     def remove(self, key: bytes) -> bool:
         """Remove an entry; False when there was none."""
@@ -228,16 +184,6 @@ class Table:
             else:
                 return True
         return False
-
-    def _expect(self, keys: list[bytes], expires_s: float) -> None:
-        """Record the end of one lease, and the entries whose heap items it precedes."""
-        if expires_s >= self._latest_s:  # none in the heap is later, so they may be appended
-            self._latest_s = expires_s
-            self._heap += [(expires_s, key) for key in keys]
-        else:
-            for key in keys:
-                heapq.heappush(self._heap, (expires_s, key))
-        self._rebuild_if_stale()
 
     def _share(self, hops: Hops) -> Hops:
         """Return the one cached tuple that equals ``hops``."""

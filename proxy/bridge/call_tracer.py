@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from gdp.names import Name
 
-__all__ = ["CallKey", "CallTracer", "NoTracer", "TraceIds", "trace_ids"]
+__all__ = ["CallKey", "CallTracer", "TraceIds", "trace_ids"]
 
 _CONTEXT: Final = b"gdp trace of a call, version 1"
 
@@ -42,8 +42,8 @@ def trace_ids(key: CallKey) -> TraceIds:
     return TraceIds(int.from_bytes(digest[:16], "big") or 1, int.from_bytes(digest[16:24], "big") or 1)
 
 
-class CallTracer(Protocol):
-    """What happened to a call; each method is called in the bridge's thread and never raises."""
+class CallTracer:
+    """Receiver of what happens to calls, which ignores it; the bridge's thread calls each method, and none raises."""
 
     def begun(self, key: CallKey, local: str) -> None:
         """Record that a local client calls the service that is ``local`` here."""
@@ -68,31 +68,3 @@ class CallTracer(Protocol):
 
     def close(self) -> None:
         """End all spans, and send what is left of them."""
-
-
-class NoTracer:
-    """Tracing is off."""
-
-    def begun(self, key: CallKey, local: str) -> None:
-        """Do nothing."""
-
-    def asked(self, key: CallKey, servers: Iterable[Name]) -> None:
-        """Do nothing."""
-
-    def responded(self, key: CallKey, server: Name, error: str = "") -> None:
-        """Do nothing."""
-
-    def answered(self, key: CallKey, server: Name) -> None:
-        """Do nothing."""
-
-    def failed(self, key: CallKey, reason: str) -> None:
-        """Do nothing."""
-
-    def serving(self, key: CallKey, local: str) -> None:
-        """Do nothing."""
-
-    def served(self, key: CallKey, error: str = "") -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""

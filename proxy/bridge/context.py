@@ -14,7 +14,7 @@ from gdp.client.participant import Participant
 from gdp.control.boundary import ErrorBoundary
 from gdp.errors import DropReason, RemoteError
 from gdp.names import Name
-from proxy.bridge.call_tracer import CallTracer, NoTracer
+from proxy.bridge.call_tracer import CallTracer
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
 from proxy.endpoints.core.endpoint import EndpointError
@@ -34,7 +34,7 @@ class BridgeContext:
     member: Participant
     traffic: Traffic
     faults: Faults
-    tracer: CallTracer = field(default_factory=NoTracer)
+    tracer: CallTracer = field(default_factory=CallTracer)
     boundary: ErrorBoundary = field(default_factory=ErrorBoundary)
 
     def report_error(self, what: str, event: EndpointError, fault: Fault) -> None:

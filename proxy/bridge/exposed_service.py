@@ -17,28 +17,25 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.client.participant import Message, Topic
-from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
-from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.cancellation import TRIGGER, Cancellation
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT
 from proxy.bridge.core.bridge_election import presence_of, sign
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import cancel_of, goal_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goal_calls import GoalCalls
-from proxy.bridge.liveliness import Party
 from proxy.bridge.ordered_server import OrderedServer
 from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
+from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.undescribed_requests import UndescribedRequests
 from proxy.config.rule import CALL_MAX_S
 from proxy.endpoints.core.endpoint import (
@@ -66,7 +63,7 @@ _NOTICE_S: Final = 1.0
 _GONE: Final = "the server is gone"
 
 
-class ExposedService:
+class ExposedService(ServiceFlow):
     """Lets remote clients call one local server.
 
     Attributes:
@@ -77,6 +74,8 @@ class ExposedService:
         LocalError: this machine does not know a type.
     """
 
+    far_role = "client"
+
     def __init__(
         self,
         context: BridgeContext,
@@ -85,47 +84,25 @@ class ExposedService:
         topic: Topic,
         random_start: int,
     ) -> None:
-        self._context = context
-        self._dispatcher = dispatcher
-        self._flow_spec = flow_spec
-        self._topic = topic
+        super().__init__(context, dispatcher, flow_spec, topic)
         self._serving = _serving_of(flow_spec, dispatcher.endpoint.ros, random_start)
         self._goals = GoalCalls()
-        self.requests = 0
-        self.request_bytes = 0
         self._cancels = 0  # number of the last cancel request of the proxy itself
         self._refuses_from_s: float | None = None
         self._is_finished = False
         self._liveness = ClientLiveness()
         self._early = UndescribedRequests()
         endpoint, rule = dispatcher.endpoint, flow_spec.rule
-        parts = ActionInterface.of(rule.kind, flow_spec.local, flow_spec.type_name)
-        self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
+        self._exchange = replace(self.parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
         self._remote_clients = RemoteClients(self._exchange, endpoint.ros)
         self._mark = dispatcher.advertise(self, sign(presence_of(flow_spec.local), endpoint.ros))
-        self._servers = [dispatcher.create_client(self, *part) for part in parts.services]
+        self._servers = [dispatcher.create_client(self, *part) for part in self.parts.services]
         self._stopper = None if rule.stop is None else dispatcher.create_client(self, rule.stop, TRIGGER)
         self._kept = None if not rule.is_ordered else self._keep(random_start)
-        self._topics = [
-            dispatcher.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
-        ]
-        self._publisher = context.member.serve(
-            topic,
-            self._exchange.to_wire(),
-            is_global=rule.is_global,
-            urgent=is_urgent(rule.priority),
-            paths=paths_value(rule.paths),
-            options=rule.send_options(),
-            is_session=session_value(rule.sign),
-        )
-        self._responses = ResponseSender(
-            context=context,
-            flow_spec=flow_spec,
-            service=topic.name,
-            exchange=self._exchange,
-            serving=self._serving,
-            publisher=self._publisher,
-        )
+        topics = zip(self.parts.topics, PROFILES, strict=False)
+        self._topics = [dispatcher.subscribe(self, *part, profile) for part, profile in topics]
+        self._publisher = context.member.serve(topic, self._exchange.to_wire(), **self.options())
+        self._responses = ResponseSender(self, self._exchange, self._serving, self._publisher)
         self._cancellation = Cancellation(
             endpoint=endpoint,
             serving=self._serving,
@@ -139,7 +116,7 @@ class ExposedService:
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote client's request or its cancellations; both wait until the client's description arrives."""
         client = message.delivered.publisher
-        self._context.contain(self._flow_spec.local, client, now_s, self._receive, message, now_s)
+        self.context.contain(self.flow_spec.local, client, now_s, self._receive, message, now_s)
 
     def _receive(self, message: Message, now_s: float) -> None:
         if self._is_finished:
@@ -168,7 +145,7 @@ class ExposedService:
             self._take_in_order(self._kept, event, now_s)
         elif isinstance(event, ResponseReceived | CallFailed) and event.handle == self._stopper:
             if isinstance(event, CallFailed):
-                self._context.faults.report(f"{self._flow_spec.rule.stop}", Fault.REFUSED, event.reason)
+                self.context.faults.report(f"{self.flow_spec.rule.stop}", Fault.REFUSED, event.reason)
         elif isinstance(event, ResponseReceived | CallFailed):
             self._end_call(event.call, event.reason if isinstance(event, CallFailed) else event.raw)
             self._give(now_s)
@@ -176,7 +153,7 @@ class ExposedService:
             at = self._topics.index(event.handle)
             self._responses.publish_news(at, event.raw, event.stamp_ns)
         elif isinstance(event, EndpointError):
-            self._context.report_error(self._flow_spec.local, event, Fault.REFUSED)
+            self.context.report_error(self.flow_spec.local, event, Fault.REFUSED)
         else:
             assert isinstance(event, TypeResolved)  # the types of an action's topics are known beforehand
 
@@ -184,7 +161,7 @@ class ExposedService:
         """Process requests that waited for their description, and check which clients are still present."""
         self._look_at_clients(now_s)
         if self._kept is not None:
-            self._kept.update_sequencer(self._context.member.peers(self._topic.name), now_s)
+            self._kept.update_sequencer(self.context.member.peers(self.name), now_s)
         self.handle_timer(now_s)
 
     def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
@@ -202,14 +179,6 @@ class ExposedService:
                 self._responses.fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
         self._give(now_s)
 
-    def parties(self, now_s: float) -> list[Party]:
-        """Return the clients that are known now."""
-        del now_s
-        member, name = self._context.member, self._topic.name
-        silent = set(member.silent_peers(name))
-        names = dict.fromkeys([*member.connected_peers(name), *silent])
-        return [Party("client", each.to_text(), is_silent=each in silent) for each in names]
-
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return self._serving.get_timer()
@@ -226,7 +195,7 @@ class ExposedService:
         if is_closed and self._kept is not None:
             self._kept.close()
         is_idle = not self._serving and (self._kept is None or self._kept.is_idle)
-        return is_closed and is_idle and self._context.member.is_acknowledged(self._topic.name)
+        return is_closed and is_idle and self.context.member.is_acknowledged(self.name)
 
     def finish(self, now_s: float) -> None:
         """Fail the calls under way, and refuse requests from now on."""
@@ -241,30 +210,25 @@ class ExposedService:
         stopper = [] if self._stopper is None else [self._stopper]
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
-            self._dispatcher.close(handle)
+            self.dispatcher.close(handle)
         self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
-        self._context.member.flush(now_s)
+        self.context.member.flush(now_s)
 
     def close(self, now_s: float) -> None:
         """Close the server; calls under way fail, and unconfirmed responses are lost."""
         self.finish(now_s)
-        self._context.member.withdraw(self._topic.name)
-
-    def renew(self, topic: Topic) -> None:
-        """Replace the delegation."""
-        self._topic = topic
-        self._context.member.renew(topic)
+        self.context.member.withdraw(self.name)
 
     def _look_at_clients(self, now_s: float) -> None:
         """Process requests that waited for their description; drop the calls of clients that left."""
-        writer_proxies = self._context.member.writer_proxies_of(self._topic.name)
+        writer_proxies = self.context.member.writer_proxies_of(self.name)
         known = {bytes(writer_proxy.publisher): writer_proxy.description for writer_proxy in writer_proxies}
         for _ in range(self._early.forget_all_but(known.keys())):
             self._drop_early("a client left before its description came")
         for client, description in known.items():
             for message in self._early.poll_messages(client):
                 self.receive(message._replace(description=description), now_s)
-        here = {self._context.member.name, *self._context.member.connected_peers(self._topic.name)}
+        here = {self.context.member.name, *self.context.member.connected_peers(self.name)}
         for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
             self._cancellation.handle_client_gone(client)
 
@@ -276,20 +240,19 @@ class ExposedService:
             self._responses.refuse(Asked(Name(message.delivered.publisher), request.part, request.call), _GONE)
 
     def _drop_early(self, reason: str) -> None:
-        self._context.faults.report(self._flow_spec.local, Fault.TOO_FAST, reason)
+        self.report(Fault.TOO_FAST, reason)
 
     def _ask(self, message: Message, now_s: float) -> None:
         delivered = message.delivered
         request = Request.from_wire(delivered.message)
         asked = Asked(Name(delivered.publisher), request.part, request.call)
-        self._context.traffic.received(len(delivered.message))
+        self.context.traffic.received(len(delivered.message))
         before = None if self._kept is not None else self._serving.answer_of(asked)
         if before is not None or asked in self._serving:
             if before:
                 self._responses.send_wire(asked.client, before)
             return
-        key = CallKey(self._topic.name, asked.client, asked.part, asked.call)
-        self._context.tracer.serving(key, self._flow_spec.local)
+        self.context.tracer.serving(self.call_key(*asked), self.flow_spec.local)
         if self._kept is None and self._refuses_from_s is not None and now_s >= self._refuses_from_s:
             self._responses.refuse(asked, "the server is leaving")
             return
@@ -312,26 +275,22 @@ class ExposedService:
 
     def _patience_s(self, request: Request) -> float | None:
         """Return the seconds that a call may take; None: as long as its goal."""
-        if self._flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
+        if self.flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
             return None
         asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
         return min(asked_s, CALL_MAX_S)
 
     def _keep(self, number: int) -> OrderedServer:
-        rule, what = self._flow_spec.rule, self._flow_spec.local
         return OrderedServer(
-            dispatcher=self._dispatcher,
-            owner=self,
-            node=rule.state_node,
-            number=number,
-            give=lambda number, raw: self._dispatcher.endpoint.call(self._servers[0], number, raw),
+            self,
+            number,
+            give=lambda number, raw: self.dispatcher.endpoint.call(self._servers[0], number, raw),
             tell=self._tell,
-            complain=lambda reason: self._context.faults.report(what, Fault.REFUSED, reason),
         )
 
     def _tell(self, client: Name, word: FollowerMessage | Refuse) -> None:
         if isinstance(word, Refuse):
-            self._context.faults.report(self._flow_spec.local, Fault.REFUSED, word.reason)
+            self.report(Fault.REFUSED, word.reason)
             self._responses.send_wire(client, Answer.failed(0, word.call, word.reason).to_wire())
         else:
             self._responses.send_wire(client, to_wire(word))
@@ -345,7 +304,7 @@ class ExposedService:
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Accept a request; one about a goal waits until the local server has accepted or rejected that goal."""
-        goal = goal_of(raw) if self._flow_spec.rule.kind == "action" else b""
+        goal = goal_of(raw) if self.flow_spec.rule.kind == "action" else b""
         after = None if asked.part == GOAL else self._goals.accepting(goal)
         self._serving.begin(now_s, patience_s, asked, raw, after)
         if goal and asked.part != CANCEL:
@@ -353,10 +312,10 @@ class ExposedService:
 
     def _give(self, now_s: float) -> None:
         """Pass the next requests in order to the local server."""
-        call, what = self._dispatcher.endpoint.call, self._flow_spec.local
+        call, what = self.dispatcher.endpoint.call, self.flow_spec.local
         for turn in self._serving.poll_turns(now_s):
             given = self._servers[turn.asked.part], turn.number, turn.request
-            if not self._context.contain(what, turn.asked.client, now_s, call, *given):
+            if not self.context.contain(what, turn.asked.client, now_s, call, *given):
                 self._end_call(turn.number, "the request could not be passed on")
 
     def _end_call(self, number: int, ending: str | bytes) -> None:
@@ -372,11 +331,11 @@ class ExposedService:
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
         self._cancels += 1
-        cancel = Asked(self._context.member.name, CANCEL, self._cancels)
+        cancel = Asked(self.context.member.name, CANCEL, self._cancels)
         try:
             self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
         except LocalError as error:
-            self._context.faults.report(self._flow_spec.local, Fault.TOO_FAST, str(error))
+            self.report(Fault.TOO_FAST, str(error))
 
 
 def _serving_of(flow_spec: FlowSpec, ros: int, random_start: int) -> Serving[bytes]:

@@ -18,24 +18,22 @@ from functools import partial
 from typing import Final
 
 from gdp.client.participant import Message, Topic
-from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
-from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.call_tracer import CallKey
+from gdp.trust.advertisement import session_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.action_interface import CANCEL, GOAL, RESULT, ActionInterface
+from proxy.bridge.core.action_interface import CANCEL, GOAL, RESULT
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import Goals, goal_of, says_yes
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.liveliness import Party
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery
+from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.virtual_server import VirtualServer
 from proxy.endpoints.core.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
@@ -64,7 +62,7 @@ class _Waiting:
     call: int = 0
 
 
-class ImportedService:
+class ImportedService(ServiceFlow):
     """Lets local clients call one remote service or action.
 
     Attributes:
@@ -74,6 +72,8 @@ class ImportedService:
         answered_by: the server whose response ended the latest call; None: none did yet.
     """
 
+    far_role = "server"
+
     def __init__(
         self,
         context: BridgeContext,
@@ -82,11 +82,7 @@ class ImportedService:
         topic: Topic,
         random_start: int,
     ) -> None:
-        self._context = context
-        self._dispatcher = dispatcher
-        self._flow_spec = flow_spec
-        self._topic = topic
-        self._parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
+        super().__init__(context, dispatcher, flow_spec, topic)
         self._goals = Goals() if flow_spec.rule.kind == "action" else None
         self._sequencer: Sequencer[Response] | None = None
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, with the reported reason
@@ -101,43 +97,19 @@ class ImportedService:
                 stops=self._goals is None or part == RESULT,  # every server has the goal, until one has its result
                 unicasts=session_value(flow_spec.rule.sign),
             )
-            for part in range(len(self._parts.services))
+            for part in range(len(self.parts.services))
         )
         self._now_s = 0.0  # of the last event
-        self.requests = 0
-        self.request_bytes = 0
         self.failed = 0
         self.answered_by: Name | None = None
         self.first_answers = Counter[Name]()  # by server, of the calls that a first response ended
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
-        self._publisher = context.member.call(
-            topic,
-            self._description(),
-            is_global=flow_spec.rule.is_global,
-            urgent=is_urgent(flow_spec.rule.priority),
-            paths=paths_value(flow_spec.rule.paths),
-            options=flow_spec.rule.send_options(),
-            is_session=session_value(flow_spec.rule.sign),
-        )
-        self._virtual_server = VirtualServer(
-            dispatcher, self, is_paced=flow_spec.has_short_queues(dispatcher.endpoint.ros)
-        )
-        self._sender = RequestSender(
-            context=context, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
-        )
-        self._discovery = ServerDiscovery(
-            context=context,
-            dispatcher=dispatcher,
-            flow_spec=flow_spec,
-            service=topic.name,
-            parts=self._parts,
-            calls=self._calls,
-            goals=self._goals,
-            opened=self._open,
-            closed=self._shut,
-        )
+        self._publisher = context.member.call(topic, self._description(), **self.options())
+        self._virtual_server = VirtualServer(self)
+        self._sender = RequestSender(self, self._calls, self._goals, self._publisher)
+        self._discovery = ServerDiscovery(self, self._calls, self._goals, opened=self._open, closed=self._shut)
 
     @property
     def servers(self) -> list[Name]:
@@ -151,10 +123,10 @@ class ImportedService:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote server's response, or a message of its action's topics."""
-        self._context.traffic.received(len(message.delivered.message))
+        self.context.traffic.received(len(message.delivered.message))
         self._now_s = now_s
         server = message.delivered.publisher
-        self._context.contain(self._flow_spec.local, server, now_s, self._receive, message, now_s)
+        self.context.contain(self.flow_spec.local, server, now_s, self._receive, message, now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
@@ -162,7 +134,7 @@ class ImportedService:
             self._ask(event, now_s)
             self._flush(now_s)
         elif isinstance(event, EndpointError):
-            self._context.report_error(self._flow_spec.local, event, Fault.REFUSED)
+            self.context.report_error(self.flow_spec.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as remote servers join and leave."""
@@ -172,9 +144,7 @@ class ImportedService:
         if self._sequencer is not None:
             outside = dict(self._sequencer.outside)
             for name in [name for name, reason in outside.items() if self._outside.get(name) != reason]:
-                self._context.faults.report(
-                    self._flow_spec.local, Fault.REFUSED, f"server {name.short}: {outside[name]}"
-                )
+                self.report(Fault.REFUSED, f"server {name.short}: {outside[name]}")
             self._outside = outside
 
     def handle_timer(self, now_s: float) -> None:
@@ -182,14 +152,6 @@ class ImportedService:
         for dispatch in self._calls:
             dispatch.handle_timer(now_s)
         self._flush(now_s)
-
-    def parties(self, now_s: float) -> list[Party]:
-        """Return the servers that are known now."""
-        del now_s
-        member, name = self._context.member, self._topic.name
-        silent = set(member.silent_peers(name))
-        names = dict.fromkeys([*member.connected_peers(name), *silent])
-        return [Party("server", each.to_text(), is_silent=each in silent) for each in names]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -204,12 +166,7 @@ class ImportedService:
         del now_s
         self._shut("the proxy no longer carries this service")
         self._virtual_server.close_now()
-        self._context.member.withdraw(self._topic.name)
-
-    def renew(self, topic: Topic) -> None:
-        """Replace the delegation."""
-        self._topic = topic
-        self._context.member.renew(topic)
+        self.context.member.withdraw(self.name)
 
     def _receive(self, message: Message, now_s: float) -> None:
         if message.private and self._sequencer is not None and is_word(message.delivered.message):
@@ -229,7 +186,7 @@ class ImportedService:
 
     def _count(self) -> None:
         """Add the increments since the last call to the proxy's counters."""
-        traffic = self._context.traffic
+        traffic = self.context.traffic
         now = tuple(
             sum(counts) for counts in zip(*((d.late, d.unexpected, d.hedged) for d in self._calls), strict=True)
         )
@@ -241,7 +198,7 @@ class ImportedService:
     def _description(self) -> bytes:
         """Return this machine's description of the service; empty where only the remote side has one."""
         try:
-            exchange = self._parts.known(self._dispatcher.endpoint, self._flow_spec.rule.encoding)
+            exchange = self.parts.known(self.dispatcher.endpoint, self.flow_spec.rule.encoding)
         except LocalError:
             return b""
         return exchange.to_wire()
@@ -261,11 +218,11 @@ class ImportedService:
         self._virtual_server.close()
 
     def _ask(self, event: RequestReceived, now_s: float) -> None:
-        part, rule = self._virtual_server.handle_request(event.handle, now_s), self._flow_spec.rule
+        part, rule = self._virtual_server.handle_request(event.handle, now_s), self.flow_spec.rule
         self.requests += 1
         self.request_bytes += len(event.raw)
         if part is None:
-            self._context.faults.report(self._flow_spec.local, Fault.NO_SERVER, SERVER_GONE)
+            self.report(Fault.NO_SERVER, SERVER_GONE)
             self._virtual_server.refuse(event.handle, event.ticket, SERVER_GONE)
             return
         waiting = _Waiting(part, event.handle, event.ticket, b"", now_s)
@@ -293,7 +250,7 @@ class ImportedService:
         patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
         wire = Request(waiting.part, call, patience_ms, body).to_wire()
         waiting.call = call
-        self._context.tracer.begun(self._key(waiting.part, call), self._flow_spec.local)
+        self.context.tracer.begun(self.own_key(waiting.part, call), self.flow_spec.local)
         if self._goals is not None:
             self._sender.note_goal(waiting.part, call, waiting.goal)
             if waiting.part == GOAL:
@@ -306,7 +263,7 @@ class ImportedService:
         """Return the servers to ask for a result, in place of the rule's choice; empty: the rule's choice applies."""
         servers = self._calls[RESULT].servers
         holders = goals.holders(goal) & set(servers)
-        if self._flow_spec.rule.spread.mode is Mode.ALL:
+        if self.flow_spec.rule.spread.mode is Mode.ALL:
             return () if not holders or len(holders) == len(servers) else tuple(servers)
         return tuple(holders or servers)
 
@@ -315,19 +272,19 @@ class ImportedService:
         server = self._discovery.find(name, now_s)
         if server is None or answer.part >= len(server.answers):
             return  # of a server that left, or that has no valid description here: that was reported
-        dispatch, key = self._calls[answer.part], self._key(answer.part, answer.call)
+        dispatch, key = self._calls[answer.part], self.own_key(answer.part, answer.call)
         if answer.outcome is Outcome.FAILED:
-            self._context.tracer.responded(key, name, answer.reason)
+            self.context.tracer.responded(key, name, answer.reason)
             dispatch.refused(answer.call, name, answer.reason, now_s)
             return
         try:
             raw = server.answers[answer.part].decode(answer.body)
         except RemoteError as error:
-            self._context.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
-            self._context.tracer.responded(key, name, str(error))
+            self.report(Fault.MALFORMED, str(error))
+            self.context.tracer.responded(key, name, str(error))
             dispatch.refused(answer.call, name, str(error), now_s)
             return
-        self._context.tracer.responded(key, name)
+        self.context.tracer.responded(key, name)
         if self._goals is None or says_yes(answer.part, raw):
             dispatch.answered(answer.call, name, (name, raw), now_s)
         else:
@@ -338,9 +295,9 @@ class ImportedService:
         self.answered_by = server
         self._forget(waiting)
         if waiting.part == 0:  # of an action the answer to its goal; results take as long as they want
-            self._context.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
+            self.context.traffic.call_ended(self.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
         self.first_answers[server] += 1
-        self._context.tracer.answered(self._key(waiting.part, waiting.call), server)
+        self.context.tracer.answered(self.own_key(waiting.part, waiting.call), server)
         self._virtual_server.answer(waiting.handle, waiting.ticket, raw)
         if self._goals is None or not says_yes(waiting.part, raw):
             return
@@ -352,20 +309,17 @@ class ImportedService:
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
         self._forget(waiting)
         self.failed += 1
-        self._context.tracer.failed(self._key(waiting.part, waiting.call), reason or failure.value)
+        self.context.tracer.failed(self.own_key(waiting.part, waiting.call), reason or failure.value)
         if failure is not Failure.TIMED_OUT:
             self._refuse(waiting, _FAULTS[failure], reason)
             return
-        reason = f"no answer within {self._flow_spec.rule.timeout_s:g} s"
+        reason = f"no answer within {self.flow_spec.rule.timeout_s:g} s"
         no_answer = self._no_answers[waiting.part]
-        if no_answer is None or no_answer.says_reason or self._flow_spec.rule.on_timeout == "silent":
+        if no_answer is None or no_answer.says_reason or self.flow_spec.rule.on_timeout == "silent":
             self._refuse(waiting, Fault.TIMED_OUT, reason)
             return
-        self._context.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
+        self.report(Fault.TIMED_OUT, reason)
         self._virtual_server.answer(waiting.handle, waiting.ticket, no_answer.to_raw(reason))
-
-    def _key(self, part: int, call: int) -> CallKey:
-        return CallKey(self._topic.name, self._context.member.name, part, call)
 
     def _forget(self, waiting: _Waiting) -> None:
         is_cancelled = self._sequencer is None  # entries of a log go to all servers in any case
@@ -374,7 +328,7 @@ class ImportedService:
     def _receive_news(self, message: Message) -> None:
         news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)
         server = self._discovery.servers.get(name)
-        at = news.part - len(self._parts.services)
+        at = news.part - len(self.parts.services)
         if server is None or self._goals is None or not 0 <= at < len(server.news):
             return
         raw = server.news[at].decode(news.body)
@@ -388,5 +342,5 @@ class ImportedService:
             self._virtual_server.publish(-1, raw)
 
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
-        self._context.faults.report(self._flow_spec.local, fault, reason)
+        self.report(fault, reason)
         self._virtual_server.refuse(waiting.handle, waiting.ticket, reason)

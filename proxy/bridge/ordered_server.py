@@ -7,12 +7,14 @@ I/O through the endpoint; ``gdp/service/follower.py`` decides. The state is a pa
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, TypeAlias
 
 from gdp.names import Name
 from gdp.service.follower import Apply, Doing, Effect, Fetch, Follower, Load, Refuse, Say
 from gdp.service.replication_messages import FollowerMessage, SequencerMessage
-from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
+from proxy.bridge.faults import Fault
+from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.state_parameter import GET, SET, read_request, state_in, was_set, write_request
 from proxy.endpoints.core.endpoint import CallFailed, GraphEntity, ResponseReceived
 from proxy.wire.replication import STATE_MAX_BYTES
@@ -30,26 +32,17 @@ class OrderedServer:
     """One local server as a replica of the log.
 
     Args:
-        node: the node whose parameter is the server's state; None: it exports none.
         number: the first request number for the local server, random.
     """
 
-    def __init__(
-        self,
-        *,
-        dispatcher: EndpointDispatcher,
-        owner: EventHandler,
-        node: str | None,
-        number: int,
-        give: Give,
-        tell: Tell,
-        complain: Callable[[str], None],
-    ) -> None:
-        self._endpoint = dispatcher.endpoint
+    def __init__(self, flow: ServiceFlow, number: int, *, give: Give, tell: Tell) -> None:
+        node = flow.flow_spec.rule.state_node  # whose parameter is the server's state; None: it exports none
+        self._endpoint = flow.dispatcher.endpoint
         self._follower = Follower(tells=node is not None)
-        self._give, self._tell, self._complain = give, tell, complain
+        self._give, self._tell = give, tell
+        self._complain = partial(flow.report, Fault.REFUSED)
         parts = () if node is None else tuple((f"{node}/{part}", type_name) for part, type_name in (GET, SET))
-        self.handles = [dispatcher.create_client(owner, *part) for part in parts]
+        self.handles = [flow.dispatcher.create_client(flow, *part) for part in parts]
         self._number = number  # of the operation under way
         self._apply: Apply | None = None
         self._given_s = -DOUBT_S

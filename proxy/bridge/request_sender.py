@@ -13,11 +13,10 @@ from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
-from proxy.bridge.call_tracer import CallKey
-from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.action_interface import CANCEL, RESULT
 from proxy.bridge.core.goals import Goals
 from proxy.bridge.server_discovery import ServerCalls
+from proxy.bridge.service_flow import ServiceFlow
 
 __all__ = ["RequestSender"]
 
@@ -30,16 +29,9 @@ class RequestSender:
     """
 
     def __init__(
-        self,
-        *,
-        context: BridgeContext,
-        service: Name,
-        calls: Sequence[ServerCalls],
-        goals: Goals | None,
-        publisher: Publisher,
+        self, flow: ServiceFlow, calls: Sequence[ServerCalls], goals: Goals | None, publisher: Publisher
     ) -> None:
-        self._context = context
-        self._service = service
+        self._flow = flow
         self._calls = calls
         self._goals = goals
         self._publisher = publisher
@@ -71,7 +63,7 @@ class RequestSender:
             while effects := dispatch.poll_effects():
                 for effect in effects:
                     if isinstance(effect, End):
-                        self._context.member.end_call(self._service, (part, effect.call))
+                        self._flow.context.member.end_call(self._flow.name, (part, effect.call))
                         continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):
@@ -93,8 +85,8 @@ class RequestSender:
             if call is None:
                 self._publisher.publish(wire)
             else:
-                self._context.member.send_requests(self._service, wire, call)
-            self._context.traffic.sent(len(wire))
+                self._flow.context.member.send_requests(self._flow.name, wire, call)
+            self._flow.context.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:
             self._refuse(part, effect, servers, str(error), now_s)
@@ -108,8 +100,8 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._context.member.send_request(self._service, server, wire, self._key_of(part, effect))
-                self._context.traffic.sent(len(wire))
+                self._flow.context.member.send_request(self._flow.name, server, wire, self._key_of(part, effect))
+                self._flow.context.traffic.sent(len(wire))
             self._trace(part, effect, [server])
         except LocalError as error:
             self._refuse(part, effect, [server], str(error), now_s)
@@ -121,10 +113,10 @@ class RequestSender:
 
     def _trace(self, part: int, effect: Effect, servers: list[Name]) -> None:
         if isinstance(effect, Ask):
-            self._context.tracer.asked(CallKey(self._service, self._context.member.name, part, effect.call), servers)
+            self._flow.context.tracer.asked(self._flow.own_key(part, effect.call), servers)
 
     def _refuse(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
-        self._context.traffic.unread += 1
+        self._flow.context.traffic.unread += 1
         if isinstance(effect, Ask):
             for server in servers:
                 self._calls[part].refused(effect.call, server, reason, now_s)

@@ -12,13 +12,10 @@ from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch
 from gdp.service.sequencer import Sequencer
-from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.action_interface import ActionInterface
-from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import Goals
 from proxy.bridge.core.remote_server import RemoteServer
-from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
+from proxy.bridge.service_flow import ServiceFlow
 from proxy.wire.service import Exchange
 
 __all__ = ["SERVER_GONE", "Response", "ServerCalls", "ServerDiscovery"]
@@ -43,22 +40,14 @@ class ServerDiscovery:
 
     def __init__(
         self,
-        *,
-        context: BridgeContext,
-        dispatcher: EndpointDispatcher,
-        flow_spec: FlowSpec,
-        service: Name,
-        parts: ActionInterface,
+        flow: ServiceFlow,
         calls: Sequence[ServerCalls],
         goals: Goals | None,
+        *,
         opened: Callable[[Exchange], None],
         closed: Callable[[str], None],
     ) -> None:
-        self._context = context
-        self._endpoint = dispatcher.endpoint
-        self._flow_spec = flow_spec
-        self._service = service
-        self._parts = parts
+        self._flow = flow
         self._calls = calls
         self._goals = goals
         self._opened = opened
@@ -68,10 +57,10 @@ class ServerDiscovery:
 
     def update(self, now_s: float) -> None:
         """Compare the servers with those that are reachable now, and report each change to the calls."""
-        member = self._context.member
+        member = self._flow.context.member
         # If no server keeps up, waiting for one that may recover is better than giving up.
-        peers = set(member.peers(self._service) or member.connected_peers(self._service))
-        writer_proxies = member.writer_proxies_of(self._service) if peers else []
+        peers = set(member.peers(self._flow.name) or member.connected_peers(self._flow.name))
+        writer_proxies = member.writer_proxies_of(self._flow.name) if peers else []
         heard = {
             writer_proxy.publisher: writer_proxy for writer_proxy in writer_proxies if writer_proxy.publisher in peers
         }
@@ -111,16 +100,20 @@ class ServerDiscovery:
 
     def _add(self, name: Name, now_s: float, incarnation: int, description: bytes) -> None:
         """Add a server, unless it is quarantined."""
-        self._context.contain(self._flow_spec.local, name, now_s, self._prepare, name, incarnation, description)
+        self._flow.context.contain(
+            self._flow.flow_spec.local, name, now_s, self._prepare, name, incarnation, description
+        )
         if (server := self.servers.get(name)) is not None and server.exchange is not None:
             self._announce(name, server, now_s)
 
     def _prepare(self, name: Name, incarnation: int, description: bytes) -> None:
         """Prepare the decoders of a server's responses; an invalid description is reported."""
-        rule = self._flow_spec.rule
+        rule = self._flow.flow_spec.rule
         self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
         try:
-            server = RemoteServer.set_description(incarnation, description, self._parts, self._endpoint, rule.encoding)
+            server = RemoteServer.set_description(
+                incarnation, description, self._flow.parts, self._flow.dispatcher.endpoint, rule.encoding
+            )
             if server.exchange is not None and server.exchange.is_ordered != rule.is_ordered:
                 side = "the far side's" if rule.is_ordered else "this side's"
                 raise LocalError(f"'state: ordered' is missing in {side} rule")
@@ -128,7 +121,7 @@ class ServerDiscovery:
                 self._opened(server.ours)
                 self._is_open = True
         except GdpError as error:
-            self._context.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
+            self._flow.report(Fault.OTHER_TYPE, str(error))
             return
         self.servers[name] = server
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Final
 
 from proxy.bridge.core.action_interface import PROFILES
-from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.local_responses import LocalResponses
+from proxy.bridge.service_flow import ServiceFlow
 from proxy.wire.service import Exchange
 
 __all__ = ["VirtualServer"]
@@ -24,14 +24,14 @@ class VirtualServer:
     """Server and an action's topics in one graph; opened and closed any number of times.
 
     Args:
-        owner: of its events.
-        is_paced: whether the local clients have short queues.
+        flow: owner of its events.
     """
 
-    def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, *, is_paced: bool) -> None:
-        self._dispatcher = dispatcher
-        self._owner = owner
-        self._responses = LocalResponses(dispatcher.endpoint, is_paced=is_paced)
+    def __init__(self, flow: ServiceFlow) -> None:
+        self._dispatcher = flow.dispatcher
+        self._owner = flow
+        endpoint = flow.dispatcher.endpoint
+        self._responses = LocalResponses(endpoint, is_paced=flow.flow_spec.has_short_queues(endpoint.ros))
         self._services: list[int] = []  # handles
         self._topics: list[int] = []
         self._closing: list[int] = []  # handles of both

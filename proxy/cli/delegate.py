@@ -13,9 +13,8 @@ from typing import Annotated
 import typer
 
 from gdp.cli import delegate as group
-from gdp.cli.completion import allow_completion
-from gdp.cli.node import Json, emit, failing_clearly
-from gdp.cli.version import HELP, Version, versioned
+from gdp.cli.node import Json, failing_clearly, report
+from gdp.cli.program import Program
 from gdp.config.yaml_source import read_yaml
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError
@@ -37,11 +36,10 @@ Live = Annotated[bool, typer.Option("--live", help="for patterns and missing typ
 Days = Annotated[float, typer.Option("--days", min=0.001, help="how long a delegation is valid")]
 Renew = Annotated[bool, typer.Option("--renew", help="make those again that are there")]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp delegate rules")
 
 
 @app.command(
-    context_settings=HELP,
     epilog="Examples: gdp delegate rules --owner owner --live robot/proxy.yaml;"
     " gdp delegate --owner owner robot/proxy.yaml",
 )
@@ -52,10 +50,8 @@ def delegate_what_is_needed(
     days: Days = DELEGATION_DAYS,
     renew: Renew = False,
     json: Json = False,
-    version: Version = False,
 ) -> None:
     """Give each proxy the delegations to publish, read, serve or call that its rules need; valid ones are kept."""
-    del version  # its callback ends the command
     with failing_clearly():
         key = load_owner(owner).public
         configs = [ProxyConfig.load(file) for file in files]
@@ -80,10 +76,9 @@ def delegate_what_is_needed(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command with arguments; without, run ``gdp delegate`` with those of this process as ``gdp-delegate``."""
     if arguments is None:
-        allow_completion("gdp-delegate")
         group.main()
     else:
-        versioned(app)(args=list(arguments), prog_name="gdp delegate rules")
+        app.run(arguments)
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
@@ -115,12 +110,10 @@ def _graphs(config: ProxyConfig, card: NodeDescriptor) -> list[Graph]:
 
 def _tell(file: Path, need: RequiredDelegation, *, is_new: bool, json: bool) -> None:
     rights = sorted(right.value for right in need.rights)
-    if json:
-        fields = {"name": need.name.to_text(), "rights": rights, "metadata": dict(need.metadata)}
-        emit("delegated" if is_new else "held", file=str(file), **fields)
-        return
+    fields = {"name": need.name.to_text(), "rights": rights, "metadata": dict(need.metadata)}
     kind, name, type_name = (need.metadata[key] for key in ("kind", "name", "type"))
-    echo(f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]")
+    text = f"{file}: {'+' if is_new else '='} {', '.join(rights)} {kind} {name} [{type_name}]"
+    report("delegated" if is_new else "held", text, json=json, file=str(file), **fields)
 
 
 if __name__ == "__main__":

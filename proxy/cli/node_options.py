@@ -10,9 +10,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from gdp.cli.completion import complete_node
-
-__all__ = ["Delegations", "DoorNode", "Iface", "Listen"]
+__all__ = ["Delegations", "Iface"]
 
 Iface = Annotated[
     Optional[str],  # noqa: UP045
@@ -22,10 +20,3 @@ Delegations = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--delegations", metavar="DIR", help="What owners gave the node. Default: as the node says."),
 ]
-DoorNode = Annotated[
-    Path,
-    typer.Argument(
-        metavar="NODE", autocompletion=complete_node, help="The door's own node: its directory, or its proxy.yaml."
-    ),
-]
-Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where clients connect.")]

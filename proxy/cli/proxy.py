@@ -10,31 +10,16 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.completion import allow_completion
 from gdp.cli.console import Columns
-from gdp.cli.node import (
-    AWAIT_IFACE_S,
-    AwaitIface,
-    Check,
-    Config,
-    Format,
-    Json,
-    Level,
-    LogFormat,
-    LogLevel,
-    MemberPlane,
-    Verbose,
-    failing_clearly,
-    member_plane,
-    set_up_logging,
-)
-from gdp.cli.version import HELP, Version, versioned
+from gdp.cli.node import AWAIT_IFACE_S, AwaitIface, Check, Config, Json, Logs, MemberPlane, running, with_plane
+from gdp.cli.program import Program
 from gdp.links.uplink import wait_for_device
 from proxy.config.config import ProxyConfig
 
 __all__ = ["Schema", "main", "schema_text"]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp-proxy")
+main = app.run
 
 
 def schema_text() -> str:
@@ -59,7 +44,7 @@ Schema = Annotated[
 ]
 
 
-@app.command(context_settings=HELP, epilog="Example: gdp-proxy --config proxy.yaml --check")
+@app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
 def proxy(
     config: Config,
     await_iface: AwaitIface = AWAIT_IFACE_S,
@@ -67,23 +52,18 @@ def proxy(
     check: Check = False,
     columns: Columns = None,
     json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
+    *,
+    logs: Logs,
     schema: Schema = False,
-    version: Version = False,
 ) -> None:
     """Carry what the configuration names between ROS and the overlay, until Ctrl-C; SIGHUP reads it again.
 
     With a ros section it takes part in that graph; without one it records what it imports. Exit 1: not all that came
     could be written.
     """
-    del columns, schema, version  # their callbacks have done all
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with failing_clearly():
-        settings = ProxyConfig.load(config)
-        if data_plane is not None:
-            settings = settings.model_copy(update={"data_plane": member_plane(data_plane)})
+    del columns, schema  # their callbacks have done all
+    with running(logs):
+        settings = with_plane(ProxyConfig.load(config), data_plane)
         if check:
             from proxy.check.command import check_proxy
 
@@ -102,12 +82,6 @@ def proxy(
 
             wait_for_device(settings.iface, await_iface)
             raise typer.Exit(0 if record(settings, json=json) else 1)
-
-
-def main() -> None:
-    """Run the command."""
-    allow_completion("gdp-proxy")
-    versioned(app)(prog_name="gdp-proxy")
 
 
 if __name__ == "__main__":

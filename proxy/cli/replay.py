@@ -15,25 +15,9 @@ from typing import Annotated, Final
 
 import typer
 
-from gdp.cli.completion import allow_completion
 from gdp.cli.console import Columns
-from gdp.cli.node import (
-    Check,
-    Config,
-    Format,
-    Json,
-    Level,
-    LogFormat,
-    LogLevel,
-    MemberPlane,
-    Verbose,
-    emit,
-    emit_wait,
-    failing_clearly,
-    member_plane,
-    set_up_logging,
-)
-from gdp.cli.version import HELP, Version, versioned
+from gdp.cli.node import Check, Config, Json, Logs, MemberPlane, emit, emit_wait, running, with_plane
+from gdp.cli.program import Program
 from gdp.errors import LocalError
 from gdp.terminal import echo
 from proxy.check.command import check_proxy
@@ -54,10 +38,11 @@ log = logging.getLogger(__name__)
 ATTACH_PATIENCE_S: Final = 30.0
 PROGRESS_S: Final = 5.0  # between log lines of a replay
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp-replay")
+main = app.run
 
 
-@app.command(context_settings=HELP, epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
+@app.command(epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
 def replay(
     bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
     config: Config,
@@ -79,10 +64,8 @@ def replay(
     check: Check = False,
     columns: Columns = None,
     json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
-    version: Version = False,
+    *,
+    logs: Logs,
 ) -> None:
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
@@ -91,13 +74,10 @@ def replay(
     if it exceeds its memory or time. Best effort is sent without confirmation; what was dropped here, and what a
     reader lost, is stated at the end.
     """
-    del columns, version  # their callbacks have done all
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
+    del columns  # its callback has done all
     limits = BagLimits(None if memory is None else memory << 20, cpu)
-    with failing_clearly(), _failing_decoder():
-        settings = ProxyConfig.load(config)
-        if data_plane is not None:
-            settings = settings.model_copy(update={"data_plane": member_plane(data_plane)})
+    with running(logs), _failing_decoder():
+        settings = with_plane(ProxyConfig.load(config), data_plane)
         with BagReader(bag, limits) as reader:
             if check:
                 raise typer.Exit(1 if check_proxy(config, settings, json=json) else 0)
@@ -224,12 +204,6 @@ def _topic_fields(replay: Replay) -> list[dict[str, object]]:
         for _, number, each in sorted(channels, key=lambda channel: channel[0])
         if each.flow.published[number]
     ]
-
-
-def main() -> None:
-    """Run the command."""
-    allow_completion("gdp-replay")
-    versioned(app)(prog_name="gdp-replay")
 
 
 if __name__ == "__main__":

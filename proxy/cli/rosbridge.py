@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 
-from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
-from gdp.cli.version import HELP, Version, versioned
-from gdp.links.uplink import wait_for_device
-from proxy.cli.door_token import NoToken, TokenFile, door_token
-from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
+from gdp.cli.node import Logs, running
+from gdp.cli.program import Program
+from proxy.cli.door_command import DoorNode, DoorOptions, Listen, serve_door
 
-__all__ = ["main"]
+__all__ = ["app"]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = Program("gdp rosbridge")
 
 LISTEN = "127.0.0.1:9090"
 
@@ -34,54 +31,29 @@ Origins = Annotated[
 ]
 
 
-@app.command(context_settings=HELP, epilog="Example: gdp rosbridge keys/viewer --origin http://localhost:8000")
+@app.command(epilog="Example: gdp rosbridge keys/viewer --origin http://localhost:8000")
 def rosbridge(
     node: DoorNode,
     listen: Listen = LISTEN,
     origin: Origins = [],  # noqa: B006  # typer copies it
-    token_file: TokenFile = None,
-    no_token: NoToken = False,
-    iface: Iface = None,
-    delegations: Delegations = None,
-    await_iface: AwaitIface = 0.0,
-    json: Json = False,
-    verbose: Verbose = False,
-    log_level: LogLevel = Level.INFO,
-    log_format: LogFormat = Format.TEXT,
-    version: Version = False,
+    *,
+    options: DoorOptions,
+    logs: Logs,
 ) -> None:
     """Let roslibjs, roslibpy and others use what this node's delegations allow: a rosbridge v2 server, until Ctrl-C.
 
     Clients subscribe to what it may read, call what it may call, and publish what it may publish.
     """
-    del version  # its callback ends the command
-    set_up_logging(verbose=verbose, level=log_level, form=log_format)
-    with failing_clearly():
+    with running(logs):
         from proxy.doors.rosbridge_session import RosbridgeSession
-        from proxy.endpoints.door import DoorEndpoint, DoorSettings
-        from proxy.node.door import door_config, run_door
 
-        config, _ = door_config(node, iface, delegations)
-        token = door_token(token_file, no_token=no_token)
-        settings = DoorSettings(label="rosbridge", listen=listen, origins=tuple(origin), token=token)
-        wait_for_device(config.iface, await_iface)
-        run_door(
-            config,
-            lambda rights: DoorEndpoint(
-                settings,
-                lambda hub, number, queue: RosbridgeSession(
-                    hub, number, queue, time.monotonic, lambda: secrets.token_bytes(16)
-                ),
-                rights,
+        serve_door(
+            "rosbridge",
+            lambda hub, number, queue: RosbridgeSession(
+                hub, number, queue, time.monotonic, lambda: secrets.token_bytes(16)
             ),
-            json=json,
+            node,
+            listen,
+            origin,
+            options,
         )
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; ``arguments``: by default those of this process."""
-    versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp rosbridge")
-
-
-if __name__ == "__main__":
-    main()

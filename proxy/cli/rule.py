@@ -6,8 +6,6 @@ I/O. Exit codes: 0 done, 2 wrong input or refused; then nothing has changed.
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Optional, cast
 
@@ -16,21 +14,19 @@ import yaml
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.cli.program import Program
 from gdp.cli.salt import NAME_SALT
-from gdp.cli.version import versioned
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
-from gdp.errors import GdpError, LocalError
+from gdp.errors import LocalError
 from gdp.metadata import SALT
-from gdp.terminal import echo
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 
-__all__ = ["app", "main"]
+__all__ = ["app"]
 
-app = typer.Typer(
+app = Program(
+    "gdp rule",
     no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
     help="Rules of a proxy, changed while it runs; they are kept in proxy.yaml.d/gdp-rule.yaml.",
 )
 
@@ -160,12 +156,3 @@ def _done(what: str, side: RuleList, name: str, *, is_running: bool, as_json: bo
     applied = "now" if is_running else "at the next start of the proxy"
     fields = {what: name, "list": side, "applied": applied, "is_running": is_running}
     show(fields, as_json=as_json, plain=f"{what} {side} {name}: {applied}")
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; arguments as after ``gdp rule``."""
-    try:
-        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp rule")
-    except GdpError as error:
-        echo(f"error: {error}", err=True)
-        sys.exit(2)

@@ -10,18 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
-from gdp.cli.version import versioned
+from gdp.cli.program import Program
 from gdp.names import Name
 from gdp.trust.right import Right
-from proxy.cli.node_options import Delegations, Iface
-from proxy.cli.tool_options import (
-    Node,
-    complete_callable,
-    ending_quietly,
-    print_json,
-    print_text,
-)
+from proxy.cli.tool_options import Node, ToolOptions, complete_callable, print_json, print_text, running_tool
 
 if TYPE_CHECKING:
     from proxy.bridge.bridge import Bridge
@@ -29,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+app = Program("gdp service", no_args_is_help=True)
 
 _LOOK_S = 0.5
 
@@ -65,27 +57,21 @@ def call(
     timeout: Annotated[
         float, typer.Option("--timeout", min=0.1, max=86_400.0, metavar="SECONDS", help="For server and response.")
     ] = 10.0,
-    iface: Iface = None,
-    delegations: Delegations = None,
-    await_iface: AwaitIface = 0.0,
-    json: Json = False,
-    verbose: Verbose = False,
+    *,
+    options: ToolOptions,
 ) -> None:
     """Call a service once through the overlay and print the response, as 'ros2 service call' does.
 
     It states which replica answered first. The node NODE needs the right to call the service. Exit code 1: no server
     is reachable, or none answers in time.
     """
-    set_up_logging(verbose=verbose, quiet=True)
-    with failing_clearly(), ending_quietly():
-        from gdp.links.uplink import wait_for_device
+    with running_tool(options):
         from proxy.endpoints.probe import Probe
-        from proxy.node.tool_member import NoAnswerError, Wanted, find_access, run_probe
+        from proxy.node.tool_member import NoAnswerError, Wanted, run_probe
         from proxy.tools.message_text import MessageText, request_tree
 
         tree = request_tree(request)
-        access = find_access(node, iface, delegations, Wanted(name, type_name, Right.CALL))
-        wait_for_device(access.config.iface, await_iface)
+        access = options.find_access(node, Wanted(name, type_name, Right.CALL))
         probe = Probe()
         asked = _Call(probe, access.rule.name, access.name, tree, timeout)
         run_probe(access, probe, asked.tick, timeout_s=timeout)
@@ -93,7 +79,7 @@ def call(
             raise NoAnswerError(f"{access.rule.name}: {asked.reason or 'interrupted before a response came'}")
         text = MessageText(asked.response_channel, None)
         server = None if asked.server is None else asked.server.to_text()
-        if json:
+        if options.json:
             body = text.to_json(asked.response)
             fields = {"service": access.rule.name, "type": access.rule.type_name, "server": server}
             print_json({**fields, "elapsed_ms": round(asked.elapsed_s * 1e3, 3), "response": body})
@@ -149,12 +135,3 @@ class _Call:
             self.reason = f"{seen} within {self._timeout_s:g} s"
             return None
         return min(now_s + _LOOK_S, end_s)
-
-
-def main() -> None:
-    """Run the command."""
-    versioned(app)(prog_name="gdp service")
-
-
-if __name__ == "__main__":
-    main()

@@ -10,24 +10,31 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import orjson
 import typer
 
 from gdp.cli.completion import complete_node
+from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
 from gdp.errors import GdpError
+from gdp.links.uplink import wait_for_device
 from gdp.terminal import echo, for_stdout
 from gdp.trust.right import Right
+from proxy.cli.node_options import Delegations, Iface
+
+if TYPE_CHECKING:
+    from proxy.node.tool_member import Access, Wanted
 
 __all__ = [
     "Node",
+    "ToolOptions",
     "TypeName",
     "complete_callable",
     "complete_readable",
-    "ending_quietly",
     "print_json",
     "print_text",
+    "running_tool",
 ]
 
 Node = Annotated[
@@ -66,19 +73,43 @@ def _held(context: typer.Context, incomplete: str, right: Right) -> list[str]:
         return []
 
 
-@contextlib.contextmanager
-def ending_quietly() -> Iterator[None]:
-    """End with exit code 1 where nothing came in time, and with 0 where the reader of a pipe has what it wants."""
-    from proxy.node.tool_member import NoAnswerError
+class ToolOptions(NamedTuple):
+    """Options of every tool: which member it is, and what it prints."""
 
-    try:
-        yield
-    except NoAnswerError as error:
-        echo(f"error: {error}", err=True)
-        raise typer.Exit(1) from error
-    except BrokenPipeError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush has no reader
-        raise typer.Exit(0) from error
+    iface: Iface = None
+    delegations: Delegations = None
+    await_iface: AwaitIface = 0.0
+    json: Json = False
+    verbose: Verbose = False
+
+    def find_access(self, node: Path, wanted: Wanted) -> Access:
+        """Return the access of a node to a name, once its device is there.
+
+        Raises:
+            LocalError: there is no such node or device, or the node lacks the right.
+        """
+        from proxy.node.tool_member import find_access
+
+        access = find_access(node, self.iface, self.delegations, wanted)
+        wait_for_device(access.config.iface, self.await_iface)
+        return access
+
+
+@contextlib.contextmanager
+def running_tool(options: ToolOptions) -> Iterator[None]:
+    """End with exit code 1 where nothing came in time, with 0 where the reader of a pipe has what it wants, else 2."""
+    set_up_logging(verbose=options.verbose, quiet=True)
+    with failing_clearly():
+        from proxy.node.tool_member import NoAnswerError
+
+        try:
+            yield
+        except NoAnswerError as error:
+            echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from error
+        except BrokenPipeError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to flush has no reader
+            raise typer.Exit(0) from error
 
 
 def print_json(fields: Mapping[str, object]) -> None:

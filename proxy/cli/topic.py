@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from gdp import terminal
-from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
-from gdp.cli.version import versioned
+from gdp.cli.program import Program
 from gdp.errors import RemoteError
 from gdp.trust.right import Right
-from proxy.cli.node_options import Delegations, Iface
 from proxy.cli.tool_options import (
     Node,
+    ToolOptions,
     TypeName,
     complete_readable,
-    ending_quietly,
     print_json,
     print_text,
+    running_tool,
 )
 
 if TYPE_CHECKING:
@@ -33,11 +32,11 @@ if TYPE_CHECKING:
     from proxy.node.tool_member import Access, Tick
     from proxy.serial.channel import Channel
     from proxy.tools.message_text import MessageText
-    from proxy.tools.rates import BandwidthReport, FrequencyReport
+    from proxy.tools.rates import Bandwidth, Frequency
 
 __all__ = ["app"]
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+app = Program("gdp topic", no_args_is_help=True)
 
 _REPORT_S: Final = 1.0
 _SILENT_S: Final = 5.0  # after this time without a message, why is said once
@@ -65,38 +64,18 @@ def hz(
     type_name: TypeName = "",
     window: Annotated[int, typer.Option("--window", "-w", min=2, help="Messages in the average.")] = 10_000,
     duration: Duration = None,
-    iface: Iface = None,
-    delegations: Delegations = None,
-    await_iface: AwaitIface = 0.0,
-    json: Json = False,
-    verbose: Verbose = False,
+    *,
+    options: ToolOptions,
 ) -> None:
     """Print once a second at which rate messages of a topic arrive here, as 'ros2 topic hz' does.
 
     It reads the topic through the overlay as the node NODE, whose delegations must give the right to read it. With
     --duration the exit code is 1 if no rate could be measured.
     """
-    set_up_logging(verbose=verbose, quiet=True)
-    with failing_clearly(), ending_quietly():
-        access = _readable(node, iface, delegations, name, type_name, await_iface)
+    with running_tool(options):
         from proxy.tools.rates import Frequency
 
-        measured = Frequency(window)
-
-        def report(now_s: float) -> bool:
-            """Print the rate; return whether there was one."""
-            del now_s
-            found: FrequencyReport | None = measured.poll_report()
-            if found is None:
-                return False
-            if json:
-                rate = None if math.isinf(found.rate_hz) else found.rate_hz
-                print_json({"topic": access.rule.name, **found._asdict(), "rate_hz": rate})
-            else:
-                print_text(found.words())
-            return True
-
-        _measure(access, lambda _channel, _raw, now_s: measured.add(now_s), report, duration)
+        _measure(_readable(node, name, type_name, options), window, Frequency.of, duration, is_json=options.json)
 
 
 @app.command(
@@ -109,36 +88,18 @@ def bw(
     type_name: TypeName = "",
     window: Annotated[int, typer.Option("--window", "-w", min=2, help="Messages in the average.")] = 100,
     duration: Duration = None,
-    iface: Iface = None,
-    delegations: Delegations = None,
-    await_iface: AwaitIface = 0.0,
-    json: Json = False,
-    verbose: Verbose = False,
+    *,
+    options: ToolOptions,
 ) -> None:
     """Print once a second how many bytes of a topic arrive here, as 'ros2 topic bw' does.
 
     Bytes are those of the messages in ROS's wire form, before sealing and compression. The node NODE needs the right to
     read the topic. With --duration the exit code is 1 if nothing could be measured.
     """
-    set_up_logging(verbose=verbose, quiet=True)
-    with failing_clearly(), ending_quietly():
-        access = _readable(node, iface, delegations, name, type_name, await_iface)
+    with running_tool(options):
         from proxy.tools.rates import Bandwidth
 
-        measured = Bandwidth(window)
-
-        def report(now_s: float) -> bool:
-            """Print the bandwidth; return whether there was one."""
-            found: BandwidthReport | None = measured.poll_report(now_s)
-            if found is None:
-                return False
-            if json:
-                print_json({"topic": access.rule.name, **found._asdict()})
-            else:
-                print_text(found.words())
-            return True
-
-        _measure(access, lambda _channel, raw, now_s: measured.add(now_s, len(raw)), report, duration)
+        _measure(_readable(node, name, type_name, options), window, Bandwidth.of, duration, is_json=options.json)
 
 
 @app.command(
@@ -160,21 +121,17 @@ def echo(
         int, typer.Option("--truncate-length", "-l", min=1, help="Longest array and string of the YAML form.")
     ] = 128,
     full: Annotated[bool, typer.Option("--full-length", "-f", help="Whole arrays and strings.")] = False,
-    iface: Iface = None,
-    delegations: Delegations = None,
-    await_iface: AwaitIface = 0.0,
-    json: Json = False,
-    verbose: Verbose = False,
+    *,
+    options: ToolOptions,
 ) -> None:
     """Print the messages of a topic, as 'ros2 topic echo' does, until Ctrl-C.
 
     It reads the topic through the overlay as the node NODE, whose delegations must give the right to read it. Without
     that right the exit code is 2, and the text says what the owner types. --json prints whole messages as lines.
     """
-    set_up_logging(verbose=verbose, quiet=True)
-    with failing_clearly(), ending_quietly():
-        access = _readable(node, iface, delegations, name, type_name, await_iface)
-        printer = _Printer(1 if once else count, None if full else truncate, is_json=json)
+    with running_tool(options):
+        access = _readable(node, name, type_name, options)
+        printer = _Printer(1 if once else count, None if full else truncate, is_json=options.json)
         _read(access, printer.print, printer.tick(access, timeout))
         if printer.is_silent:
             terminal.echo(f"error: {name}: no message within {timeout:g} s", err=True)
@@ -256,15 +213,10 @@ class _Hint:
         terminal.echo(text, err=True)
 
 
-def _readable(
-    node: Path, iface: str | None, delegations: Path | None, name: str, type_name: str, await_s: float
-) -> Access:
-    from gdp.links.uplink import wait_for_device
-    from proxy.node.tool_member import Wanted, find_access
+def _readable(node: Path, name: str, type_name: str, options: ToolOptions) -> Access:
+    from proxy.node.tool_member import Wanted
 
-    access = find_access(node, iface, delegations, Wanted(name, type_name, Right.READ))
-    wait_for_device(access.config.iface, await_s)
-    return access
+    return options.find_access(node, Wanted(name, type_name, Right.READ))
 
 
 def _read(access: Access, take: Callable[[Channel, bytes, float], None], tick: Tick) -> None:
@@ -277,11 +229,16 @@ def _read(access: Access, take: Callable[[Channel, bytes, float], None], tick: T
 
 def _measure(
     access: Access,
-    take: Callable[[Channel, bytes, float], None],
-    report: Callable[[float], bool],
+    window: int,
+    report_of: Callable[[list[tuple[float, int]], float], Frequency | Bandwidth],
     duration_s: float | None,
+    *,
+    is_json: bool,
 ) -> None:
     """Report once a second; exit 1 if a bounded time brought no report."""
+    from proxy.tools.rates import Arrivals
+
+    arrivals = Arrivals(window)
     hint = _Hint(access)
     is_measured = False
     report_at_s = math.inf
@@ -295,20 +252,17 @@ def _measure(
             hint.tick(bridge, now_s)
         end_s = math.inf if duration_s is None else hint.begun_s + duration_s
         if now_s >= min(report_at_s, end_s):
-            is_measured |= report(now_s)
+            if latest := arrivals.poll_latest():
+                is_measured = True
+                report = report_of(latest, now_s)
+                if is_json:
+                    print_json({"topic": access.rule.name, **report._asdict()})  # an infinite rate is null
+                else:
+                    print_text(report.words())
             report_at_s = now_s + _REPORT_S
         return None if now_s >= end_s else min(report_at_s, end_s)
 
-    _read(access, take, tick)
+    _read(access, lambda _channel, raw, now_s: arrivals.add(now_s, len(raw)), tick)
     if duration_s is not None and not is_measured:
         terminal.echo(f"error: {access.rule.name}: fewer than two messages within {duration_s:g} s", err=True)
         raise typer.Exit(1)
-
-
-def main() -> None:
-    """Run the commands."""
-    versioned(app)(prog_name="gdp topic")
-
-
-if __name__ == "__main__":
-    main()

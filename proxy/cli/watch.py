@@ -10,7 +10,6 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Final, Optional
@@ -18,8 +17,8 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
-from gdp.cli.version import versioned
-from gdp.errors import GdpError, LocalError
+from gdp.cli.program import Program
+from gdp.errors import LocalError
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.ros_names import covers, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles
@@ -27,9 +26,9 @@ from gdp.state.control_protocol import Command
 from gdp.terminal import echo
 from proxy.bridge.liveliness import LivelinessEvent, LivelinessTracker, NameLiveliness, names_from_fields
 
-__all__ = ["app", "main"]
+__all__ = ["app"]
 
-app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
+app = Program("gdp watch")
 
 _PERIOD_S: Final = 0.25  # the control socket has no events
 _ANSWER_S: Final = 5.0
@@ -133,12 +132,3 @@ def _print(event: LivelinessEvent, *, as_json: bool) -> None:
         clock = now.astimezone().strftime("%H:%M:%S")
         echo(f"{clock}  {event.name}  {event.role} {event.node[:_NODE_CHARS]} {event.change}")
     sys.stdout.flush()
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; arguments as after ``gdp watch``."""
-    try:
-        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp watch")
-    except GdpError as error:
-        echo(f"error: {error}", err=True)
-        sys.exit(2)

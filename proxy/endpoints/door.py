@@ -33,7 +33,8 @@ from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQu
 from proxy.doors.hub import DoorSession, Hub, Rights
 from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
-from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.endpoints.in_process import InProcessEndpoint
+from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 
 if TYPE_CHECKING:
@@ -95,18 +96,21 @@ class _Client:
         return self.session.queue
 
 
-class DoorEndpoint:
+class DoorEndpoint(InProcessEndpoint):
     """Endpoint whose nodes are the clients of a WebSocket server.
 
     Raises:
         LocalError: the address cannot be listened on, or ``websockets`` is not installed.
     """
 
+    kind = "a door"
+
     def __init__(self, settings: DoorSettings, new_session: NewSession, rights: Callable[[], Rights]) -> None:
         require_extra("doors", ["websockets"], settings.label)
+        super().__init__()
         self._settings = settings
         self._new_session = new_session
-        self._events: deque[tuple[Event, _Client | None]] = deque()
+        self._heard: deque[tuple[Event, _Client | None]] = deque()  # events, and whose they are
         self._speaker: _Client | None = None  # whose message is being processed
         self._arrivals = Arrivals["ServerConnection"](ARRIVING_MAX_BYTES)
         self._input_bytes = 0  # written by the server's thread
@@ -117,7 +121,6 @@ class DoorEndpoint:
         self._unwritten = 0  # messages that drew an error of this program when they were written for a client
         self._handles = count(1)
         self._sessions = count(1)
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._hub = Hub(self._emit, rights, _known_or_none)
         self._clients: dict[int, _Client] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -148,11 +151,6 @@ class DoorEndpoint:
         return host, port
 
     @property
-    def ros(self) -> RosVersion:
-        """Return the dialect of its messages: CDR."""
-        return 2
-
-    @property
     def label(self) -> str:
         """Return the display name."""
         return f"{self._settings.label} {self._origin}"
@@ -168,11 +166,6 @@ class DoorEndpoint:
         return f"ws://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
-    def is_live(self) -> bool:
-        """Return True: clients come and go."""
-        return True
-
-    @property
     def dropped(self) -> int:
         """Return the messages dropped because a queue was full, or because they could not be written."""
         return self._hub.dropped + self._lost + self._unwritten
@@ -182,17 +175,13 @@ class DoorEndpoint:
         """Return the number of connections."""
         return len(self._clients)
 
-    def fileno(self) -> int:
-        """Return a descriptor that is readable while there are events."""
-        return self._wake
-
     def poll_events(self) -> Sequence[Event]:
         """Remove and return the pending events."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._wake)
         events = list[Event]()
-        while self._events:
-            event, speaker = self._events.popleft()
+        while self._heard:
+            event, speaker = self._heard.popleft()
             if isinstance(event, MessageReceived | RequestReceived):
                 self._taken_bytes += len(event.raw)
                 if speaker is not None:
@@ -211,10 +200,6 @@ class DoorEndpoint:
         except LocalError:
             self._do(self._hub.want_definition, topic, type_name)
             raise
-
-    def service(self, name: str, type_name: str) -> Service:
-        """Raise ``LocalError``: the definition of a server is used."""
-        raise LocalError(f"{name}: a door has no definition of {type_name}; that of its server is used")
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Take what clients publish under a name."""
@@ -253,18 +238,6 @@ class DoorEndpoint:
         del handle
         self._do(self._hub.pass_refusal, ticket, reason)
 
-    def create_client(self, name: str, type_name: str) -> int:
-        """Raise ``LocalError``: clients of a door serve nothing."""
-        raise LocalError(f"{name}: clients of a door cannot serve {type_name}")
-
-    def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Raise ``LocalError``: see ``create_client``."""
-        del call, raw
-        raise LocalError(f"handle {handle} is no client")
-
-    def drop(self, handle: int, call: int) -> None:
-        """Do nothing: no call was begun."""
-
     def close(self, handle: int) -> None:
         """Close a subscription, publisher or server."""
         self._do(self._hub.close, handle, time.monotonic())
@@ -277,7 +250,7 @@ class DoorEndpoint:
             self._thread.join()
         self._socket.close()
         self._owners.close()
-        os.close(self._wake)
+        super().shut_down()
 
     # the server's thread
 
@@ -326,7 +299,7 @@ class DoorEndpoint:
             self._input_bytes += len(event.raw)
             if speaker is not None:
                 speaker.given_bytes += len(event.raw)
-        self._events.append((event, speaker))
+        self._heard.append((event, speaker))
         os.eventfd_write(self._wake, 1)
 
     def _has_capacity(self, speaker: _Client | None, size_bytes: int) -> bool:

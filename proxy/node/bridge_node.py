@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from gdp.cli.node import emit, emit_wait
+from gdp.cli.node import emit, emit_wait, report
 from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -148,10 +148,8 @@ def _local_names(bridge: Bridge) -> dict[Name, str]:
 
 def _tell_change(change: FlowChange, *, json: bool) -> None:
     """Say that a flow began or ended after the start: a node came or went, or the rules were read again."""
-    if json:
-        emit("flow", change="begun" if change.is_begun else "ended", **_described(change.flow_spec))
-    else:
-        echo(f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}")
+    text = f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}"
+    report("flow", text, json=json, change="begun" if change.is_begun else "ended", **_described(change.flow_spec))
 
 
 def _line(flow_spec: FlowSpec) -> str:

@@ -16,7 +16,7 @@ from typing import Final
 import orjson
 from pydantic import ValidationError
 
-from gdp.cli.node import emit, emit_wait
+from gdp.cli.node import emit, emit_wait, report
 from gdp.config.schema import first_fault
 from gdp.errors import LocalError
 from gdp.nodes.delegation_store import DelegationStore
@@ -112,10 +112,8 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
         finally:
             door.shut_down()
         totals = {"sent": node.traffic.messages_out, "received": node.traffic.messages_in, "dropped": door.dropped}
-        if json:
-            emit("done", **totals, faults=dict(node.faults.counts))
-        else:
-            echo("{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals))
+        text = "{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals)
+        report("done", text, json=json, **totals, faults=dict(node.faults.counts))
 
 
 def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorRules], *, json: bool) -> None:

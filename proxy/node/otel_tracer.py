@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Final
 from gdp.extras import require_extra
 from gdp.names import Name
 from gdp.state.snapshot import short_id
-from proxy.bridge.call_tracer import CallKey, NoTracer, trace_ids
+from proxy.bridge.call_tracer import CallKey, CallTracer, trace_ids
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
     from opentelemetry.trace import Span
 
-    from proxy.bridge.call_tracer import CallTracer
     from proxy.config.config import Traces
 
 __all__ = ["OtelTracer", "open_tracer"]
@@ -45,7 +44,7 @@ class _Call:
     is_ended: bool = False
 
 
-class OtelTracer:
+class OtelTracer(CallTracer):
     """Spans of one proxy.
 
     Args:
@@ -227,7 +226,7 @@ def open_tracer(traces: Traces | None, node: Name, label: str) -> CallTracer:
         MissingExtraError: it asks for one, and the extra ``otel`` is not installed.
     """
     if traces is None:
-        return NoTracer()
+        return CallTracer()
     require_extra("otel", ["opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"], "traces")
     from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
     from opentelemetry.sdk.trace.export import BatchSpanProcessor

@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from gdp.cli.node import emit, emit_wait
+from gdp.cli.node import emit, emit_wait, report
 from gdp.errors import LocalError
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
@@ -98,10 +98,8 @@ def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: 
         if not is_ready and node.member.attachment.is_attached:
             is_ready = True
             node.tell_refusals()
-            if json:
-                emit("ready", name=node.member.name.to_text())
-            else:
-                echo(f"proxy {node.member.name.short} is attached; Ctrl-C ends it")
+            name = node.member.name
+            report("ready", f"proxy {name.short} is attached; Ctrl-C ends it", json=json, name=name.to_text())
         if time.monotonic() >= tick_at_s:
             tick_at_s = time.monotonic() + TICK_S
             if writer is not None:

@@ -7,15 +7,12 @@ recording distinguishes publishers: each has a channel. The caller owns the time
 
 from __future__ import annotations
 
-import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import (
-    Event,
     Graph,
     GraphChanged,
     GraphEntity,
@@ -24,6 +21,7 @@ from proxy.endpoints.core.endpoint import (
     Role,
     TypeResolved,
 )
+from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.split import SplitWriter
 from proxy.recordings.writer import BagWriter
@@ -42,30 +40,16 @@ class RecordedMessage(NamedTuple):
     raw: bytes
 
 
-class _TopicsEndpoint:
-    """Common part of both endpoints: a queue of events, and no services."""
+class _TopicsEndpoint(InProcessEndpoint):
+    """Common part of both endpoints: no services."""
 
-    is_live: Final = False
-    dropped: Final = 0
+    kind = "a recording"
+    is_live = False
 
     def __init__(self, label: str) -> None:
+        super().__init__()
         self.label = label
-        self._events = deque[Event]()
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._put(GraphChanged())
-
-    def fileno(self) -> int:
-        """Return a descriptor that is readable while ``poll_events`` has events."""
-        return self._wake
-
-    def poll_events(self) -> Sequence[Event]:
-        """Remove and return the pending events, in order."""
-        if not self._events:
-            return ()
-        os.eventfd_read(self._wake)
-        events = list(self._events)
-        self._events.clear()
-        return events
 
     def channel(self, topic: str, type_name: str) -> Channel:
         """Refuse: a recording has its own definitions and no installed types.
@@ -94,23 +78,6 @@ class _TopicsEndpoint:
         """Refuse: a recording holds topics only; raises ``LocalError``."""
         del type_name
         self._refuse(name)
-
-    def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Refuse: a recording holds topics only; raises ``LocalError``."""
-        del raw
-        self._refuse(f"call {call} of handle {handle}")
-
-    def drop(self, handle: int, call: int) -> None:
-        """Ignore the call: there is none."""
-
-    def shut_down(self) -> None:
-        """Free the descriptor; the recording itself belongs to the caller."""
-        os.close(self._wake)
-
-    def _put(self, event: Event) -> None:
-        if not self._events:
-            os.eventfd_write(self._wake, 1)
-        self._events.append(event)
 
     def _refuse(self, what: str) -> NoReturn:
         raise LocalError(f"{self.label}: {what}: a recording holds topics only")

@@ -7,15 +7,40 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-__all__ = ["Bandwidth", "BandwidthReport", "Frequency", "FrequencyReport"]
+__all__ = ["Arrivals", "Bandwidth", "Frequency"]
 
 _UNITS = ((1e6, "MB"), (1e3, "KB"))
 
 
-class FrequencyReport(NamedTuple):
+class Arrivals:
+    """Arrival times and sizes of the latest messages of a topic.
+
+    Args:
+        window: most messages that count, at least 2.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._latest = deque[tuple[float, int]](maxlen=window)
+        self._is_new = False
+
+    def add(self, now_s: float, size: int) -> None:
+        """Count a message of this many bytes."""
+        self._latest.append((now_s, size))
+        self._is_new = True
+
+    def poll_latest(self) -> list[tuple[float, int]]:
+        """Return monotonic second and bytes of each; empty: none came since the last call, or fewer than two in all."""
+        if not self._is_new or len(self._latest) < 2:
+            return []
+        self._is_new = False
+        return list(self._latest)
+
+
+class Frequency(NamedTuple):
     """Rate of messages, and the spread of the time between two of them.
 
     Attributes:
@@ -35,37 +60,18 @@ class FrequencyReport(NamedTuple):
             f"\tmin: {self.min_s:.3f}s max: {self.max_s:.3f}s std dev: {self.std_dev_s:.5f}s window: {self.window}"
         )
 
-
-class Frequency:
-    """Arrival times of the latest messages.
-
-    Args:
-        window: most messages that count, at least 2.
-    """
-
-    def __init__(self, window: int) -> None:
-        self._times_s = deque[float](maxlen=window)
-        self._is_new = False
-
-    def add(self, now_s: float) -> None:
-        """Count a message."""
-        self._times_s.append(now_s)
-        self._is_new = True
-
-    def poll_report(self) -> FrequencyReport | None:
-        """Return the rate; None: no message since the last report, or fewer than two in all."""
-        if not self._is_new or len(self._times_s) < 2:
-            return None
-        self._is_new = False
-        times = list(self._times_s)
-        gaps = [later - earlier for earlier, later in pairwise(times)]
+    @classmethod
+    def of(cls, latest: Sequence[tuple[float, int]], now_s: float) -> Frequency:
+        """Return the rate of two messages or more."""
+        del now_s
+        gaps = [later - earlier for (earlier, _), (later, _) in pairwise(latest)]
         mean_s = sum(gaps) / len(gaps)
         variance = sum((gap - mean_s) ** 2 for gap in gaps) / len(gaps)
         rate_hz = 1 / mean_s if mean_s > 0 else math.inf
-        return FrequencyReport(rate_hz, min(gaps), max(gaps), math.sqrt(variance), len(times))
+        return cls(rate_hz, min(gaps), max(gaps), math.sqrt(variance), len(latest))
 
 
-class BandwidthReport(NamedTuple):
+class Bandwidth(NamedTuple):
     """Bytes a second, and the sizes of messages in the window, in bytes of ROS's wire form."""
 
     bytes_s: float
@@ -81,32 +87,13 @@ class BandwidthReport(NamedTuple):
             f"\tMessage size mean: {_size(self.mean_bytes)} min: {_size(self.min_bytes)} max: {_size(self.max_bytes)}"
         )
 
-
-class Bandwidth:
-    """Arrival times and sizes of the latest messages.
-
-    Args:
-        window: most messages that count.
-    """
-
-    def __init__(self, window: int) -> None:
-        self._arrivals = deque[tuple[float, int]](maxlen=window)
-        self._is_new = False
-
-    def add(self, now_s: float, size: int) -> None:
-        """Count a message of this many bytes."""
-        self._arrivals.append((now_s, size))
-        self._is_new = True
-
-    def poll_report(self, now_s: float) -> BandwidthReport | None:
-        """Return the rate since the first message of the window; None: no message since the last report."""
-        if not self._is_new or len(self._arrivals) < 2:
-            return None
-        self._is_new = False
-        sizes = [size for _, size in self._arrivals]
-        passed_s = max(now_s - self._arrivals[0][0], 1e-9)
+    @classmethod
+    def of(cls, latest: Sequence[tuple[float, int]], now_s: float) -> Bandwidth:
+        """Return the rate since the first of two messages or more."""
+        sizes = [size for _, size in latest]
+        passed_s = max(now_s - latest[0][0], 1e-9)
         total = sum(sizes)
-        return BandwidthReport(total / passed_s, len(sizes), total / len(sizes), min(sizes), max(sizes))
+        return cls(total / passed_s, len(sizes), total / len(sizes), min(sizes), max(sizes))
 
 
 def _size(count: float) -> str:

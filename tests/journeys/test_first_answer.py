@@ -230,9 +230,7 @@ def test_requests_to_a_server_behind_a_thin_link_do_not_fill_its_queue() -> None
     replicas = Replicas((OTHER, NEAR))
     replicas.begin("thin")
     watch, reader = replicas.net.cores[WATCH], replicas.net.cores[OTHER]
-    publisher = watch.advertise(
-        watch.resolve("news", Right.PUBLISH), reliable=True, urgent=False, latched=0, is_global=True, description=b"-"
-    )
+    publisher = watch.member.advertise(watch.resolve("news", Right.PUBLISH), b"-", reliable=True)
     inbox = reader.subscribe(reader.resolve("news", Right.READ), 1_000)
     for label in (WATCH, OTHER):
         replicas.net.send(label)

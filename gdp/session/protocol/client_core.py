@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gdp.client.participant import Message, Participant, Topic
+from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
@@ -19,6 +19,9 @@ from gdp.service.replication import Replication
 from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.protocol.messages import Response
 from gdp.session.protocol.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, StopFrame, read_response
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["Call", "ClientCore"]
 
@@ -55,7 +58,6 @@ class ClientCore:
     Args:
         label: word for the name in errors.
         start: number of the first call, random in 64 bits.
-        is_session: a session secret authenticates requests to one server and responses, if that server asks for it too.
 
     Raises:
         LocalError: no delegation, or the name is in use in this session.
@@ -68,19 +70,14 @@ class ClientCore:
         label: str,
         *,
         start: int,
-        is_global: bool = True,
-        urgent: bool = False,
-        paths: int = 1,
-        is_session: bool = False,
+        **options: Unpack[ServiceOptions],
     ) -> None:
         self._member = member
         self._name = topic.name
         self._label = label
         self._start = start
-        self._is_session = is_session
-        self._publisher: Publisher = member.call(
-            topic, SERVING, is_global=is_global, urgent=urgent, paths=paths, is_session=is_session
-        )
+        self._is_session = options.get("is_session", False)
+        self._publisher: Publisher = member.call(topic, SERVING, **options)
         self._dispatches: dict[Replication, Dispatch[Response]] = {}
         self._servers: dict[Name, int] = {}  # server to its incarnation
         self._leaving: set[Name] = set()

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.client.participant import Message as MemberMessage
-from gdp.client.participant import Participant, Topic
-from gdp.client.publisher import Publisher
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions, checked
+from gdp.client.participant import Participant, ServiceOptions, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import NAME_BYTES, Name
@@ -24,6 +22,9 @@ from gdp.session.protocol.messages import DelegatedName, Message, NameLike, desc
 from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import read_message
 from gdp.trust.right import Right
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["QUEUE_MAX_BYTES", "QUEUE_MESSAGES", "Inbox", "SessionCore", "replication_of"]
 
@@ -157,34 +158,6 @@ class SessionCore:
 
     # calls of a program
 
-    def advertise(
-        self,
-        topic: Topic,
-        *,
-        reliable: bool,
-        urgent: bool,
-        latched: int,
-        is_global: bool,
-        description: bytes,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
-    ) -> Publisher:
-        """Publish a name; see ``Participant.advertise``.
-
-        Raises:
-            LocalError: the name is published already in this session, or an option is out of bounds.
-        """
-        return self.member.advertise(
-            topic,
-            description,
-            reliable=reliable,
-            depth=latched,
-            is_global=is_global,
-            urgent=urgent,
-            paths=paths,
-            options=checked(options),
-        )
-
     def subscribe(self, topic: Topic, limit: int, paths: int = 1) -> Inbox:
         """Subscribe to a name.
 
@@ -201,33 +174,13 @@ class SessionCore:
             del self._receivers[inbox.name]
             self.member.unsubscribe(inbox.name)
 
-    def serve(
-        self,
-        topic: Topic,
-        *,
-        at_once: int | None,
-        is_global: bool,
-        urgent: bool,
-        options: SendOptions = DEFAULT_OPTIONS,
-        paths: int = 1,
-        is_session: bool = False,
-    ) -> ServerCore:
+    def serve(self, topic: Topic, *, at_once: int | None, **options: Unpack[ServiceOptions]) -> ServerCore:
         """Serve a name.
 
         Raises:
             LocalError: the name is read, served or called already in this session.
         """
-        server = ServerCore(
-            self.member,
-            topic,
-            start=self._random_start(),
-            at_once=at_once,
-            is_global=is_global,
-            urgent=urgent,
-            options=options,
-            paths=paths,
-            is_session=is_session,
-        )
+        server = ServerCore(self.member, topic, start=self._random_start(), at_once=at_once, **options)
         self._receivers[topic.name] = self._servers[topic.name] = server
         self._services.append(server)
         return server

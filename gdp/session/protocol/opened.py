@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
-from gdp.client.send_options import Priority, SendOptions, is_urgent
+from gdp.client.send_options import Priority, SendOptions, checked, is_urgent
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -131,18 +131,19 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
         """
         topic = self.core.resolve(name, Right.PUBLISH)
         urgent = is_urgent(priority)
+        options = SendOptions(
+            deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
+        )
         made = self.driver.run(
-            lambda: self.core.advertise(
+            lambda: self.core.member.advertise(
                 topic,
+                description,
                 reliable=reliable,
-                urgent=urgent,
-                latched=latched,
+                depth=latched,
                 is_global=is_global,
-                description=description,
+                urgent=urgent,
                 paths=paths_value(paths),
-                options=SendOptions(
-                    deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
-                ),
+                options=checked(options),
             )
         )
         publisher = self._publisher_type(self, topic, made, reliable=reliable)

@@ -7,10 +7,9 @@ response of a duplicate request.
 from __future__ import annotations
 
 from collections import deque
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gdp.client.participant import Message, Participant, Topic
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving, Turn
@@ -23,6 +22,9 @@ from gdp.session.protocol.wire import (
     StopFrame,
     read_request,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["ServerCore"]
 
@@ -39,7 +41,6 @@ class ServerCore:
     Args:
         start: number of the first call here, random in 64 bits.
         at_once: most requests that handlers process at the same time.
-        is_session: a session secret authenticates streams with one client, if that client asks for it too.
 
     Attributes:
         turns: requests for handlers, in order; a driver removes them.
@@ -56,18 +57,12 @@ class ServerCore:
         *,
         start: int,
         at_once: int | None,
-        is_global: bool,
-        urgent: bool,
-        options: SendOptions = DEFAULT_OPTIONS,
-        paths: int = 1,
-        is_session: bool = False,
+        **options: Unpack[ServiceOptions],
     ) -> None:
         self._member = member
         self._name = topic.name
         self._serving: Serving[bytes] = Serving(start, at_once)
-        self._publisher = member.serve(
-            topic, SERVING, is_global=is_global, urgent=urgent, options=options, paths=paths, is_session=is_session
-        )
+        self._publisher = member.serve(topic, SERVING, **options)
         self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
         self._is_leaving = False

@@ -152,21 +152,12 @@ def test_an_observer_that_was_sent_away_hears_no_more() -> None:
     assert copy.entries == {}
 
 
-def test_many_at_once_are_taken_until_the_table_is_full() -> None:
+def test_new_entries_are_taken_until_the_table_is_full() -> None:
     table = Table(max_entries=3)
     table.install(key(9), HOPS, 5.0)
-    assert table.install_many([(key(n), HOPS) for n in (1, 9, 2, 3, 4)], 2.0) == 3
+    assert [table.install(key(n), HOPS, 2.0) for n in (1, 9, 2, 3, 4)] == [True, True, True, False, False]
     assert table.entries.keys() == {key(9), key(1), key(2)}
     assert set(table.expire(2.0)) == {key(9), key(1), key(2)}
-
-
-def test_a_wrong_one_among_many_leaves_those_before_it() -> None:
-    table, copy = Table(), Copy()
-    table.observe(copy)
-    with pytest.raises(LocalError):
-        table.install_many([(key(1), HOPS), (key(2, 31), HOPS)], 1.0)
-    assert copy.entries == table.entries == {key(1): HOPS}
-    assert table.next_expiry() == 1.0
 
 
 class TableAgainstPlainDict(RuleBasedStateMachine):
@@ -178,21 +169,12 @@ class TableAgainstPlainDict(RuleBasedStateMachine):
         self.table.observe(self.copy)
         self.now_s = 0.0
 
-    @rule(number=st.integers(0, 8), lease_s=st.integers(0, 20))
-    def install(self, number: int, lease_s: int) -> None:
-        taken = self.table.install(key(number), HOPS, self.now_s + lease_s)
+    @rule(number=st.integers(0, 8), lease_s=st.integers(0, 20), to=st.sampled_from([HOPS, NOWHERE]))
+    def install(self, number: int, lease_s: int, to: Hops) -> None:
+        taken = self.table.install(key(number), to, self.now_s + lease_s)
         assert taken == (key(number) in self.model or len(self.model) < 6)
         if taken:
             self.model[key(number)] = self.now_s + lease_s
-
-    @rule(numbers=st.lists(st.integers(0, 8)), lease_s=st.integers(0, 20), to=st.sampled_from([HOPS, NOWHERE]))
-    def install_many(self, numbers: list[int], lease_s: int, to: Hops) -> None:
-        taken = 0
-        for number in numbers:
-            if key(number) in self.model or len(self.model) < 6:
-                taken += 1
-                self.model[key(number)] = self.now_s + lease_s
-        assert self.table.install_many([(key(number), to) for number in numbers], self.now_s + lease_s) == taken
 
     @rule(number=st.integers(0, 8))
     def remove(self, number: int) -> None:

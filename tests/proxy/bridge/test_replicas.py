@@ -143,7 +143,7 @@ def test_an_answer_of_somebody_without_a_delegation_is_not_taken(sites: Sites) -
     (call,) = (number for number, _ in dispatch._calls)
     wire = Answer(0, call, Outcome.ANSWERED, b'{"success":true,"message":"forged"}').to_wire()
     delivered = Delivered(bytes(forger.member.name), 1, 1, wire, 1, 1)
-    flow.receive(Message(flow._topic.name, delivered, b"", True), sites.now_s)
+    flow.receive(Message(flow.topic.name, delivered, b"", True), sites.now_s)
     assert caller.outcomes == []
     locals_[0].waiting[0][1](switched("right"))
     assert sites.run(1, lambda: caller.outcomes == [switched("right")])
