@@ -27,7 +27,7 @@ from gdp.ports.netlink import NetlinkSocket
 from lab.namespaces import wait_for_carrier
 from netns_tests.conftest import MakeKernel
 from netns_tests.spaces import Space
-from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S, filled
+from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import (
     BOTH,
@@ -35,6 +35,7 @@ from tests.fixtures_forwarding import (
     ONE,
     PEER_MACS,
     WIDE,
+    filled,
     frame,
     leaves,
 )

@@ -1,4 +1,4 @@
-"""What our reader gives of each recording below folders, beside the reader of its format: for suites of public files.
+"""What our reader gives of each recording below folders, next to the reader of its format: for suites of public files.
 
     python scripts/read_recordings.py rosbag2/rosbag2_tests/resources mcap/tests/conformance/data
 

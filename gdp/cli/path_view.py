@@ -28,7 +28,7 @@ def path_lines(name: str, path: Mapping[str, object]) -> Iterator[str]:
     for hop in hops:
         yield from _hop_lines(hop)
     if any(hop.get("needs_right") for hop in hops):
-        yield "     branches are told to switches, and to nodes with a right on the name"
+        yield "     branches are shown to switches, and to nodes with a right on the name"
 
 
 def _hop_lines(hop: Mapping[str, object]) -> Iterator[str]:

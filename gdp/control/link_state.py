@@ -142,7 +142,7 @@ class LinkState(Body):
         )  # fmt: skip
 
     @classmethod
-    def of(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
+    def from_origin(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
         """Read a parsed statement's body; role and domain of the origin come from its certificate.
 
         Of a leaf, links that leave its domain are left out.

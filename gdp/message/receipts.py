@@ -2,8 +2,8 @@
 
 Sans-I/O. A reader's counts decide how fast its writer sends, so invented ones would flood the path (RFC 9000, section
 21.4). One frame in 64 is a sample, by the last byte of its seal. A report carries the sum of the seals of the samples
-that came; the writer finds the set of samples that has this sum. Seals depend on the salt of their message. So nobody
-knows the seal of a frame that did not come, unless another frame of its message came and the content can be guessed.
+that came; the writer finds the set of samples that has this sum. Seals depend on the salt of their message. The seal of
+a frame that did not come is known only where another frame of its message came and the content can be guessed.
 """
 
 from __future__ import annotations

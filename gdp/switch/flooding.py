@@ -129,7 +129,7 @@ class Flooding:
         if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
         is_leaf = member.role is Role.LEAF
-        state = LinkState.of(fields, member.name, member.domain, is_leaf=is_leaf)
+        state = LinkState.from_origin(fields, member.name, member.domain, is_leaf=is_leaf)
         if is_leaf and state.scope is Scope.BORDER:
             raise StatementError(DropReason.THROUGH_LEAF, "a leaf that would be a border")
         if state.scope is Scope.DOMAIN and not self._domain == member.domain == neighbour.domain:

@@ -44,11 +44,11 @@ def test_b10_a_reader_that_says_to_have_all_frames_gets_no_more_than_its_path_ca
             sent[:] = sent[0] + len(frame), max(sent[1], header.parts)
 
     def lie(*fields: object) -> AckNack:
-        told = AckNack(*fields)  # type: ignore[arg-type]
-        all_frames = told.newest * sent[1] + told.newest_part + 1
+        report = AckNack(*fields)  # type: ignore[arg-type]
+        all_frames = report.newest * sent[1] + report.newest_part + 1
         lies = {"received": all_frames, "frames": all_frames, "held_us": HELD_US}
-        told = told if told.flags else told._replace(missing=(), lost=0, **lies)  # type: ignore[arg-type]
-        return told._replace(next_number=told.newest, next_part=told.newest_part) if reliable else told
+        report = report if report.flags else report._replace(missing=(), lost=0, **lies)  # type: ignore[arg-type]
+        return report._replace(next_number=report.newest, next_part=report.newest_part) if reliable else report
 
     world.network.taps.append(count)
     monkeypatch.setattr(writer_proxy, "AckNack", lie)

@@ -124,7 +124,7 @@ def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
     ).fitted(nuc1.membership)
     wire = state.to_wire(nuc1.name, nuc1.key, nuc1.membership)
     assert len(wire) <= CONTROL_MAX_BYTES
-    read = LinkState.of(parse(wire).fields, nuc1.name, nuc1.root.domain)
+    read = LinkState.from_origin(parse(wire).fields, nuc1.name, nuc1.root.domain)
     assert read == state
     assert len(read.ribs) > 4
     assert len(read.links) > 64

@@ -130,17 +130,17 @@ def test_a_switch_of_our_domain_tells_links_and_branches(flow: Flow) -> None:
     assert branch["p"] == world.members[ROBOT].name
 
 
-def test_branches_are_told_to_those_with_a_right_on_the_name_and_to_switches() -> None:
+def test_branches_are_shown_to_those_with_a_right_on_the_name_and_to_switches() -> None:
     world = Simulation(topology=flat_topology(pairwise("abcd"), mtu=MTU_BYTES, rib="b", members="abc"))
     assert world.run_until_attached()
     name = flowing(world, source="a/end", readers=("b/end",)).topic.name
     target = world.switches["b"].name  # where the tree has its branch to the reader
-    told = {}
+    shown = {}
     for label in ("a/end", "b/end", "c/end", "d"):
         reply = Asker(world, label).ask(target, "trace", name, reply_bytes=2_000)
         assert reply is not None
-        told[label] = len(reply.result.maps("branches", 9)) if "branches" in reply.result else 0
-    assert told == {"a/end": 1, "b/end": 1, "c/end": 0, "d": 1}
+        shown[label] = len(reply.result.maps("branches", 9)) if "branches" in reply.result else 0
+    assert shown == {"a/end": 1, "b/end": 1, "c/end": 0, "d": 1}
     thief = world.members["c/end"]
     thief.diagnostics.evidence_of = world.members["b/end"].attachment.evidence_of
     reply = Asker(world, "c/end").ask(target, "trace", name, reply_bytes=2_000)

@@ -268,7 +268,7 @@ def test_branches_that_a_right_would_show_are_mentioned() -> None:
     }
     path = {"right": "publish", "node": ROBOT, "answered": False, "hops": [hop]}
     assert list(path_lines("/scan", path))[2:] == [
-        "     branches are told to switches, and to nodes with a right on the name"
+        "     branches are shown to switches, and to nodes with a right on the name"
     ]
 
 

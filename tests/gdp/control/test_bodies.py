@@ -86,7 +86,7 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "link state": (
         STATE.to_wire(NODE.name, NODE.key, b"cert"),
         STATE,
-        lambda fields: LinkState.of(fields, NODE.name, A),
+        lambda fields: LinkState.from_origin(fields, NODE.name, A),
     ),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
     "query of a reader": (
