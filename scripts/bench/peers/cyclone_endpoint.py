@@ -104,7 +104,7 @@ def main() -> None:
     os.environ["CYCLONEDDS_URI"] = settings.own["xml"]  # read when the participant is made
     if settings.role == "ping":
         pids = {"sender": [os.getpid()], **settings.pids}
-        say(series="cyclone", sizes=exchange(CycloneWay("ping", "pong"), settings.load, pids))
+        say(**exchange(CycloneWay("ping", "pong"), settings.size, settings.count, pids))
         return
     way = CycloneWay("pong", "ping")
     say(event="ready")
