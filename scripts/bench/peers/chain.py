@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from machine import set_offloads
+from machine import clear_offloads
 from pyroute2 import IPRoute
 from testbed import Lab, add_address
 
@@ -57,7 +57,7 @@ def _neighbours(node: str) -> tuple[str, ...]:
 def _number(node: str) -> None:
     for other in _neighbours(node):
         add_address(other, address(node, other))
-        set_offloads(other, on=False)
+        clear_offloads(other)
     with IPRoute() as here:
         for network, gateway in routes(node).items():
             here.route("add", dst=network, gateway=gateway)
