@@ -109,10 +109,9 @@ class ZenohNet:
 
 
 def cyclone_xml(own: str, other: str) -> str:
-    """Return the configuration of an end at the address ``own``, of IPv4 or IPv6, whose only peer is at ``other``."""
-    transport = "<Transport>udp6</Transport>" if ":" in own else ""
+    """Return the configuration of an end at the IPv4 address ``own``, whose only peer is at ``other``."""
     return (
-        f'<CycloneDDS><Domain id="any"><General>{transport}<Interfaces><NetworkInterface address="{own}"/></Interfaces>'
+        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{own}"/></Interfaces>'
         "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f'<MaxAutoParticipantIndex>1</MaxAutoParticipantIndex><Peers><Peer address="{other}"/></Peers></Discovery>'
         "</Domain></CycloneDDS>"
