@@ -37,9 +37,9 @@ from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_row import READY_S, Carried, Row
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, parse, perform
-from testbed import BUFFER_BYTES
 
 from gdp.host.run_registry import RunRegistry
+from lab.dds import BUFFER_BYTES
 from lab.process import FailedError, figures_of
 from lab.topology import LEFT, RIGHT
 
