@@ -1,4 +1,4 @@
-"""Environment of ROS processes in namespaces: Fast DDS over UDP or shared memory, with room for a camera image.
+"""Environment of ROS processes in namespaces: Fast DDS over UDP or shared memory, with buffers for a camera image.
 
 I/O. Writes a profile.
 """
