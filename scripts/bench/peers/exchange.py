@@ -27,7 +27,6 @@ ANSWER: Final = struct.Struct("!QII")  # number, bytes, CRC-32 or 0
 _NUMBER: Final = struct.Struct("!Q")
 _CHECKED: Final = 1 << 63  # in a number: answer with the CRC
 _GREETING_S: Final = 0.1
-_WARM_UP_SHARE: Final = 5  # a fifth more, before: windows open, caches fill
 
 # CDR_LE; stamp; frame_id "cam"; height 1, width; encoding "mono8"; is_bigendian, step; length of data.
 _IMAGE_HEAD: Final = struct.Struct("<4siII4sIII6sBxII")
@@ -72,7 +71,7 @@ def exchange(way: Way, size: int, count: int, pids: Mapping[str, Sequence[int]])
     numbers, message = iter(range(1, _CHECKED)), image(size)
     _greet(way)
     _once(way, message, next(numbers) | _CHECKED)
-    for _ in range(count // _WARM_UP_SHARE):
+    for _ in range(count):  # windows open, caches fill
         _once(way, message, next(numbers))
     before = _read(clocks)
     rtts = [_once(way, message, next(numbers)) for _ in range(count)]
