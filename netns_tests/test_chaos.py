@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,16 +10,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from faults.disk import NOT_WRITTEN, Disk, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
+from faults.store import NOT_WRITTEN, Disk, has_server, snapshot_faults
 
+from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process
 from gdp.host.run_registry import RunRegistry
 from lab.topology import make_topology
 from tests.pages import ROOT
+from tests.script_packages import PYTHON_PATH
 from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.nightly]
@@ -48,6 +51,27 @@ def test_a_killed_run_is_taken_down_by_the_next() -> None:
     until(lambda: not any(each.alive for each in record.processes), "their end: they die with their parent")
     assert run in RunRegistry().sweep()
     assert not any(Path(path).exists() for path in [*record.namespaces, *record.files])
+
+
+@pytest.mark.skipif(not has_server(), reason="neither redis-server nor valkey-server is installed")
+def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep() -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((PYTHON_PATH, str(ROOT / "scripts" / "bench")))}
+    argv = [sys.executable, "-m", "netns_tests.store_child"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env=environment) as child:
+        assert child.stdout is not None
+        run = child.stdout.readline().strip()
+        child.send_signal(signal.SIGKILL)
+    (record,) = (record for record in RunRegistry().all() if record.run == run)
+    spaces, folder = [Path(path) for path in record.namespaces], Path(record.files[0])
+    servers = processes_inside(spaces)
+    assert len(servers) == 6
+    assert (folder / "disk").is_mount()
+    record.processes.clear()  # as if killed before it recorded the servers
+    (Path("/run/gdp") / f"{run}.json").write_text(record.to_text())
+    assert run in RunRegistry().sweep()
+    assert not any(server.alive for server in servers)
+    assert not any(path.exists() for path in [*spaces, folder])
 
 
 def has_written(disk: Disk, node: str) -> bool:

@@ -68,7 +68,7 @@ fi
 if [[ $lane == nightly && $(id -u) -eq 0 ]]; then
     printf 'fuzzing: ten minutes of all decoders\n'
     .venv/bin/python scripts/fuzz.py --guided --total 600 || status=1
-    printf 'chaos: ten minutes of faults of every kind\n'
+    printf 'chaos: ten minutes of faults of every kind, two RIBs on a shared store\n'
     # At the usual keepalives, twelve switches alone keep two slow cores busy; what is silent then says nothing of faults.
     .venv/bin/python scripts/bench/chaos.py --seed 9 --seconds 600 --switches 12 --rate 0.25 --keepalive-ms 200 --limit-s 8 ||
         status=1

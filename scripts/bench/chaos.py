@@ -10,17 +10,20 @@ policy leave connected (``faults/plan.py``) must continue. Promises:
     reliable flows          are complete from the first message that came, or the reader got a report of each loss
     requests                each has one answer, or one error
     snapshots               a RIB logs once that its disk is full, and when it writes again; it still starts
+    the cluster             no server logs that it lost data
 
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20
     sudo .venv/bin/python scripts/bench/chaos.py --hours 3                   # seed after seed
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --only cut --only roam
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --cluster          # RIBs share a Valkey or Redis Cluster
 
 A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
 """
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import sys
 import time
@@ -31,11 +34,11 @@ from pathlib import Path
 from typing import Final
 
 from faults.accounts import Books, Continuity, Silence
-from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
-from faults.plan import VICTIM, Oracle, random_network
-from faults.schedule import Fault, FaultKind, broken_by, make_schedule
+from faults.plan import VICTIM, Oracle, Plan, random_network
+from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
+from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
 
@@ -55,6 +58,7 @@ REPORTED_S: Final = 0.25  # shorter silences are not reported
 SPARSE: Final = 1.5  # nor those of a flow that are shorter than so many of its periods
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
+_CLUSTER_EVERY: Final = 3  # one in so many seeds gets a cluster
 _PRESSURE: Final = Path("/proc/pressure/cpu")
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
@@ -132,6 +136,8 @@ class Chaos:
         )
         if failed := self.books.failed_since(well_ns):
             found.append(f"after the last fault: {failed} calls failed")
+        if self._overlay.store is not None:
+            found += self._overlay.store.complaints()
         return [*found, *self._after_revocation(), *self._of_snapshots()]
 
     def noticed(self) -> int:
@@ -204,6 +210,16 @@ class Chaos:
                 overlay.kill(rib)
                 overlay.start(rib)
                 self._await(rib)
+        elif overlay.store is not None and targets[0] == STORE:
+            self._begin_in_store(overlay.store, fault)
+
+    def _begin_in_store(self, store: StoreCluster, fault: Fault) -> None:
+        choice = round(fault.amount)
+        if fault.kind is FaultKind.FREEZE_PRIMARY:
+            progress(f"           {store.freeze(str(fault), choice=choice)}")
+        else:
+            is_primary = fault.kind is FaultKind.KILL_PRIMARY
+            progress(f"           {store.kill(str(fault), is_primary=is_primary, choice=choice)}")
 
     def _end(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
@@ -223,6 +239,10 @@ class Chaos:
             overlay.step_clock(targets[0], 0.0)
         elif kind is FaultKind.DISK_FULL and overlay.disk is not None:
             overlay.disk.free()
+        elif kind is FaultKind.FREEZE_PRIMARY and overlay.store is not None:
+            overlay.store.thaw(str(fault))
+        elif overlay.store is not None and targets[0] == STORE:
+            overlay.store.restart(str(fault))
 
     def _await(self, who: str) -> None:
         """Continue to read records while a restarted process comes up; it joins the network when it reports ready."""
@@ -249,8 +269,9 @@ class Chaos:
         for node in self._plan.ribs:
             who = f"rib {node}"
             for incarnation_id, log in self._overlay.logs(who):
-                is_alive = incarnation_id == self._overlay.incarnation_id(who) and self._overlay.is_running(who)
-                found += snapshot_faults(f"{who} (life {incarnation_id})", log, is_alive=is_alive)
+                if self._overlay.keeps_snapshot(node):
+                    is_alive = incarnation_id == self._overlay.incarnation_id(who) and self._overlay.is_running(who)
+                    found += snapshot_faults(f"{who} (life {incarnation_id})", log, is_alive=is_alive)
         if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
         return found
@@ -270,12 +291,13 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     """
     plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
     kinds = [SHORT[name] for name in options.only or SHORT]
-    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds)
+    in_store = _in_store(plan, seed, is_wanted=options.cluster)
+    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
     more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
     begun_s = time.monotonic()
     with (
         new_run(runs) as run,
-        Overlay(run, plan, has_clocks=True, has_disk=True, more=more) as overlay,
+        Overlay(run, plan, has_clocks=True, has_disk=True, in_store=in_store, more=more) as overlay,
     ):
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
@@ -305,6 +327,19 @@ def _waited_s() -> float:
         some = _PRESSURE.read_text(encoding="ascii").splitlines()[0]
         return int(some.rpartition("total=")[2]) / 1e6
     return 0.0
+
+
+def _in_store(plan: Plan, seed: int, *, is_wanted: bool | None) -> list[str]:
+    """Return the switches whose RIBs share a cluster: those of the top domain, or none.
+
+    ``is_wanted``: None: for every third seed, where a server is installed. Raises ``FailedError``: it is wanted, and no
+    server is installed.
+    """
+    if is_wanted and not has_server():
+        raise FailedError("neither valkey-server nor redis-server is installed")
+    if not (has_server() and seed % _CLUSTER_EVERY == 0 if is_wanted is None else is_wanted):
+        return []
+    return [node for node in plan.ribs if plan.topology.domain_of(node).upper is None]
 
 
 def _show(seed: int, chaos: Chaos) -> None:
@@ -356,6 +391,11 @@ def main() -> None:
         "--limit-s", type=float, default=LIMIT_S, help="longest silence meanwhile (default: %(default)s)"
     )
     parser.add_argument("--only", action="append", choices=list(SHORT), help="this kind of fault; may be repeated")
+    parser.add_argument(
+        "--cluster",
+        action=argparse.BooleanOptionalAction,
+        help="RIBs of the top domain share a Valkey or Redis Cluster (default: for every third seed, if installed)",
+    )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument(
         "--keepalive-ms",

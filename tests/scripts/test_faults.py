@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from faults.accounts import Books, Timeline
-from faults.disk import snapshot_faults
 from faults.plan import VICTIM, Broken, Flow, Oracle, Plan, Service, random_network
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
+from faults.store import critical_lines, snapshot_faults
 
 from gdp.message.loss import LossReason
 from lab.topology import make_topology
@@ -77,6 +77,19 @@ def test_a_schedule_can_be_limited_to_some_kinds() -> None:
     assert {fault.kind for fault in faults} == {FaultKind.ROAM, FaultKind.CUT}
 
 
+_OF_STORE = {FaultKind.KILL_PRIMARY, FaultKind.KILL_REPLICA, FaultKind.FREEZE_PRIMARY}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_servers_of_a_store_fail_one_at_a_time_and_long_enough_to_be_replaced(seed: int) -> None:
+    plan = random_network(seed)
+    assert not _OF_STORE & {fault.kind for fault in make_schedule(plan, seed, 300)}
+    faults = [each for each in make_schedule(plan, seed, 300, has_store=True) if each.kind in _OF_STORE]
+    assert {fault.kind for fault in faults} == _OF_STORE
+    assert all(fault.end_s - fault.start_s >= 3.0 for fault in faults)
+    assert all(one.end_s <= other.start_s for one, other in pairwise(faults))
+
+
 def test_a_disk_is_full_once_at_a_time_and_a_rib_may_restart_meanwhile() -> None:
     faults = make_schedule(random_network(1), 1, 200, kinds=[FaultKind.DISK_FULL])
     assert {len(fault.targets) for fault in faults} == {1, 2}
@@ -101,6 +114,14 @@ _FULL, _AGAIN = "snapshot not written path=a reason=full\n", "snapshot written a
 )
 def test_a_rib_says_once_that_its_snapshot_is_not_written_and_when_it_is_again(log: str, faults: int) -> None:
     assert len(list(snapshot_faults("rib s1", log, is_alive=True))) == faults
+
+
+def test_a_server_of_the_cluster_that_lost_data_is_reported_once(tmp_path: Path) -> None:
+    for number, lines in (("1", ["* Ready to accept connections"]), ("2", ["# == CRITICAL == -NOPERM a", "* b"] * 3)):
+        (tmp_path / number).mkdir()
+        (tmp_path / number / "server.log").write_text("\n".join(lines))
+    (complaint,) = critical_lines(tmp_path)
+    assert complaint == "server 2 of the store, 3 times: -NOPERM a"
 
 
 @pytest.mark.parametrize(

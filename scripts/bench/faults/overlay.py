@@ -20,10 +20,10 @@ from typing import Final
 from testbed import Lab, received, set_link
 
 from faults.clock import Clock
-from faults.disk import Disk
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
+from faults.store import Disk, StoreCluster
 from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
@@ -45,6 +45,7 @@ class Overlay:
         has_clocks: processes may have their wall clock stepped.
         more: further keys of the file of every switch and RIB, by role.
         has_disk: RIBs keep snapshots on a small disk.
+        in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
 
     Raises:
         LocalError: the kernel refuses.
@@ -59,6 +60,7 @@ class Overlay:
         has_clocks: bool = False,
         more: Mapping[str, Mapping[str, object]] | None = None,
         has_disk: bool = False,
+        in_store: Sequence[str] = (),
     ) -> None:
         self.plan = plan
         self.directory = run.directory
@@ -78,6 +80,8 @@ class Overlay:
             self._clocks = {who: Clock(run.directory / "clocks" / who.replace(" ", "-")) for who in self.everybody()}
         self._links = LinkFaults()
         self.disk = Disk(run) if has_disk else None
+        self.store = StoreCluster(run, self.spaces, in_store) if in_store else None
+        self._in_store = frozenset(in_store)
         for member in plan.members:
             self._admit(member)
 
@@ -86,6 +90,8 @@ class Overlay:
 
     def __exit__(self, *_: object) -> None:
         self._links.close()
+        if self.store is not None:
+            self.store.close()
         for who in list(self._frozen):
             self.thaw(who)
         end_processes(list(self._processes.values()))  # all at once
@@ -202,6 +208,10 @@ class Overlay:
         texts = [text for _, text in self.logs(who)]
         return "\n".join(texts[-1].splitlines()[-lines:]) if texts else ""
 
+    def keeps_snapshot(self, node: str) -> bool:
+        """Return whether the RIB at a switch keeps a snapshot on the disk."""
+        return self.disk is not None and node not in self._in_store
+
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
         for incarnation_id in range(1, self._incarnation_ids.get(who, 0) + 1):
@@ -274,9 +284,12 @@ class Overlay:
         at = next(at for at in self.plan.topology.attached("rib") if at.switch == node)
         domain = self.plan.topology.domain_of(node)
         further: dict[str, object] = {"upper": self._rib_names(domain.upper)}
-        further["peers"] = self._rib_names(domain.label, but=node)
-        if self.disk is not None:
-            further["snapshot"] = str(self.disk.snapshot(node))
+        if self.store is not None and node in self._in_store:
+            further |= self.store.config
+        else:
+            further["peers"] = self._rib_names(domain.label, but=node)
+            if self.disk is not None:
+                further["snapshot"] = str(self.disk.snapshot(node))
         return self._credentials.rib(at, **{**further, **self._more.get("rib", {})})
 
     def _rib_names(self, label: str | None, but: str = "") -> list[str]:

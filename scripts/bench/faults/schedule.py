@@ -33,6 +33,9 @@ class FaultKind(Enum):
     PARTITION = "partition"
     ROAM = "member moved"
     DISK_FULL = "disk full"
+    KILL_PRIMARY = "primary killed"
+    KILL_REPLICA = "replica killed"
+    FREEZE_PRIMARY = "primary frozen"
 
 
 STRUCTURAL: Final = frozenset({FaultKind.CUT, FaultKind.SILENT, FaultKind.KILL_SWITCH})
@@ -40,8 +43,13 @@ _WEIGHTS: Final = {
     FaultKind.CUT: 4, FaultKind.SILENT: 3, FaultKind.LOSS: 3, FaultKind.DOUBLED: 2, FaultKind.REORDERED: 2,
     FaultKind.KILL_SWITCH: 3, FaultKind.KILL_RIB: 3, FaultKind.KILL_MEMBER: 2, FaultKind.FREEZE: 3,
     FaultKind.CLOCK: 2, FaultKind.PARTITION: 1, FaultKind.ROAM: 4, FaultKind.DISK_FULL: 2,
+    FaultKind.KILL_PRIMARY: 2, FaultKind.KILL_REPLICA: 1, FaultKind.FREEZE_PRIMARY: 2,
 }  # fmt: skip
 DISK: Final = "the disk"
+STORE: Final = "the store"
+_OF_STORE: Final = frozenset({FaultKind.KILL_PRIMARY, FaultKind.KILL_REPLICA, FaultKind.FREEZE_PRIMARY})
+_STORE_LEAST_S: Final = 3.0  # a replica takes over within two seconds: a shorter fault would end in the middle of that
+_SERVERS: Final = 3  # number of servers of a role
 _AT_ONCE: Final = 3
 _CLOCK_STEP_S: Final = 300.0
 _FIRST_S: Final = 1.0
@@ -53,7 +61,7 @@ class Fault:
     """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and its new switch.
 
     ``start_s``, ``end_s``: from the start of the run; a fault without an end of its own ends at its start. ``amount``:
-    seconds of a clock step.
+    seconds of a clock step; the index of the server of the store, among those of the role.
     """
 
     kind: FaultKind
@@ -95,13 +103,15 @@ def make_schedule(
     *,
     pace_s: float = 2.0,
     kinds: Sequence[FaultKind] | None = None,
+    has_store: bool = False,
 ) -> list[Fault]:
     """Return the faults of a run, in the order of their starts.
 
     ``duration_s``: when the last fault has ended. ``pace_s``: mean time between two starts. ``kinds``: what may happen;
-    None: everything.
+    None: everything. ``has_store``: RIBs share a store of several servers, which may fail.
     """
-    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, set(kinds or FaultKind)))
+    drawn = set(kinds or FaultKind) - (frozenset() if has_store else _OF_STORE)
+    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, drawn))
 
 
 def _draw(
@@ -161,6 +171,10 @@ def _one(
     if kind is FaultKind.DISK_FULL:
         killed = [f"rib {node}" for node in chance.sample(plan.ribs, chance.randrange(2))]
         return Fault(kind, (DISK, *killed), now_s, end_s)
+    if kind in _OF_STORE:
+        end_s = now_s + chance.uniform(_STORE_LEAST_S, 8.0)
+        number = chance.randrange(_SERVERS)
+        return Fault(kind, (STORE,), now_s, end_s, number) if end_s <= duration_s else None
     mover = chance.choice(sorted(plan.homes))
     there = chance.choice([home for home in plan.homes[mover] if home != at[mover]])
     return Fault(FaultKind.ROAM, (mover, there), now_s, now_s)
