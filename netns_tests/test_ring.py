@@ -17,7 +17,9 @@ import pytest
 from scapy.utils import RawPcapReader
 
 from gdp.client.capture_opener import Outcome
+from gdp.errors import LocalError
 from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import RunRegistry
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.recordings.reader import BagReader
@@ -280,6 +282,39 @@ def test_what_a_killed_run_left_is_gone_with_the_next(longer: Path, demo: Path, 
 
 
 @pytest.mark.momentary(FAST)
+def test_machines_have_their_cores_by_control_groups_which_the_next_run_removes(
+    longer: Path, demo: Path, tmp_path: Path
+) -> None:
+    probe = Cgroup(f"gdp-test-{os.getpid()}")
+    try:
+        probe.make()
+        probe.share_cpu(1)
+    except LocalError as error:
+        pytest.skip(f"no control groups with weights here: {error}")
+    finally:
+        probe.remove()
+    process, run = started(longer, "--cores")
+    members = [path.read_text().split() for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/cgroup.procs")]
+    with process:
+        process.kill()
+    assert members
+    assert all(members)
+    weights = {
+        path.parent.name.removeprefix(f"gdp-{run}-"): int(path.read_text())
+        for pattern in ("cpu.weight", "cpu.shares")
+        for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/{pattern}")
+    }
+    assert weights.keys() == {f"nuc{number}" for number in range(1, 6)}
+    assert {node: weight / weights["nuc1"] for node, weight in weights.items() if node != "nuc1"} == dict.fromkeys(
+        ("nuc2", "nuc3", "nuc4", "nuc5"), 2.0
+    )
+    result = crossed(tmp_path, demo, "--rate", 0, "--cores")
+    settings = result["settings"]
+    assert isinstance(settings, dict)
+    assert settings["cores"] == {"nuc1": 2, "nuc2": 4, "nuc3": 4, "nuc4": 4, "nuc5": 4}
+    assert list(Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*")) == []
+
+
 def test_a_kept_ring_stands_until_it_is_taken_down(demo: Path) -> None:
     ended = ring(demo, "--rate", 0, "--keep")
     assert ended.returncode == 0, ended.stderr

@@ -2,8 +2,8 @@
 
 I/O; needs writable cgroups, which containers and plain users often lack. It supports both versions, also at the same
 time: a bound is set in the version that has its file.
-Source: cgroups(7); Linux, Documentation/admin-guide/cgroup-v2.rst (cpu.max, memory.max, cgroup.freeze,
-cgroup.kill) and cgroup-v1/ (cpu.cfs_quota_us, memory.limit_in_bytes).
+Source: cgroups(7); Linux, Documentation/admin-guide/cgroup-v2.rst (cpu.max, cpu.weight, memory.max, cgroup.freeze,
+cgroup.kill) and cgroup-v1/ (cpu.cfs_quota_us, cpu.shares, memory.limit_in_bytes).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
 _PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow machine runs evenly
 _LEAST_US: Final = 1_000  # the kernel accepts no quota below this
 _LONGEST_PERIOD_US: Final = 1_000_000
+_WEIGHT, _SHARES = 100, 1_024  # of one core: the defaults of a group
 _PATIENCE_S: Final = 3.0
 _LOOK_S: Final = 0.005
 _GONE: Final = (errno.ENOENT, errno.ENODEV)
@@ -80,6 +81,13 @@ class Cgroup:
         else:
             self._write(path.with_name("cpu.cfs_period_us"), str(period_us))
             self._write(path, str(-1 if quota_us is None else quota_us))
+
+    def share_cpu(self, cores: int) -> None:
+        """Weight the group by ``cores``: where groups compete for processors, they get time in this proportion."""
+        path = self._find(("cpu.weight", "cpu.shares"))
+        if path is None:
+            raise LocalError(f"the group {self.name} has no weight of processor time here")
+        self._write(path, str(cores * (_WEIGHT if path.name == "cpu.weight" else _SHARES)))
 
     def limit_memory(self, size_bytes: int | None) -> None:
         """Limit the group's memory; the kernel kills processes in it that exceed the limit; None: no limit."""

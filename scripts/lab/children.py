@@ -12,7 +12,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import AsyncGenerator, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
@@ -117,9 +117,11 @@ class Children:
     Args:
         run: records each of them, so that the clean-up of the run ends it.
         kept: they outlive this process; otherwise the kernel kills them when it ends for any reason.
+        started: called with machine and process id of each process that runs in a namespace.
     """
 
-    def __init__(self, run: Run, *, kept: bool) -> None:
+    def __init__(self, run: Run, *, kept: bool, started: Callable[[str, int], None] | None = None) -> None:
+        self._started = started
         self._run = run
         self._kept = kept
         self._all: list[Child] = []
@@ -151,7 +153,10 @@ class Children:
     ) -> Child:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         argv = namespaces[node].command([sys.executable, *arguments], dies_with_us=not self._kept)
-        return self.start(f"{role} {node}", argv, heard=heard, environment=environment)
+        child = self.start(f"{role} {node}", argv, heard=heard, environment=environment)
+        if self._started is not None:
+            self._started(node, child.pid)
+        return child
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
         """Wait until each has reported ``ready``, and return these events; from then on they are required."""

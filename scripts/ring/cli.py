@@ -27,6 +27,7 @@ from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
+from ring.cores import CORES_HELP
 from ring.faults import Cut, Kill, Roam
 from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
@@ -102,6 +103,7 @@ Examples:
   scripts/ring_topology.sh --kill rib:school@5       a RIB dies
   scripts/ring_topology.sh --live --seconds 70 --cut nuc1-nuc2@5 --kill switch:nuc3@20-30 --roam server:nuc4@40
   scripts/ring_topology.sh --data-plane scapy        every frame built by Scapy
+  scripts/ring_topology.sh --cores                   a robot of two cores, edge servers of four
   scripts/ring_topology.sh --keep                    leave it up to look around
   scripts/ring_topology.sh --down                    and take it down
 """
@@ -143,6 +145,7 @@ def ring(
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
     ] = ADVERTISEMENT_LEASE_S,
+    cores: Annotated[bool, typer.Option("--cores", help=CORES_HELP)] = False,
     wide: Annotated[bool, typer.Option("--wide", help="All columns of the table, 200 characters.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
@@ -176,6 +179,7 @@ def ring(
             kills=tuple(Kill.from_text(text) for text in kill or ()),
             lease_s=lease,
             keep=keep,
+            cores=cores,
             wide=wide,
             live=None if live is None else _one_of("live", live, LIVES),
             seconds=seconds,

@@ -30,6 +30,7 @@ class Options:
         bag: the recording; None: a generated robot drive.
         rate: 1 is the recorded pace, 0 as fast as possible.
         out: directory, created if necessary, for the received recording; None: it is deleted with the run.
+        cores: bound and weight the processor time of each machine.
         wide: print all columns of the table.
         live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
         seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
@@ -53,6 +54,7 @@ class Options:
     roams: tuple[Roam, ...] = ()
     kills: tuple[Kill, ...] = ()
     keep: bool = False
+    cores: bool = False
     wide: bool = False
     live: Live | None = None
     seconds: float | None = None
@@ -107,6 +109,7 @@ class Options:
             "encoding": self.encoding,
             "data_plane": self.data_plane,
             "mtu": self.mtu,
+            "cores": self.cores,
             "lease_s": self.lease_s,
             "cuts": [str(cut) for cut in self.cuts],
             "roams": [str(roam) for roam in self.roams],

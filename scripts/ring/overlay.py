@@ -12,10 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.children import READY_S, Child, Children, cancel
 from lab.credentials import OverlayCredentials
 from lab.namespaces import Namespaces
+from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from ring.faults import Cut, Fault, Kill, Roam, roamers
 from ring.options import Options
 from ring.progress import ProgressReporter
@@ -48,7 +50,8 @@ class Overlay:
             lease_s=options.lease_s,
             uplink={"data_plane": "scapy"} if options.data_plane == "scapy" else None,
         )
-        self.children = Children(run, kept=options.keep)
+        self._cores = self._make_cores(run) if options.cores else None
+        self.children = Children(run, kept=options.keep, started=None if self._cores is None else self._cores.add)
         self.start = partial(self.children.start_in, self.namespaces)
         self.switches: dict[str, Child] = {}
         self._ribs: dict[str, Child] = {}
@@ -57,8 +60,9 @@ class Overlay:
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return the options for the JSON result, with the selected data plane."""
-        return {**self.options.settings(), "data_plane": ", ".join(self._planes)}
+        """Return the options for the JSON result, with the selected data plane and the cores of each machine."""
+        cores = None if self._cores is None else self._cores.cores
+        return {**self.options.settings(), "data_plane": ", ".join(self._planes), "cores": cores}
 
     async def stand_up(self) -> None:
         """Start switches and RIBs; return when all are ready."""
@@ -107,6 +111,16 @@ class Overlay:
         home = roam.proxy(self.topology).switch
         await asyncio.to_thread(self.namespaces.unplug, home, roam.who)
         await asyncio.to_thread(self.namespaces.connect_device, home, roam.who, roam.to)
+
+    def _make_cores(self, run: Run) -> MachineCores | None:
+        try:
+            made = MachineCores(run, cores_of(self.topology))
+        except LocalError as error:
+            self.reporter.step(f"--cores has no effect: no control groups can be made here ({error})")
+            return None
+        text = f"the robot {ROBOT_CORES}, each edge server {EDGE_CORES}"
+        self.reporter.step(f"cores by control groups: {text}")
+        return made
 
     def _start_switch(self, node: str, config: Path, prefix: str = "") -> Child:
         return self.start(node, f"{prefix}switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"])

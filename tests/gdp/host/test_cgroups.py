@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import RunRegistry
 
 _PATIENCE_S = 10.0
+_BUSY_NS = 1_000_000_000
 
 
 @pytest.fixture
@@ -57,6 +60,33 @@ def test_a_bound_on_memory_holds(group: Cgroup) -> None:
     group.limit_memory(None)
 
 
+def test_groups_that_compete_get_time_by_their_cores(group: Cgroup) -> None:
+    """Two busy processes on one processor, of which one group has three cores' worth and the other one."""
+    other = Cgroup(f"{group.name}-other")
+    processor = str(min(os.sched_getaffinity(0)))
+    busy = [sys.executable, "-c", "while True: pass"]
+    try:
+        assert other.make()
+        group.share_cpu(3)
+        other.share_cpu(1)
+        with ExitStack() as stack:
+            spent = []
+            for each in (group, other):
+                process = stack.enter_context(subprocess.Popen(["taskset", "-c", processor, *busy]))
+                stack.callback(process.kill)
+                each.add(process.pid)
+                spent.append(Path(f"/proc/{process.pid}/schedstat"))
+            begun = [int(path.read_text().split()[0]) for path in spent]
+            end_s = time.monotonic() + _PATIENCE_S
+            used = [0, 0]
+            while sum(used) < _BUSY_NS and time.monotonic() < end_s:
+                time.sleep(0.02)
+                used = [int(path.read_text().split()[0]) - at for path, at in zip(spent, begun, strict=True)]
+        assert used[0] > 1.7 * used[1]
+    finally:
+        other.remove()
+
+
 def test_bounds_are_set_and_taken_off(group: Cgroup) -> None:
     small = (0.025, {"1000 40000", "1000"})  # a longer period, because the kernel takes no quota below 1 ms
     for cpus, reported in ((0.5, {"10000 20000", "10000"}), small, (None, {"max 20000", "-1"})):
@@ -70,6 +100,8 @@ def test_bounds_are_set_and_taken_off(group: Cgroup) -> None:
 def test_a_bound_that_cannot_be_set_is_refused() -> None:
     with pytest.raises(LocalError, match="no bound on processor time"):
         Cgroup("gdp-never-made").limit_cpu(1.0)
+    with pytest.raises(LocalError):
+        Cgroup("gdp-never-made").share_cpu(1)
 
 
 def test_what_was_never_made_is_removed_without_complaint() -> None:

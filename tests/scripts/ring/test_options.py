@@ -50,6 +50,7 @@ def test_settings_are_what_json_can_write() -> None:
         "seconds": None,
         "encoding": "json",
         "data_plane": "auto",
+        "cores": False,
         "mtu": 1_500,
         "lease_s": 24.0,
         "cuts": ["nuc2-nuc3@5"],
