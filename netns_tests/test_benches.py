@@ -41,4 +41,5 @@ def test_a_bench_runs_to_its_table_from_a_clone_alone(
         options.append("--no-save")  # else a busy machine is refused
     ran = in_clone(f"scripts/bench/{name}", *options, patience_s=_PATIENCE_S)
     assert ran.returncode == 0, ran.stderr
+    assert "not here" not in ran.stdout, ran.stdout
     assert "FAILED" not in ran.stderr, ran.stderr

@@ -10,6 +10,7 @@ import``.
         for baseline in baselines:
             progress(f"round {number + 1}/{rounds}: {baseline}")
             over.add(baseline, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
+    over.absent("kernel", "no CAP_BPF")                              # is shown as "not here: no CAP_BPF"
     over.spread("kernel", "1400 B, 3 switches", "frames/s")          # Spread(median, low, high) | None
     target = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
     show(title, state, settings, over, [target, ...])                  # tables, ratio lines
@@ -65,13 +66,15 @@ class Target:
         what: the figure in words, with its unit unless it is a ratio.
         target: the bound; None where there is none.
         at_most: the bound is an upper one.
-        measured: over rounds; None when no round measured it.
+        measured: over rounds; None when a side of it could not be measured.
+        why_not: then, the reason.
     """
 
     what: str
     target: float | None
     at_most: bool
     measured: Spread | None
+    why_not: str = ""
 
     @property
     def met(self) -> bool | None:
@@ -81,7 +84,7 @@ class Target:
         return self.measured.median <= self.target if self.at_most else self.measured.median >= self.target
 
     def __str__(self) -> str:
-        measured = f"measured {self.measured}" if self.measured else "not measured"
+        measured = f"measured {self.measured}" if self.measured else f"not measured: {self.why_not}"
         if self.target is None:
             return f"{self.what}: {measured}"
         target = f"target {'≤' if self.at_most else '≥'} {number_text(self.target)}"
@@ -95,10 +98,15 @@ class Rounds:
     """Figures of a bench: baseline, case, column (figure and unit), one value a round."""
 
     values: dict[str, dict[str, dict[str, list[float | None]]]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
 
     def add(self, contender: str, case: str, column: str, value: float | None) -> None:
         """Add the value of the next round; None for one that failed."""
         self.values.setdefault(contender, {}).setdefault(case, {}).setdefault(column, []).append(value)
+
+    def absent(self, contender: str, reason: str) -> None:
+        """Record why a baseline does not take part."""
+        self.reasons[contender] = reason
 
     def column(self, contender: str, case: str, column: str) -> list[float | None]:
         """Return one value a round."""
@@ -121,19 +129,19 @@ class Rounds:
         self, what: str, contender: str, case: str, column: str, asked: float | None, *, at_most: bool = False
     ) -> Target:
         """Return a bound on one baseline's figure."""
-        return _target(what, asked, at_most, self.column(contender, case, column))
+        return _target(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
 
     def ratio(
         self, what: str, one: str, other: str, case: str, column: str, asked: float | None, *, at_most: bool = False
     ) -> Target:
         """Return a bound on ``one / other``, round by round."""
         values = self._pairwise(one, other, case, column, lambda a, b: a / b if b else None)
-        return _target(what, asked, at_most, values)
+        return _target(what, asked, at_most, values, self._why_not(one, case) or self._why_not(other, case))
 
     def difference(self, what: str, one: str, other: str, case: str, column: str, asked: float | None) -> Target:
         """Return an upper bound on ``one - other``, round by round."""
         values = self._pairwise(one, other, case, column, lambda a, b: a - b)
-        return _target(what, asked, True, values)
+        return _target(what, asked, True, values, self._why_not(one, case) or self._why_not(other, case))
 
     def _pairwise(
         self, one: str, other: str, case: str, column: str, of: Callable[[float, float], float | None]
@@ -141,10 +149,17 @@ class Rounds:
         pairs = zip(self.column(one, case, column), self.column(other, case, column), strict=False)
         return [None if a is None or b is None else of(a, b) for a, b in pairs]
 
+    def _why_not(self, contender: str, case: str) -> str:
+        if contender in self.reasons:
+            return f"{contender} is not here: {self.reasons[contender]}"
+        return "" if case in self.values.get(contender, {}) else f"{contender} was not asked for"
 
-def _target(what: str, asked: float | None, at_most: bool, values: Iterable[float | None]) -> Target:
+
+def _target(what: str, asked: float | None, at_most: bool, values: Iterable[float | None], why_not: str) -> Target:
     known = [value for value in values if value is not None]
-    return Target(what, asked, at_most, Spread.of(known) if known else None)
+    if known:
+        return Target(what, asked, at_most, Spread.of(known))
+    return Target(what, asked, at_most, None, why_not or "no round measured it")
 
 
 def percentile(values: Iterable[float], share: float) -> float:
@@ -213,6 +228,8 @@ def show(title: str, state: MachineState, settings: Settings, over: Rounds, targ
                 spreads = (over.spread(contender, case, column) for column in columns)
                 table.add_row(contender + state.mark, *("-" if spread is None else str(spread) for spread in spreads))
         console.print(table)
+    for contender, reason in over.reasons.items():
+        console.print(f"{contender} - not here: {reason}", markup=False, highlight=False, soft_wrap=True)
     for target in targets:
         console.print(str(target), markup=False, highlight=False, soft_wrap=True)
 
@@ -244,6 +261,7 @@ def write_json(
         "settings": dict(settings),
         "rounds": {**held["rounds"], **over.values},
         "measured": {**held.get("measured", {}), **dict.fromkeys(over.values, stamp)},
+        "not_here": over.reasons,
         "targets": [
             *(target for target in held["targets"] if target["what"] not in new),
             *({**asdict(target), "met": target.met} for target in targets),

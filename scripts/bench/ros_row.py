@@ -23,7 +23,7 @@ then dominate the time. ROS 2's guide to tuning recommends the same.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -78,6 +78,7 @@ class Row:
         mtu: of every device, the cable included; that of the ring is its own.
         bridged: whether the direct path leads through three bridges instead of one cable.
         ring: the overlay in place of the row: A and B are its first and its last switch.
+        cores: of each machine of the ring; None: the machines share all cores.
         shared_memory: whether the processes of one machine share memory; else they use UDP there too.
 
     Raises:
@@ -93,6 +94,7 @@ class Row:
         mtu: int,
         bridged: bool = False,
         ring: Topology | None = None,
+        cores: Mapping[str, int] | None = None,
         shared_memory: bool = True,
     ) -> None:
         overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
@@ -104,7 +106,7 @@ class Row:
         domains = (*overlay.domains, *([DomainPlan("direct", bridges)] if bridges else []))
         topology = Topology((*overlay.links, *cables), domains, overlay.attachments)
         ends = tuple(self._machines.values())
-        self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else ())
+        self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else (), cores=cores)
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):

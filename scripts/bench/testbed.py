@@ -25,6 +25,7 @@ from lab.credentials import Carried, OverlayCredentials, Side
 from lab.namespaces import Namespaces
 from lab.process import FailedError, LabProcess
 from lab.topology import Attachment, Topology
+from ring.cores import MachineCores
 
 _SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
 _ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
@@ -51,8 +52,8 @@ T = TypeVar("T")
 class Lab:
     """Machines of a topology, each in a namespace.
 
-    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. Raises
-    ``LocalError``: the kernel refuses.
+    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. ``cores``: bound
+    of processor time by machine; None: the machines share all cores. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(
@@ -61,12 +62,14 @@ class Lab:
         topology: Topology,
         *,
         own_shared_memory: Sequence[str] = (),
+        cores: Mapping[str, int] | None = None,
     ) -> None:
         self.run = run
         self.directory = run.directory
         self.topology = topology
         self.namespaces = Namespaces(topology, run)
         self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
+        self._cores = MachineCores(run, dict(cores)) if cores else None
 
     def has_shared_memory(self, node: str) -> bool:
         """Return whether a machine has a ``/dev/shm`` of its own."""
@@ -94,7 +97,10 @@ class Lab:
         """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
         argv = self.command(node, [sys.executable, *arguments], environment)
         paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))}
-        return LabProcess(self.run, f"{what} at {node}", argv, environment=paths, has_orders=has_orders)
+        started = LabProcess(self.run, f"{what} at {node}", argv, environment=paths, has_orders=has_orders)
+        if self._cores is not None:
+            self._cores.add(node, started.pid)
+        return started
 
 
 class OverlayNodes:

@@ -33,6 +33,7 @@ from gdp.host.cgroups import Cgroup
 from lab.process import LabProcess
 from lab.topology import LEFT, RIGHT, ring5
 from proxy.config.config import Encoding
+from ring.cores import CORES_HELP, cores_of
 
 CONTENDERS: Final = {CYCLONE: "cyclone", FAST: "fast", JSON: "fast", CDR: "fast"}  # with the middleware of its ends
 ENCODINGS: Final[Mapping[str, Encoding]] = {JSON: "json", CDR: "cdr"}
@@ -81,7 +82,7 @@ def measure(options: Options) -> Computed:
     for name in names:
         machine = {"machine": asdict(machine_state())}
         tasks[name] = {
-            "network": _network(name, 1 if quick else options.rounds, quick=quick) | machine,
+            "network": _network(name, 1 if quick else options.rounds, quick=quick, is_limited=options.cores) | machine,
             "alone": _alone(name, quick=quick) | machine,
         }
     document = {"slower": SLOWER, "tasks": tasks}
@@ -90,7 +91,7 @@ def measure(options: Options) -> Computed:
     return Computed("offload", title, document, page, lambda: print(page), lambda at, _: save_picture(at, document))
 
 
-def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
+def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:
     """Let every contender carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
@@ -104,7 +105,9 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
     found = {who: Measured() for who in CONTENDERS}
     size = 0
-    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring5(MTU)) as row:
+    ring = ring5(MTU)
+    cores = cores_of(ring) if is_limited else None
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring, cores=cores) as row:
         for at in range(1, rounds + 1):
             for who, middleware in CONTENDERS.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
@@ -114,6 +117,7 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
                 size = _trip(row, found[who], orders, at_once, direct=who not in ENCODINGS)
     return {
         "over": "the ring of three domains",
+        "cores": cores,
         "request_bytes": size,
         "rounds": rounds,
         "answered_at_once": rounds * at_once,
@@ -191,4 +195,5 @@ if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
+    parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)

@@ -162,7 +162,7 @@ def _details(networks: Document) -> list[str]:
     head = ("scenario", "", "there", "back", "computed", "total", "wrong answers")
     trials = "; ".join(
         f"{name}: {each['rounds']} rounds, {each['answered_at_once']} requests answered at once (there, back) and"
-        f" {each['computed']} computed (computed, total), the overlay over {each['over']}"
+        f" {each['computed']} computed (computed, total), the overlay over {each['over']}, {_cores_text(each)}"
         for name, each in networks.items()
     )
     return [markdown_table(head, rows), f"Of each contender: {trials}."]
@@ -181,7 +181,7 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         " a result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core,"
         " as the server has.",
         "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
-        " robot, switches, proxies and server. Links are veth pairs, without the time of a"
+        " robot, switches, proxies and server; `--cores` bounds each. Links are veth pairs, without the time of a"
         " cable, and the switches forward in the kernel.",
         "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
         " `dds`, without the overlay.",
@@ -189,6 +189,12 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
     for name, task in tasks.items():
         notes += [f"{name}, {part}: measured on {MachineState(**each['machine'])}." for part, each in task.items()]
     return notes
+
+
+def _cores_text(network: Document) -> str:
+    if network["cores"] is None:
+        return "machines share all cores"
+    return "cores by control groups: " + ", ".join(f"{node} {count}" for node, count in network["cores"].items())
 
 
 def share_text(cores: float) -> str:
