@@ -6,13 +6,10 @@ Sans-I/O.
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Final
 
 from fog.hardware import Hardware
 
-__all__ = ["HOURS_A_MONTH", "Offer"]
-
-HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
+__all__ = ["Offer"]
 
 
 @dataclass(frozen=True, slots=True)

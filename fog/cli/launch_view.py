@@ -21,7 +21,8 @@ from fog.cluster import CloudNode
 from fog.latency.known import Latency
 from fog.launch.interface_discovery import kept, offered
 from fog.launch.load import Loaded, key_values, load
-from fog.offer import HOURS_A_MONTH, Offer
+from fog.offer import Offer
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway

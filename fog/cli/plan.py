@@ -18,9 +18,10 @@ from fog.catalog.prices import price_list, regions_of
 from fog.cli.options import SiteFile, State
 from fog.cli.views import a_console, latency_lines, ms_text
 from fog.hardware import Hardware
-from fog.offer import HOURS_A_MONTH, Offer
+from fog.offer import Offer
 from fog.plan.answer import Answer, Question, answer
 from fog.plan.choice import BY_BOTH, Weights
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.site import peek_site
 from gdp.cli.console import Columns, folding

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fog.latency.known import NO_ENDPOINT, Latency
-from fog.offer import HOURS_A_MONTH
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.supervisor.core.record import Record, cost_usd, stage
 from fog.supervisor.journal import Cluster, Entry

@@ -12,18 +12,18 @@ import sys
 import time
 
 from recorded import SEGMENTATION
-from vision import Network, Scene
+from vision import Networks, Scene
 
 RUNS = 600
 
 
 def main() -> None:
     """Record the times."""
-    network, seconds = Network(), []
+    networks, seconds = Networks(), []
     for number in range(-1, RUNS):  # the first run also allocates, and is left out
         scene = Scene.draw(abs(number))
         begun_s = time.process_time()
-        mask = network.segment(scene.frame)
+        mask = networks.segment(scene.frame)
         seconds.append(round(time.process_time() - begun_s, 5))
         if not scene.is_covered(mask):
             sys.exit(f"error: frame {number}: the mask does not cover its words; nothing is written")

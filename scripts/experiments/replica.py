@@ -5,7 +5,7 @@ Process of its own, started by ``field.py`` or ``fog`` on a machine: ``replica.p
 ``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``. The request's start names the problem in its ``frame_id``; an
 unknown problem is answered at once, without a path. The stamp of its goal holds the number of the request in seconds.
 The answer's header names the machine, and its stamp is the computing time. Both stop when the service's ``/stop`` is
-called (``std_srvs/srv/Trigger``). ``segment``, ``count`` and ``tag`` serve what ``image_request.py``
+called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``count`` and ``tag`` serve what ``image_request.py``
 describes, one request at a time.
 """
 
@@ -35,7 +35,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-from vision import Grey, Network, count_words
+from vision import Grey, Networks, count_words
 
 _THREADS: Final = 32
 Settings = Mapping[str, object]
@@ -135,9 +135,14 @@ def _look(node: Node, settings: Settings, see: Callable[[Grey], Mapping[str, obj
         node.create_service(SetParameters, name, answer)
 
 
+def _detect(node: Node, settings: Settings) -> None:
+    networks = Networks()
+    _look(node, settings, lambda frame: {"found": networks.detect(frame)})
+
+
 def _segment(node: Node, settings: Settings) -> None:
-    network = Network()
-    _look(node, settings, lambda frame: {"mask": text_of(network.segment(frame))})
+    networks = Networks()
+    _look(node, settings, lambda frame: {"mask": text_of(networks.segment(frame))})
 
 
 def _count(node: Node, settings: Settings) -> None:
@@ -169,6 +174,7 @@ def _tag(node: Node, settings: Settings) -> None:
 _ROLES: Final[Mapping[str, Callable[[Node, Settings], object]]] = {
     "plan": _Ompl,
     "replay": _Replay,
+    "detect": _detect,
     "segment": _segment,
     "count": _count,
     "tag": _tag,

@@ -1,10 +1,10 @@
 """Table I: the cost of one on-demand machine compared with two of them and with two spot machines.
 
-Command: reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``. It has
-the paper's six applications in its two regions.
+Command: reads the price list of this package, prints a table, writes ``docs/experiments/table1.{md,png,json}``.
+First come the paper's six applications in its two regions, then some machine types of one region.
 
-    python scripts/experiments/table1.py                         # under 5 seconds
-    python scripts/experiments/table1.py --json --quick
+    python scripts/experiments/table1.py                         # everything, under 5 seconds
+    python scripts/experiments/table1.py --region us-west-2 --json --quick
 """
 
 from __future__ import annotations
@@ -21,9 +21,13 @@ from skeleton import Options
 from fog.catalog.aws import aws_prices
 from fog.hardware import Hardware
 from fog.offer import Offer
+from fog.plan.cost import Bill, compared
+from gdp.errors import LocalError
 
+TYPES: Final = ("c5.4xlarge", "c6i.4xlarge", "m6i.4xlarge", "r5.16xlarge", "t3.xlarge", "g4dn.xlarge", "p3.2xlarge")
 _WAYS: Final = ("one on-demand", "two on-demand", "two spot")
 _HEAD: Final = ("application", "needs", "", *_WAYS, "two spot / one on-demand", "machines")
+_TYPE_HEAD: Final = (*_WAYS, "a month: one", "two", "two spot", "two spot cost", "taken a month")
 REGIONS: Final = ("us-west-1", "us-west-2")  # the paper's
 # Application -> what a machine must have, and the paper's USD an hour: one on-demand, two on-demand, two spot.
 APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
@@ -38,6 +42,20 @@ APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
 # Ratio -> the prices of a row that it divides: 0: one on-demand, 1: two on-demand, 2: two spot.
 _RATIOS: Final = {"one on-demand / two spot": (0, 2), "two on-demand / two spot": (1, 2)}
 _RATIO_HEAD: Final = ("application", *(f"{ratio}: {whose}" for ratio in _RATIOS for whose in ("paper", "here")))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Three costs of a machine type."""
+
+    type_name: str
+    bills: tuple[Bill, Bill, Bill]
+    taken_a_month: str
+
+    @property
+    def times_cheaper(self) -> float:
+        """Return the cost of one on-demand machine over that of two spot machines; below 1: they cost more."""
+        return 1 / self.bills[2].of_single
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +76,48 @@ class Application:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Compare the cost of one on-demand machine, two on-demand machines and two spot machines."""
-    run_experiment(command_line(__doc__), measure, words)
+    parser = command_line(__doc__)
+    parser.add_argument("--region", default="us-east-1", help="of AWS (default: %(default)s)")
+    run_experiment(parser, measure, words)
 
 
-def measure(_: Options) -> Computed:
+def measure(options: Options) -> Computed:
     """Look up the prices; ``--quick`` takes no less time."""
-    needed = applications()
+    region: str = options.region
+    rows, needed = bills(region), applications()
 
     def print_tables() -> None:
         print_table(_HEAD, _application_rows(needed), words=3)
         print_table(_RATIO_HEAD, _ratio_rows(needed))
+        print_table((f"{region}, USD", *_TYPE_HEAD), map(_cells, rows))
 
-    document = {"sources": aws_prices().sources, "applications": [asdict(each) for each in needed]}
+    document = {
+        "region": region,
+        "sources": aws_prices().sources,
+        "applications": [asdict(each) for each in needed],
+        "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
+    }
     title = "Table I: the price of a replica"
-    return Computed("table1", title, document, page(needed), print_tables, lambda path, _: _draw(path, needed))
+    pictured = page(region, rows, needed)
+    return Computed("table1", title, document, pictured, print_tables, lambda path, _: _draw(path, region, rows))
+
+
+def bills(region: str) -> list[Row]:
+    """Return the rows of the types that have both prices there. Raises ``LocalError``: none has."""
+    prices = aws_prices()
+    offers: dict[tuple[str, bool], Offer] = {
+        (offer.type_name, offer.is_spot): offer for offer in prices.offers if offer.region == region
+    }
+    rows = [
+        Row(name, compared(offers[name, False], offers[name, True]), prices.bands[prices.band[region, name]])
+        for name in TYPES
+        if (name, False) in offers and (name, True) in offers
+    ]
+    if not rows:
+        raise LocalError(
+            f"no prices of {region}: expected one of {', '.join(sorted({o.region for o in prices.offers}))}"
+        )
+    return rows
 
 
 def applications() -> list[Application]:
@@ -123,8 +169,16 @@ def _ratio_rows(needed: Sequence[Application]) -> list[tuple[str, ...]]:
     ]
 
 
-def page(needed: Sequence[Application]) -> str:
+def _cells(row: Row) -> tuple[str, ...]:
+    hours = (f"{bill.usd_per_hour:.4f}" for bill in row.bills)
+    months = (f"{bill.usd_per_month:,.2f}" for bill in row.bills)
+    return (row.type_name, *hours, *months, f"{row.bills[2].of_single:.2f} ×", row.taken_a_month)
+
+
+def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str:
     """Return the page, in Markdown."""
+    best = max(rows, key=lambda row: row.times_cheaper)
+    worst = min(rows, key=lambda row: row.times_cheaper)
     parts = [
         "# Table I: the price of a replica",
         "Made by `python scripts/experiments/table1.py`.",
@@ -141,26 +195,32 @@ def page(needed: Sequence[Application]) -> str:
         "The paper's abstract says that the cost is up to 2.2 times lower. Over two on-demand machines its own prices"
         " reach that, for all applications but MPT Home and MPT Cubicles. Over one on-demand machine none does: MPT"
         " TwistyCool comes nearest, whose two spot machines cost less than those of MPT Home with half the cores.",
+        "## By machine type",
+        "USD an hour, and a month of 730 hours.",
+        markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
         "![prices](table1.png)",
+        f"Two spot machines cost between {best.bills[2].of_single:.2f} ({best.type_name}) and "
+        f"{worst.bills[2].of_single:.2f} ({worst.type_name}) of what one on-demand machine costs: at best "
+        f"{best.times_cheaper:.1f} times less. They cost less as soon as the savings pass 50 %.",
         "Sources: " + "; ".join(aws_prices().sources) + ". Spot = on-demand × (1 − savings); the advisor's savings are "
         "averages in whole percent, and traffic and disks are not in the price.",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _draw(path: Path, needed: Sequence[Application]) -> None:
+def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
     from pictures import plt, save, tidy
 
     figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
-    for at, (label, colour) in enumerate((("paper", "#99a8b2"), ("here", "#1f6f8b"))):
-        prices = [(each.paper, each.usd_per_hour)[at] for each in needed]
-        places = [place + (at - 0.5) * 0.4 for place in range(len(needed))]
-        axis.bar(places, [usd[2] / usd[0] for usd in prices], 0.36, color=colour, label=label)
+    for at, colour in enumerate(("#99a8b2", "#5d6b75", "#1f6f8b")):
+        places = [place + (at - 1) * 0.27 for place in range(len(rows))]
+        axis.bar(places, [row.bills[at].of_single for row in rows], 0.25, color=colour, label=rows[0].bills[at].what)
     axis.axhline(1, color="#222222", lw=0.7)
-    axis.set_xticks(range(len(needed)), [each.name for each in needed], fontsize=8)
-    axis.set_ylabel("two spot / one on-demand")
-    axis.set_ylim(0, 1.3)
-    tidy(axis, ncols=2, loc="upper left")
+    axis.set_xticks(range(len(rows)), [row.type_name for row in rows], fontsize=8)
+    axis.set_ylabel("price, of one on-demand machine")
+    axis.set_title(f"AWS {region}", loc="left", fontsize=10)
+    axis.set_ylim(0, 2.6)
+    tidy(axis, ncols=3, loc="upper left")
     save(figure, path)
 
 

@@ -155,6 +155,7 @@ Task: TypeAlias = "Plan | Number | Look | Tag"
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
     "number": Number,
+    "detect": lambda _: Look(lambda said, scene: scene.agrees(said["found"])),
     "segment": lambda _: Look(_covers),
     "count": lambda _: Look(lambda said, scene: said["words"] == len(scene.words)),
     "tag": Tag,

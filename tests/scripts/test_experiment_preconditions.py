@@ -109,7 +109,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, QUIET)
-    monkeypatch.setattr(table1, "applications", lambda: pytest.fail("measured"))
+    monkeypatch.setattr(table1, "bills", lambda region: pytest.fail("measured"))
     (tmp_path / "file").touch()
     said = ends(lambda: table1.main(["--out", str(tmp_path / "file" / "out")]))
     assert f"{tmp_path}/file/out cannot be written (Not a directory): choose another folder" in said

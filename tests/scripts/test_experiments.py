@@ -60,16 +60,25 @@ def test_a_failed_request_counts_with_the_time_that_it_cost() -> None:
     assert (summary.count, summary.failed, summary.mean_s, summary.worst_s) == (2, 1, 5.0, 9.0)
 
 
-def test_the_network_covers_the_drawn_words_and_finds_nothing_where_nothing_is_drawn() -> None:
+def test_the_networks_read_the_drawn_words_and_cover_them() -> None:
     needs("scipy", "rapidocr_onnxruntime")
-    import numpy as np
-    from vision import SHAPE, Network, Scene
+    from vision import Networks, Scene
 
-    network = Network()
+    networks = Networks()
     for seed in range(3):
         scene = Scene.draw(seed)
-        assert scene.is_covered(network.segment(scene.frame))
-    assert not network.segment(np.full(SHAPE, 70, np.uint8)).any()
+        assert scene.agrees(networks.detect(scene.frame))
+        assert scene.is_covered(networks.segment(scene.frame))
+
+
+def test_the_networks_find_nothing_where_nothing_is_drawn() -> None:
+    needs("scipy", "rapidocr_onnxruntime")
+    import numpy as np
+    from vision import SHAPE, Networks
+
+    networks, ground = Networks(), np.full(SHAPE, 70, np.uint8)
+    assert networks.detect(ground) == []
+    assert not networks.segment(ground).any()
 
 
 def test_words_are_counted_without_a_network() -> None:
@@ -79,6 +88,21 @@ def test_words_are_counted_without_a_network() -> None:
     for seed in range(24):
         scene = Scene.draw(seed)
         assert count_words(scene.frame) == len(scene.words)
+
+
+def test_a_word_too_many_or_too_few_or_elsewhere_or_another_is_wrong() -> None:
+    needs("scipy")
+    from vision import Scene
+
+    scene = Scene.draw(1)
+    found = list(scene.words)
+    assert scene.agrees(found)
+    assert not scene.agrees([*found, ("ROBOT", (5, 5, 25, 90))])
+    assert not scene.agrees(found[1:])
+    assert not scene.agrees([("R0BOT", box) for _, box in found])
+    assert not scene.agrees(
+        [(word, (top + 10, left, bottom + 10, right)) for word, (top, left, bottom, right) in found]
+    )
 
 
 def test_a_mask_with_a_region_too_many_or_too_few_or_a_part_of_each_is_wrong() -> None:
@@ -114,6 +138,7 @@ def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
     for _, (top, left, bottom, right) in words:
         mask[top:bottom, left:right] = True
     answers: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+        "detect": ({"found": [*words]}, {"found": [*words[1:]]}),
         "segment": ({"mask": text_of(mask)}, {"mask": text_of(~mask)}),
         "count": ({"words": len(words)}, {"words": 0}),
     }
@@ -123,8 +148,9 @@ def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
         assert [each.is_right for each in judged] == [True, False], name
 
 
-def test_a_figure_that_computes_refuses_without_the_network(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("figure", ["fig6", "fig7"])
+def test_a_figure_that_computes_refuses_without_the_networks(
+    figure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     needs("scipy", "rcl_interfaces", "matplotlib")
     import vision
@@ -135,7 +161,7 @@ def test_a_figure_that_computes_refuses_without_the_network(
     parser.add_argument("--compute", action="store_true")
     parser.set_defaults(requests=2, computed=2)
     with pytest.raises(SystemExit) as ended:
-        run_experiment(parser, importlib.import_module("fig6").measure, ["--quick", "--compute"])
+        run_experiment(parser, importlib.import_module(figure).measure, ["--quick", "--compute"])
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "rapidocr_onnxruntime is not installed: pip install" in line
