@@ -136,14 +136,15 @@ def numbers(overlay: Overlay, member: str) -> list[int]:
     return [each.number for _, records in overlay.read(member) for each in records if each.kind in kinds]
 
 
-def test_frames_of_a_link_are_lost_and_doubled_as_configured(overlay: Overlay) -> None:
+def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Overlay) -> None:
     until(lambda: numbers(overlay, "R"), "a message")
     overlay.disturb("s1", "s2", FrameFaults(lost=1.0))
     begun = max(numbers(overlay, "P"))
     until(lambda: max(numbers(overlay, "P"), default=0) > begun + 50, "half a second of messages")
     assert max(numbers(overlay, "R"), default=0) < begun + 20
-    overlay.disturb("s1", "s2", FrameFaults(doubled=1.0))
-    until(lambda: numbers(overlay, "R"), "a message")
+    for faults in (FrameFaults(doubled=1.0), FrameFaults(delayed=0.5)):
+        overlay.disturb("s1", "s2", faults)
+        until(lambda: numbers(overlay, "R"), "a message")
     overlay.calm("s1", "s2")
     until(lambda: numbers(overlay, "R"), "a message")
 

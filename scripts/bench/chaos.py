@@ -4,7 +4,8 @@ A random network of 12 to 20 switches, four domains, three tiers, several RIBs, 
 best-effort topics (``faults/plan.py``). It gets overlapping faults (``faults/schedule.py``). Flows that graph and
 policy leave connected (``faults/plan.py``) must continue. Promises:
 
-    after the last fault    every flow that must be connected delivers again within a second, and stays so
+    after the last fault    every flow that must be connected delivers again within a second, and stays so; with
+                            --thin within two, if a queue holds 200 ms
     meanwhile               no silence above --limit-s where both ends were connected all the time
     nothing                 reaches a wrong reader, or comes twice; nothing of the revoked member after three seconds
     reliable flows          are complete from the first message that came, or the reader got a report of each loss
@@ -17,6 +18,7 @@ policy leave connected (``faults/plan.py``) must continue. Promises:
     sudo .venv/bin/python scripts/bench/chaos.py --hours 3                   # seed after seed
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --only cut --only roam
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --cluster          # RIBs share a Valkey or Redis Cluster
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --thin 4           # all links are thin and full
 
 A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
 """
@@ -50,10 +52,12 @@ from lab.topology import ends_of
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # observation after the last fault
 WELL_S: Final = 1.0  # limit after the last fault until all flows work again
+WELL_TRIPS: Final = 5  # ... and on full links so many waits in a queue: each exchange of a join and a reader takes one
 LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
 LOOK_S: Final = 0.1
+IMAGE_SHARE: Final = 2.0  # of a thin link, as much as images offer
 REPORTED_S: Final = 0.25  # shorter silences are not reported
 SPARSE: Final = 1.5  # nor those of a flow that are shorter than so many of its periods
 CALL_S: Final = 5.0
@@ -64,9 +68,9 @@ FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
     FaultKind.LOSS: FrameFaults(lost=0.05),
     FaultKind.DOUBLED: FrameFaults(doubled=0.2),
+    FaultKind.REORDERED: FrameFaults(delayed=0.2, delay_s=0.02),
 }
-# Frames that overtake each other, and links that are thin and full, come in virtual time (tests/scripts).
-SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind if kind is not FaultKind.REORDERED}
+SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
 
 
 class Chaos:
@@ -122,12 +126,17 @@ class Chaos:
         self._watch(time.monotonic() + AFTER_S)
         self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
-    def broken_promises(self, limit_s: float) -> list[str]:
-        """Return what broke, in words. ``limit_s``: longest silence of connected ends during faults."""
+    def broken_promises(self, limit_s: float, full_s: float = 0.0) -> list[str]:
+        """Return what broke, in words.
+
+        ``limit_s``: longest silence of connected ends during faults. ``full_s``: longest wait in a link's queue, if
+        links are kept full.
+        """
         last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
         found = [f"{who} ended by itself" for who in self._overlay.died()]
-        well_ns = last_ns + round(WELL_S * 1e9)
-        found += self._continuity.broken_promises(self.begun_ns, last_ns, end_ns, limit_s, WELL_S)
+        well_s = WELL_S + WELL_TRIPS * full_s
+        well_ns = last_ns + round(well_s * 1e9)
+        found += self._continuity.broken_promises(self.begun_ns, last_ns, end_ns, limit_s, well_s)
         found += sorted(set(self.books.wrong))
         found += self.books.incomplete(self._is_last_life, end_ns - round(2e9))
         over_ns = end_ns - round((CALL_S + 1) * 1e9)
@@ -289,8 +298,11 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
 
     Raises ``FailedError``: the network did not come up. Raises ``GdpError``: the kernel refuses.
     """
-    plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
-    kinds = [SHORT[name] for name in options.only or SHORT]
+    thin_bits_s = 1e6 * (options.thin or 0.0)
+    plan = random_network(
+        seed, options.switches, rate=options.rate, one_rib=options.one_rib, image_bits_s=IMAGE_SHARE * thin_bits_s
+    )
+    kinds = [SHORT[name] for name in options.only] if options.only else None
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
     faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
     more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
@@ -303,10 +315,15 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
         chaos = Chaos(overlay, faults)
         chaos.settle()
+        if thin_bits_s:
+            between = [link for link in plan.topology.links if {link.a, link.b} <= set(plan.switches)]
+            for link in between:
+                overlay.make_thin(link.a, link.b, thin_bits_s, options.fifo_ms / 1e3)
+            progress(f"{len(between)} links have {options.thin:g} Mbit/s and a FIFO of {options.fifo_ms:g} ms")
         progress(f"everything is delivered after {time.monotonic() - begun_s:.1f} s; {len(faults)} faults")
         try:
             chaos.run()
-            broke = chaos.broken_promises(options.limit_s)
+            broke = chaos.broken_promises(options.limit_s, options.fifo_ms / 1e3 if thin_bits_s else 0.0)
         except FailedError as error:
             broke = [str(error)]
         _show(seed, chaos)
@@ -395,6 +412,12 @@ def main() -> None:
         "--cluster",
         action=argparse.BooleanOptionalAction,
         help="RIBs of the top domain share a Valkey or Redis Cluster (default: for every third seed, if installed)",
+    )
+    parser.add_argument(
+        "--thin", type=float, metavar="MBIT_S", help="rate of all links between switches, which images then keep full"
+    )
+    parser.add_argument(
+        "--fifo-ms", type=float, default=200.0, help="depth of the FIFO of such a link (default: %(default)s)"
     )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument(

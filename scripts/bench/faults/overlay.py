@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from pyroute2 import IPRoute
 from testbed import Lab, received, set_link
 
 from faults.clock import Clock
@@ -34,6 +35,7 @@ from lab.credentials import OverlayCredentials
 from lab.process import FailedError, LabProcess, end_processes
 
 READY_S: Final = 60.0
+_BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 
 
 class Overlay:
@@ -251,6 +253,11 @@ class Overlay:
         for own, other in ((a, b), (b, a)):
             self._links.clear(self.spaces[own].path, other)
 
+    def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
+        """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
+        for own, other in ((a, b), (b, a)):
+            self._lab.inside(own, partial(_shape, other, bits_s, fifo_s))
+
     def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
         """Return how many frames have come in at a node's devices towards these neighbours."""
         return self._lab.inside(node, partial(received, neighbours))
@@ -342,6 +349,14 @@ class Overlay:
         self._credentials.write(
             f"end-{member}.yaml", {**self._credentials.node_yaml(Role.PROXY, member), "iface": iface}
         )
+
+
+def _shape(ifname: str, bits_s: float, fifo_s: float) -> None:
+    """Limit what leaves a device: a token bucket, before which frames wait in a FIFO."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=ifname)
+        limit = max(round(bits_s / 8 * fifo_s), _BUCKET_BYTES)
+        here.tc("add", "tbf", index, 0x10000, rate=round(bits_s / 8), burst=_BUCKET_BYTES, limit=limit)
 
 
 def _flow_part(channel: int, flow: Flow) -> dict[str, object]:
