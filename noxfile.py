@@ -5,7 +5,7 @@
     nox -s coverage       branch coverage of the product code
     nox -s docs           the documentation as a site
     nox -s pages          the age of measured pages; a nightly run fails where one is old
-    nox -s bench          a benchmark, such as -- scripts/bench/frames.py; its options without arguments
+    nox -s bench          a benchmark, such as -- scripts/bench/messages.py --quick; its options without arguments
     nox -s pythons        imports and quick tests under every supported Python that is installed
 
 Sessions use .venv, which scripts/setup.sh --dev makes. Only ``pythons`` makes environments of its own.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fog_demo.environment import STATE, standing_runs, sweep
+from fog_demo.cluster import STATE, standing_runs, sweep
 from gdp.host.run_registry import RunRegistry
 from netns_tests.local_site import leftovers
 from tests.pages import ROOT

@@ -15,9 +15,10 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
 
-from testbed import Lab, add_address, ros_environment
+from testbed import Lab, add_address
 
 from gdp.host.run_registry import RunRegistry
+from lab.dds import ros_environment
 from lab.topology import chain
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
@@ -107,6 +108,7 @@ from pathlib import Path
 sys.path.append(sys.argv[2])
 from testbed import Lab
 from gdp.host.run_registry import RunRegistry
+from lab.dds import ros_environment
 from lab.topology import chain
 tempfile.tempdir = sys.argv[1]
 lab = Lab(RunRegistry(Path(sys.argv[1]) / "runs").start(), chain(1), own_shared_memory=("s1",))

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from fog_demo.environment import standing_runs
+from fog_demo.cluster import STATE, standing_runs
 from gdp.host.run_registry import RunRegistry
 from gdp.management.control_client import NodeConnection, find_control_socket
 from netns_tests.test_fog_demo import command as fog_command
@@ -151,9 +151,8 @@ def test_a_trace_in_a_fog_cluster_reaches_each_machine_that_serves() -> None:
 
     with running(fog_command("--calm", 60), are_serving) as process:
         (run,) = (each for each in standing_runs("demo").all() if each.owner.pid == process.pid)
-        paths = traced("a fog cluster", "/echo", Path(run.files[0]) / "nodes" / "proxy-nuc1")
+        paths = traced("a fog cluster", "/echo", Path(run.files[0]) / STATE / "robot" / "proxy")
     assert [path["right"] for path in paths] == ["serve", "serve"]
     assert all(path["answered"] for path in paths)
-    ring_of_five = [f"switch-nuc{number}" for number in range(1, 6)]
-    assert all(labels(path)[:5] == ring_of_five and len(labels(path)) >= 6 for path in paths)
+    assert {tuple(labels(path)) for path in paths} == {("robot", "gateway-gateway", f"echo-{each}") for each in serving}
     assert {str(path["hops"][-1]["out"]["role"]) for path in paths} == {"proxy"}

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Demonstration of a service that outlives its machines: a robot in a ring of five switches, two spot machines, one
-# preempted, the other killed, each replaced while requests flow. The last line states how many requests failed.
+# Demonstration of a service that outlives its machines: a robot, two spot machines, one preempted, the other
+# killed, each replaced while requests flow. The last line states how many requests failed.
 #
 #   sudo scripts/fog_demo.sh                       about a minute
 #   sudo scripts/fog_demo.sh --json > out.json     the outcome for programs; progress goes to standard error

@@ -1,208 +1,212 @@
-"""Forwarding bench: frames a second through one and three switches, round-trip time, and cost of a frame.
+"""Forwarding bench: frames a second through three switches, and the round trip of one frame, next to a Linux bridge.
 
-    sudo .venv/bin/python scripts/bench/forwarding.py                      minutes; JSON and plot to docs/benchmarks
+    sudo .venv/bin/python scripts/bench/forwarding.py                      a minute; JSON and plot to docs/benchmarks
     sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
-    sudo .venv/bin/python scripts/bench/forwarding.py --only kernel --only bridge --rounds 5
 
-The baselines are our planes (scapy, raw, kernel with and without redirect_peer), the Linux bridge and the kernel's IPv4
-forwarding. In each round they run in the same chain of namespaces, one after the other. Per size of frame and length of
-chain:
+::
 
-frames/s            highest rate at which less than 0.1 % is lost and the last frame comes at once (``rate_search.py``)
-RTT, polling ends   of single frames, by endpoints that query their socket continuously: the path alone; not measured
-                    for planes that are processes where these would share the endpoints' cores
-RTT, sleeping ends  by endpoints that wait in epoll, as nodes do
-CPU µs/frame        at that rate: the source, soft interrupts (forwarding in the kernel is done by the sender's own, so
-                    it shows as the source's time) and switch processes; the sink is left out
-forwarding's part, forwarding's share: round trip and CPU, less the cost of directly joined endpoints in the same round
+    s1 (source) -- s2 -- s3 -- s4 -- s5 (sink)        a namespace each; the three in the middle forward
 
-All frames leave through AF_PACKET, IPv4 ones too, so that the source costs the same for all, and no offload takes part.
-Everything made is removed, also after an error.
+*frames/s* is the best of some tries at full speed that lose less than 0.1 %, and whose last frame comes at once: a rate
+that only fills queues does not count. Both forward in the sender's own time, so no rate needs to be searched. *RTT* is
+of single frames between endpoints that wait for them as nodes do. All frames leave through AF_PACKET, which no offload
+touches. Of other planes and of the kernel's IPv4 docs/explanation/design.md has what led to the choice.
 """
 
 from __future__ import annotations
 
-import os
+import json
 import statistics
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Final
 
-from baselines import Baseline, Bridge, IPv4, Plane
-from chains import Chain
-from machine import offload_text
+from forwarding_end import SINK, SOURCE
 from plot import Panel, panel_of
-from rate_search import LOSS_MAX, highest
-from report import Rounds, Target, percentile, progress
-from skeleton import Options, Outcome, command_line, run_bench
+from pyroute2 import IPRoute
+from report import Rounds, Target, percentile
+from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
+from testbed import Lab, add_bridge, mac_addresses
 
-from gdp.errors import LocalError
-from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError, LabProcess
+from gdp.frame.codec import OVERHEAD_BYTES, Header, encode
+from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.host.run_registry import Run, RunRegistry
+from gdp.limits import HOPS_MAX
+from lab.process import FailedError, LabProcess, figures_of, floats_of
+from lab.topology import chain
 
+KERNEL, BRIDGE = "kernel", "bridge"
+RATE, LOSS = "frames/s", "loss %"
+TRIP, TRIP_P99 = "RTT median, µs", "RTT p99, µs"
+SIZE: Final = 1_400  # bytes, the Ethernet header included
+CASE: Final = f"{SIZE:,} B, 3 switches"
+TRIES: Final = 3
+LOSS_MAX: Final = 0.001
+LATE_MAX_S: Final = 0.05
 PINGS: Final = 1_000
-SIZES: Final = {1_500: (128, 1_400), 9_000: (8_900,)}
-LENGTHS: Final = (1, 3)
-OURS: Final = ("kernel", "kernel, redirect", "raw", "scapy")
-OTHERS: Final = ("bridge", "IPv4")
-GUESSES: Final = {"raw": 80_000.0, "scapy": 1_500.0}
-RATE, LOSS, SINK_LOSS = "frames/s", "loss %", "of it at the sink %"
-CPU, SHARE = "CPU µs/frame", "forwarding's share, µs"
-POLLED, POLLED_P99, PART = "RTT µs, polling ends: median", "p99, polling", "forwarding's part, µs"
-SLEPT, SLEPT_P99 = "RTT µs, sleeping ends: median", "p99, sleeping"
+GAIN: Final = 1.7
+_SOURCE_CPU, _SINK_CPU = 0, 1
+_READY_S: Final = 120.0
+_BRIDGE: Final = "bridge"
+_WARM_UP_PINGS: Final = 10
 
 
-class Bench:
-    """Rounds of one run: the figures so far, and the measurement of one baseline in one chain."""
+def data_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> bytes:
+    """Return a whole data frame of ``size`` bytes. Raises ``ValueError``: too small for the headers."""
+    payload = size - OVERHEAD_BYTES
+    if payload < 0:
+        raise ValueError(f"a frame has at least {OVERHEAD_BYTES} bytes")
+    header = Header(Kind.DATA, 0, HOPS_MAX, 1, payload, 0, 0, 1, 1, destination, source)
+    return macs + ETHERTYPE.to_bytes(2, "big") + encode(header) + bytes(payload)
 
-    def __init__(self, seconds: float, pings: int) -> None:
-        self.over = Rounds()
-        self._seconds = seconds
-        self._pings = pings
-        self._guesses: dict[tuple[str, str], float] = {}
-        self._ends_cpu: dict[int, float] = {}
-        self._ends_trip: dict[int, float] = {}
 
-    def measure(self, baseline: Baseline, chain: Chain, sizes: Sequence[int], lengths: Sequence[int]) -> None:
-        """Set a baseline up, measure each size, take it down; report the reason if it is not available.
+class Row(Lab):
+    """The five machines, with source and sink running; a context manager that ends these. Raises as ``Lab``."""
 
-        ``baseline``: what to measure. ``chain``: the chain of namespaces. ``sizes``: of frames, bytes. ``lengths``:
-        chains in whose tables the figures appear.
-        """
-        if baseline.name in self.over.reasons:
-            return
+    def __init__(self, run: Run) -> None:
+        super().__init__(run, chain(5))
+        nodes = self.topology.nodes
+        self._macs = {node: self.inside(node, partial(mac_addresses, self._devices(node))) for node in nodes}
         with ExitStack() as undo:
-            try:
-                workers = undo.enter_context(baseline.stand(chain))
-            except (LocalError, FailedError) as error:
-                self.over.absent(baseline.name, str(error))
-                return
-            for size in sizes:
-                figures = self._figures(baseline, chain, workers, size)
-                for length in lengths:
-                    for column, value in figures.items():
-                        self.over.add(baseline.name, case_of(size, length), column, value)
+            self._source, self._sink = (
+                undo.enter_context(self._worker(node, "end", cpu=cpu, ifname=self._devices(node)[0]))
+                for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
+            )
+            self._source.read(_READY_S)
+            self._sink.read(_READY_S)
+            self._undo = undo.pop_all()
 
-    def _figures(
-        self, baseline: Baseline, chain: Chain, workers: Sequence[LabProcess], size: int
-    ) -> dict[str, float | None]:
-        wire = baseline.wire(chain, size)
-        pings = min(self._pings, 50) if baseline.name == "scapy" else self._pings
-        slept = chain.round_trips(wire, pings, poll=False)
-        apart = not baseline.processes or len(os.sched_getaffinity(0)) >= 2 + len(workers)
-        polled = chain.round_trips(wire, pings, poll=True) if apart else []
-        trip = statistics.median(polled) if polled else None
-        if trip is not None and not chain.switches:
-            self._ends_trip[size] = trip
-        asked = baseline.name, case_of(size, chain.switches)
-        guess = self._guesses.get(asked, GUESSES.get(baseline.name)) if baseline.processes else None
-        best = highest(lambda rate: chain.attempt(wire, workers, rate, self._seconds), guess)
-        cpu = share = None
-        if best is not None:
-            self._guesses[asked] = best.rate
-            cpu = best.cpu_s / best.got * 1e6
-            if not chain.switches:
-                self._ends_cpu[size] = cpu
-            share = cpu - self._ends_cpu[size] if chain.switches and size in self._ends_cpu else None
-        return {
-            RATE: best.rate if best else None,
-            LOSS: best.loss * 100 if best else None,
-            SINK_LOSS: best.sink_drops / best.sent * 100 if best else None,
-            POLLED: trip,
-            POLLED_P99: percentile(polled, 0.99) if polled else None,
-            PART: trip - self._ends_trip[size] if trip and chain.switches and size in self._ends_trip else None,
-            SLEPT: statistics.median(slept) if slept else None,
-            SLEPT_P99: percentile(slept, 0.99) if slept else None,
-            CPU: cpu,
-            SHARE: share,
-        }
+    def __enter__(self) -> Row:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    @contextmanager
+    def kernel(self) -> Iterator[Mapping[str, str]]:
+        """Run a switch of this project in every middle; yield a frame there and one back, each in hex."""
+        with ExitStack() as undo:
+            workers = []
+            for node in self.topology.nodes[1:-1]:
+                left, right = self._devices(node)
+                ways = {side: f"{at} {self._macs[at][node].hex()}" for side, at in (("left", left), ("right", right))}
+                workers.append(undo.enter_context(self._worker(node, "switch", ways=ways)))
+            for worker in workers:
+                if reason := worker.read(_READY_S).get("refused_because"):
+                    raise FailedError(str(reason))
+            yield self._frames(1)
+
+    @contextmanager
+    def bridge(self) -> Iterator[Mapping[str, str]]:
+        """Make a bridge in every middle, which has learnt both addresses; yield as ``kernel``."""
+        with ExitStack() as undo:
+            for node in self.topology.nodes[1:-1]:
+                self.inside(node, partial(add_bridge, _BRIDGE, self._devices(node)))
+                undo.callback(self.inside, node, _remove_bridge)
+            frames = self._frames(4)
+            self.round_trips(frames, _WARM_UP_PINGS)
+            yield frames
+
+    def flat_out(self, frames: Mapping[str, str], seconds: float) -> dict[str, float]:
+        """Send at full speed for a while; return rate and loss. Raises ``FailedError``: a process ended."""
+        self._sink.ask(do="count")
+        sent = figures_of(self._source.ask(do="send", frame=frames["there"], seconds=seconds))
+        got = figures_of(self._sink.ask(expected=sent["sent"]))
+        late_s = max(got["last_s"] - sent["end_s"], 0.0)
+        loss = 1 - got["got"] / max(sent["sent"], 1)
+        holds = loss < LOSS_MAX and late_s < LATE_MAX_S
+        rate = got["got"] / (sent["end_s"] - sent["start_s"] + late_s) if holds else 0.0
+        return {RATE: rate, LOSS: 100 * loss}
+
+    def round_trips(self, frames: Mapping[str, str], pings: int) -> list[float]:
+        """Return round-trip times in microseconds; fewer than ``pings`` when some were lost.
+
+        Raises ``FailedError``: a process ended.
+        """
+        self._sink.ask(do="answer", frame=frames["back"], pings=pings)
+        times = floats_of(self._source.ask(do="ping", frame=frames["there"], pings=pings), "rtt_us")
+        self._sink.read(_READY_S)
+        return times
+
+    def _devices(self, node: str) -> list[str]:
+        """Return a node's devices, from left to right; each has the name of the neighbour that it leads to."""
+        nodes = self.topology.nodes
+        at = nodes.index(node)
+        return [*nodes[max(0, at - 1) : at], *nodes[at + 1 : at + 2]]
+
+    def _frames(self, hops: int) -> Mapping[str, str]:
+        """Return frames to the machine so many links away: the next one for a switch, the far end for a bridge."""
+        nodes = self.topology.nodes
+        found = {}
+        for name, row, names in (("there", nodes, (SINK, SOURCE)), ("back", nodes[::-1], (SOURCE, SINK))):
+            macs = self._macs[row[hops]][row[hops - 1]] + self._macs[row[0]][row[1]]
+            found[name] = data_frame(macs, SIZE, *names).hex()
+        return found
+
+    def _worker(self, node: str, role: str, **settings: object) -> LabProcess:
+        return self.start(node, role, ["-m", "forwarding_end", role, json.dumps(settings)], has_orders=True)
 
 
-def case_of(size: int, switches: int) -> str:
-    """Return the heading of a table."""
-    return f"{size:,} B, {switches} switch{'es' if switches > 1 else ''}"
+def _remove_bridge() -> None:
+    with IPRoute() as here:
+        here.link("del", index=here.link_lookup(ifname=_BRIDGE)[0])
 
 
-def baselines_of(only: Sequence[str]) -> list[Baseline]:
-    """Return the selected baselines, by default all; those to compare are adjacent."""
-    others = [Bridge("bridge"), IPv4("IPv4")]
-    quick: list[Baseline] = [*(Plane(name, processes=False) for name in OURS if name not in GUESSES), *others]
-    known = [*quick, *(Plane(name, processes=True) for name in OURS if name in GUESSES)]
-    return [each for each in known if not only or each.name in only]
+def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> dict[str, float]:
+    """Return the figures of one baseline, by column. Raises ``FailedError``: it is not available, or loses frames."""
+    with row.kernel() if baseline == KERNEL else row.bridge() as frames:
+        trips = row.round_trips(frames, pings)
+        tries = [row.flat_out(frames, seconds) for _ in range(TRIES)]
+    best = max(tries, key=lambda each: each[RATE])
+    if not trips or not best[RATE]:
+        raise FailedError(f"frames are lost: {best[LOSS]:.2f} % at full speed, {pings - len(trips)} of {pings} pings")
+    return {**best, TRIP: statistics.median(trips), TRIP_P99: percentile(trips, 0.99)}
 
 
 def targets_of(over: Rounds) -> list[Target]:
-    """Return the targets of the kernel plane, all in the longer chain."""
-    case, plain = case_of(1_400, 3), "kernel, redirect"
+    """Return the targets of the kernel plane."""
     return [
-        over.ratio(f"{case}: kernel by plain redirect / bridge, frames/s", plain, "bridge", case, RATE, 1.3),
-        over.ratio(f"{case}: kernel / bridge, frames/s", "kernel", "bridge", case, RATE, 1.7),
-        over.ratio(
-            f"{case}: kernel / IPv4, RTT median by polling ends", "kernel", "IPv4", case, POLLED, 0.7, at_most=True
-        ),
-        over.ratio(
-            f"{case}: kernel / IPv4, RTT median by sleeping ends", "kernel", "IPv4", case, SLEPT, None, at_most=True
-        ),
-        over.ratio(f"{case}: kernel / IPv4, forwarding's part of the RTT", "kernel", "IPv4", case, PART, None),
-        over.ratio(f"{case}: kernel / bridge, forwarding's share of the CPU", "kernel", "bridge", case, SHARE, None),
+        over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
+        over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
     ]
 
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
-    """Measure every baseline in every chain, round by round."""
-    sizes = {1_500: (1_400,)} if options.quick else SIZES
-    bench = Bench(options.seconds, 200 if options.quick else PINGS)
-    with ExitStack() as undo:
-        chains = {length: undo.enter_context(Chain(runs, length, 1_500)) for length in (0, *LENGTHS)}
-        found = offload_text(chains[LENGTHS[-1]].offloads())
-        for number in range(1, options.rounds + 1):
-            for mtu, bytes_each in sizes.items():
-                where = f"round {number} of {options.rounds}, MTU {mtu}"
-                for chain in chains.values():
-                    chain.set_mtu(mtu)
-                progress(f"{where}: ends alone")
-                bench.measure(Baseline("ends alone"), chains[0], bytes_each, LENGTHS)
-                for length in LENGTHS:
-                    for baseline in baselines_of(options.only):
-                        progress(f"{where}, {length} in the middle: {baseline.name}")
-                        bench.measure(baseline, chains[length], bytes_each, [length])
+    """Measure both, round by round."""
+    recorder, pings = Recorder(), int(options.pings)
+    with new_run(runs) as run, Row(run) as row:
+        columns = (RATE, LOSS, TRIP, TRIP_P99)
+        trials = [
+            Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))
+            for name in (KERNEL, BRIDGE)
+        ]
+        recorder.interleave(trials, options.rounds)
+    over = recorder.rounds
     settings = {
         "rounds": options.rounds,
         "seconds a try": options.seconds,
-        "pings": 200 if options.quick else PINGS,
+        "pings": pings,
         "loss below": LOSS_MAX,
-        "MTU": list(sizes),
-        "cores": "source 0, sink 1, switches anywhere",
-        "offloads of the devices (none touches AF_PACKET frames)": found,
+        "cores": f"source {_SOURCE_CPU}, sink {_SINK_CPU}, switches anywhere",
+        "trouble": recorder.notes or "none",
     }
-    return Outcome(
-        "forwarding", "Forwarding", bench.over, targets_of(bench.over), settings, lambda: panels_of(bench.over)
-    )
+    return Outcome("forwarding", "Forwarding", over, targets_of(over), settings, lambda: panels_of(over))
 
 
 def panels_of(over: Rounds) -> list[Panel]:
-    """Return panels of rates by size, round trips and costs, in the longer chain."""
-    everyone = (*OURS, *OTHERS, "ends alone")
-    panel = partial(panel_of, over, ours=OURS)
-    case = case_of(1_400, LENGTHS[-1])
+    """Return panels of rates and round trips."""
+    both = (KERNEL, BRIDGE)
     return [
-        *(panel(each, RATE, everyone) for each in over.cases() if each.endswith(f"{LENGTHS[-1]} switches")),
-        panel(case, SHARE, everyone, log=True),
-        panel(case, POLLED, everyone, p99=POLLED_P99, log=True),
-        panel(case, SLEPT, everyone, p99=SLEPT_P99, log=True),
+        panel_of(over, CASE, RATE, both, ours=(KERNEL,)),
+        panel_of(over, CASE, TRIP, both, p99=TRIP_P99, ours=(KERNEL,)),
     ]
 
 
 if __name__ == "__main__":
+    quick = {"rounds": 1, "seconds": 0.15, "pings": 200}
     parser = command_line(
-        __doc__,
-        rounds=3,
-        seconds=0.3,
-        seconds_of="length of one try",
-        quick={"rounds": 1, "seconds": 0.15},
-        has_record=True,
-        has_plot=True,
+        __doc__, rounds=7, seconds=0.3, seconds_of="length of one try", quick=quick, has_record=True, has_plot=True
     )
-    parser.add_argument("--only", action="append", choices=[*OURS, *OTHERS], default=[], help="may be repeated")
+    parser.add_argument("--pings", type=int, default=PINGS, help="in each round (default: %(default)s)")
     run_bench(parser, measure)

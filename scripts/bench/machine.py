@@ -6,8 +6,7 @@ netlink family are often absent. Functions on devices apply to the namespace of 
 Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
 
     state = machine_state()                            call it first: it also takes the load before the bench
-    offloads("s2")                                     {"tso": True, "gso": True, "gro": False, "tx-checksum": True}
-    set_offloads("s2", on=False)
+    clear_offloads("s2")
 """
 
 from __future__ import annotations
@@ -21,17 +20,14 @@ import struct
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 _SIOCETHTOOL: Final = 0x8946
-_GET_SET: Final = {"tso": (0x1E, 0x1F), "gso": (0x23, 0x24), "gro": (0x2B, 0x2C), "tx-checksum": (0x16, 0x17)}
-_NEEDS: Final = ("tx-checksum", "tso")  # segmentation cannot be on without checksums: switch these in this order
+_OFFLOADS: Final = (0x1F, 0x24, 0x2C, 0x17)  # to set tso, gso, gro, tx-checksum: segmentation needs checksums
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,67 +112,22 @@ def _processor() -> str:
     return platform.machine()
 
 
-def offloads(ifname: str) -> dict[str, bool]:
-    """Return which of tso, gso, gro and tx-checksum a device has on. Raises ``OSError``: no such device."""
-    return {name: bool(_ask(ifname, get, 0)) for name, (get, _) in _GET_SET.items()}
-
-
-def set_offloads(ifname: str, *, on: bool) -> None:
-    """Switch all four on or off; AF_PACKET frames never use them, IP does.
+def clear_offloads(ifname: str) -> None:
+    """Switch segmentation, reception and checksum offloads off, so that a frame on the wire is a frame of a program.
 
     Raises ``OSError``: no such device, or not allowed.
     """
-    first = _NEEDS if on else _NEEDS[::-1]
-    for name in (*first, *(name for name in _GET_SET if name not in first)):
-        _ask(ifname, _GET_SET[name][1], int(on))
-
-
-def offload_text(found: Iterable[Mapping[str, bool]]) -> str:
-    """Return the offloads of several devices in a word each: on, off, or mixed."""
-    values: dict[str, set[bool]] = {}
-    for one in found:
-        for name, is_on in one.items():
-            values.setdefault(name, set()).add(is_on)
-    return ", ".join(
-        f"{name} {'mixed' if len(each) > 1 else 'on' if True in each else 'off'}" for name, each in values.items()
-    )
-
-
-def _ask(ifname: str, command: int, value: int) -> int:
-    request = ctypes.create_string_buffer(struct.pack("=II", command, value), 8)
-    argument = struct.pack("16sP16x", ifname.encode(), ctypes.addressof(request))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        fcntl.ioctl(asked, _SIOCETHTOOL, argument)
-    return int(struct.unpack("=II", request.raw)[1])
+    for command in _OFFLOADS:
+        request = ctypes.create_string_buffer(struct.pack("=II", command, 0), 8)
+        argument = struct.pack("16sP16x", ifname.encode(), ctypes.addressof(request))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+            fcntl.ioctl(asked, _SIOCETHTOOL, argument)
 
 
 def processor_s(pid: int) -> float:
     """Return the processor time of a process, of the system too, as proc(5) counts it in ``/proc/<pid>/stat``."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime
-
-
-def thread_s(pid: int) -> float:
-    """Return the processor time of a process of one thread, including its soft interrupts (schedstat).
-
-    Raises ``OSError``: no such process.
-    """
-    return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
-
-
-def soft_interrupts_s() -> float:
-    """Return the processor time of the kernel's soft interrupt threads, which take over under load."""
-    return sum(map(thread_s, _soft_interrupt_threads()))
-
-
-@lru_cache(maxsize=1)
-def _soft_interrupt_threads() -> list[int]:
-    found = []
-    for comm in Path("/proc").glob("[0-9]*/comm"):
-        with suppress(FileNotFoundError, ProcessLookupError):  # it ended meanwhile
-            if comm.read_text(encoding="utf-8").startswith("ksoftirqd/"):
-                found.append(int(comm.parent.name))
-    return found
 
 
 DATA: Final = ROOT / "scripts" / "data"

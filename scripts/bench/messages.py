@@ -2,88 +2,111 @@
 
 Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by round:
 
-    gdp-kernel, gdp-raw   switches, RIB and two members: encrypted, signed, verified, reliable; in json, cbor and cdr
-    gdp-kernel-unicast    the same as a request to one server and its response, without the library
-    gdp-kernel-session    the same under ``sign: session``: a key of the two ends, no signature
-    zenoh-mtls            three routers; mutual TLS on every hop
-    zenoh-tcp             the same without TLS
-    cyclone               Cyclone DDS, unsecured, reliable; the three forward IPv4 in the kernel
+    gdp-kernel           switches, RIB and two members: encrypted, signed, verified, reliable
+    gdp-kernel-session   the same as requests and responses under ``sign: session``: a key of the two ends, no signature
+    zenoh-mtls           three routers; mutual TLS on every hop
+    cyclone              Cyclone DDS, unsecured, reliable; the three forward IPv4 in the kernel
 
     sudo .venv/bin/python scripts/bench/messages.py                     # the whole; writes docs/benchmarks/messages.*
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
-    sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
+    sudo .venv/bin/python scripts/bench/messages.py --only gdp-kernel --only zenoh-mtls --mtu 1500 --size 921600
     sudo .venv/bin/python scripts/bench/messages.py --load half         # other processes take half of each core
 
-Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages. The table
-shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
-docs/benchmarks by itself; a part of it writes to the paths of --json and --plot.
+Messages are CDR, and go one at a time, as in a control loop; no device has offloads. A figure of a round is the median
+(or p99) of its messages. Only the whole bench writes under docs/benchmarks by itself; a part of it writes to the paths
+of --json and --plot.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from itertools import product
 from typing import Final
 
-from background_load import LOADS, SHARE
-from peers.exchange import ANSWER, SIZE_MIN, Load
-from peers.rounds import MEDIAN, P99, Plan, Turns, case_of, targets_of
-from peers.systems import ENCODINGS, Baseline, CycloneNet, GdpNet, ZenohNet
+from background_load import LOADS, SHARE, load_of
+from peers.chain import Chain
+from peers.exchange import ANSWER, SIZE_MIN
+from peers.systems import BASELINES, Baseline
 from plot import Panel, panel_of
-from report import Rounds
-from skeleton import Options, Outcome, command_line, parse, perform
+from report import Rounds, Target, percentile
+from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, parse, perform
 
 from gdp.host.run_registry import RunRegistry
 from gdp.runtime.busy_poll import SPIN_US
 
-SIZES: Final = (100, 10_000, 921_600)
+MEDIAN: Final = "RTT median, ms"
+P99: Final = "RTT p99, ms"
+CPU: Final = {"sender": "sender CPU, ms", "receiver": "receiver CPU, ms", "between": "CPU between, ms"}
+COLUMNS: Final = (MEDIAN, P99, *CPU.values())
+SMALL, IMAGE = 100, 921_600
+SIZES: Final = (SMALL, IMAGE)
 MTUS: Final = (1_500, 9_000)
-QUICK_COUNT: Final = 10
+OURS: Final = tuple(name for name in BASELINES if name.startswith("gdp"))
+_SMALL_TIMES: Final = 4  # so many times as many messages of up to 100 kB are sent
+_LARGE_BYTES: Final = 100_000
+_SECURED: Final = "zenoh-mtls"
+_UNSECURED: Final = "cyclone"
+_RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
+    (SMALL, 1_500, False): 0.4,
+    (SMALL, 9_000, False): 0.4,
+    (IMAGE, 9_000, False): 0.4,
+    (IMAGE, 1_500, False): 0.6,
+    (SMALL, 1_500, True): 0.8,
+    (SMALL, 9_000, True): 0.8,
+    (IMAGE, 9_000, True): 0.6,
+}
+_ADDED_MS: Final = 1.5
+_SMALL_CPU_MS: Final = 0.12
+
+Case = tuple[int, int, bool]  # bytes, MTU, whether other processes take half of each core
 
 
-def baselines_of(only: Sequence[str]) -> tuple[Baseline, ...]:
-    """Return the baselines with these names; all, if none is named."""
-    every: tuple[Baseline, ...] = (
-        GdpNet("kernel", ENCODINGS),
-        GdpNet("raw", ENCODINGS),
-        GdpNet("kernel", ("cdr",), "unicast"),
-        GdpNet("kernel", ("cdr",), "session"),
-        ZenohNet(secured=True),
-        ZenohNet(secured=False),
-        CycloneNet(),
-    )
-    return tuple(each for each in every if not only or each.name in only)
+def case_of(size: int, mtu: int, *, loaded: bool) -> str:
+    """Return the name of a case."""
+    return f"{size:,} B, MTU {mtu}{', cores half taken' if loaded else ''}"
 
 
-def panels_of(over: Rounds, plan: Plan) -> list[Panel]:
+def count_of(size: int, options: Options) -> int:
+    """Return how many messages of a size are measured in a round."""
+    count = int(options.count)
+    return count if size > _LARGE_BYTES else _SMALL_TIMES * count
+
+
+def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
+    """Return the figures of one baseline in one case, by column."""
+    with load_of(loaded):
+        found = baseline.measure(chain, size, count)
+    times_s: Sequence[float] = found["rtt_s"]
+    figures = {MEDIAN: 1e3 * percentile(times_s, 0.5), P99: 1e3 * percentile(times_s, 0.99)}
+    return figures | {CPU[place]: 1e3 * float(cpu_s) for place, cpu_s in found["cpu_s"].items()}
+
+
+def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list[Target]:
+    """Return the targets of each of our rows, in the cases that were run."""
+    targets: list[Target] = []
+    for label, each in product(ours, cases):
+        size, mtu, loaded = each
+        case = case_of(size, mtu, loaded=loaded)
+        if each in _RATIOS:
+            what = f"{label} / {_SECURED}, {case}"
+            targets.append(over.ratio(what, label, _SECURED, case, MEDIAN, _RATIOS[each], at_most=True))
+        if size == SMALL and not loaded:
+            targets += [
+                over.target(f"{label}, {case}, {CPU[end]}", label, case, CPU[end], _SMALL_CPU_MS, at_most=True)
+                for end in ("sender", "receiver")
+            ]
+        if size == IMAGE and not loaded:
+            what = f"{label} - {_UNSECURED}, ms, {case}"
+            targets.append(over.difference(what, label, _UNSECURED, case, MEDIAN, _ADDED_MS))
+    return targets
+
+
+def panels_of(over: Rounds, names: Sequence[str]) -> list[Panel]:
     """Return a panel for each case: medians, whiskers to the p99."""
-    ours = [label for label in plan.labels if label.startswith("gdp")]
-    return [
-        panel_of(over, case_of(size, mtu, offloads=on, loaded=loaded), MEDIAN, plan.labels, p99=P99, ours=ours)
-        for size, mtu, on in plan.cases
-        for loaded in plan.loads
-    ]
-
-
-def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = command_line(__doc__, has_record=True, has_plot=True)
-    parser.add_argument("--rounds", type=positive, default=5)
-    parser.add_argument(
-        "--count", type=positive, default=80, help="messages above 100 kB; of smaller ones four times that"
-    )
-    parser.add_argument("--quick", action="store_true", help=f"one round of {QUICK_COUNT} messages")
-    parser.add_argument("--only", action="append", choices=names, help="this baseline; may be repeated")
-    parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
-    parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
-    parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
-    parser.add_argument(
-        "--load",
-        choices=tuple(LOADS),
-        default="both",
-        help="none, or processes that take half of each core, or each in turn (default: %(default)s)",
-    )
-    return parser
+    return [panel_of(over, case, MEDIAN, names, p99=P99, ours=OURS) for case in over.cases()]
 
 
 def positive(text: str) -> int:
@@ -106,52 +129,65 @@ def size_of(text: str) -> int:
     return size
 
 
-def plan_of(options: argparse.Namespace) -> Plan:
-    """Return the plan that the command line states."""
-    return Plan(
-        tuple(options.mtu or MTUS),
-        {"off": (False,), "on": (True,), "both": (False, True)}[options.offloads],
-        baselines_of(options.only or ()),
-        Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
-        1 if options.quick else options.rounds,
-        LOADS[options.load],
-    )
-
-
 def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every baseline in every case, round by round."""
-    plan = plan_of(options)
-    turns = Turns(plan)
-    turns.run(runs)
+    names, sizes = options.only or list(BASELINES), options.size or SIZES
+    recorder = Recorder()
+    cases: list[Case] = list(product(sizes, options.mtu or MTUS, LOADS[options.load]))
+    with ExitStack() as stack:
+        chains = {
+            mtu: Chain(mtu, stack.enter_context(new_run(runs))) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)
+        }
+        trials = [
+            Trial(
+                case_of(size, mtu, loaded=loaded),
+                name,
+                COLUMNS,
+                partial(measure_one, BASELINES[name], chains[mtu], size, count_of(size, options), loaded),
+            )
+            for (size, mtu, loaded), name in product(cases, names)
+        ]
+        recorder.interleave(trials, options.rounds)
+    over = recorder.rounds
+    settings = {
+        "rounds": options.rounds,
+        "messages a round": [count_of(size, options) for size in sizes],
+        "answer, B": ANSWER.size,
+        "ends of gdp spin, us": SPIN_US,
+        "shared memory": "off everywhere",
+        "offloads": "off",
+        "load": f"{SHARE:.0%} of each core" if True in LOADS[options.load] else "none",
+        "trouble": recorder.notes or "none",
+    }
+    ours = [name for name in names if name in OURS]
     return Outcome(
         "messages",
         "Messages over three machines, an answer back",
-        turns.over,
-        targets_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases, plan.loads),
-        {
-            "rounds": plan.rounds,
-            "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
-            "answer, B": ANSWER.size,
-            "ends of gdp spin, us": SPIN_US,
-            "shared memory": "off everywhere",
-            "load": f"{SHARE:.0%} of each core" if True in plan.loads else "none",
-            **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
-            "trouble": turns.notes or "none",
-        },
-        lambda: panels_of(turns.over, plan),
+        over,
+        targets_of(over, ours, cases),
+        settings,
+        lambda: panels_of(over, names),
         is_whole=is_whole(options),
     )
 
 
 def is_whole(options: Options) -> bool:
     """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
-    has_part = options.quick or options.only or options.mtu or options.size
-    return not has_part and options.offloads == options.load == "both"
+    return not (options.quick or options.only or options.mtu or options.size) and options.load == "both"
 
 
 def main() -> None:
     """Run the bench, or a part of it."""
-    options = parse(arguments([each.name for each in baselines_of(())]))
+    parser = command_line(__doc__, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
+    parser.add_argument("--rounds", type=positive, default=5)
+    text = "messages above 100 kB; of smaller ones four times that"
+    parser.add_argument("--count", type=positive, default=80, help=text)
+    parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
+    parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
+    parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
+    text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
+    parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
+    options = parse(parser)
     options.no_plot |= options.plot is None and not is_whole(options)
     options.is_whole = is_whole
     perform(options, measure)

@@ -25,10 +25,10 @@ import time
 from typing import Final
 
 from plot import Panel, panel_of
-from recovery_stage import DEDICATED, ECHO, REPLICA, Cluster
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
+from fog_demo.cluster import DEDICATED, ECHO, REPLICA, Cluster, requests_in
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
 
@@ -129,8 +129,9 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 progress(", ".join(f"{column}: {value:.2f}" for column, value in found.items() if value is not None))
                 for column, value in found.items():
                     over.add(WHO, CASES[case], column, value)
-        for column, count in cluster.end_caller().items():
-            over.add(WHO, TRAFFIC, column, count)
+        requests, failed = requests_in(cluster.end_caller())
+        over.add(WHO, TRAFFIC, "requests", requests)
+        over.add(WHO, TRAFFIC, FAILED, failed)
     return Outcome(
         "recovery_gateway" if is_replica else "recovery",
         f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}",

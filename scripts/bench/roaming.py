@@ -17,12 +17,12 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from numbered_flow import NumberedFlow, open_sessions
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
 from gdp.host.run_registry import RunRegistry
 from internet.access import Access
+from internet.flow import NumberedFlow, open_sessions
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay

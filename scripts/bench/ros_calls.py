@@ -1,4 +1,4 @@
-"""Client and server of ``services.py``, and replicas of ``replicas.py``: ordinary rclpy nodes.
+"""Client and server of ``ros.py --calls``, and replicas of ``replicas.py``: ordinary rclpy nodes.
 
 Process of its own, started by ``ros_row.py`` as ``serve``, ``call`` (one call at a time) or ``load`` (many
 clients, calls at a steady rate). The server echoes the request, so that an answer to another call is detected.

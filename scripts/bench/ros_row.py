@@ -31,10 +31,11 @@ from itertools import pairwise
 from typing import Final, Literal
 
 from machine import processor_s
-from testbed import BUFFER_BYTES, Lab, OverlayNodes, add_address, add_bridge, ros_environment
+from testbed import Lab, OverlayNodes, add_address, add_bridge
 
 from gdp.host.run_registry import Run
 from lab import credentials
+from lab.dds import BUFFER_BYTES, ros_environment
 from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 from proxy.config.config import Encoding

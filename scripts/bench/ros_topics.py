@@ -24,7 +24,7 @@ TEXT_BYTES: Final = 100  # in CDR: prefix 4, length 4, 91 characters, one 0
 IMAGE_BYTES: Final = 921_600  # 640 x 480, rgb8; its header comes on top
 _TEXT_CHARS: Final = TEXT_BYTES - 9
 _WIDTH, _HEIGHT, _PIXEL = 640, 480, 3
-_DEPTHS: Final = {"text": 10, "quick": 10, "image": 10, "small": 1_000}  # ten of 200/s would be 50 ms
+_DEPTHS: Final = {"text": 10, "image": 10, "small": 1_000}  # ten of 200/s would be 50 ms
 _GREETING_S: Final = 0.05
 _QUIET_S: Final = 8.0  # Fast DDS requests losses after 3 s
 _CAMERA_S: Final = 0.1
@@ -72,7 +72,6 @@ class _Images:
 
 _KINDS: Final[Mapping[str, type[_Texts] | type[_Images]]] = {
     "text": _Texts,
-    "quick": _Texts,
     "image": _Images,
     "small": _Texts,
 }

@@ -6,7 +6,6 @@ FIFO in each direction. On the same link and seed, one after the other:
     gdp                      sessions of the library over two switches; urgent streams have that priority
     zenoh-tls-drop, -block   Zenoh over mutual TLS; congestion control as rmw_zenoh sets it, or blocking
     zenoh-quic-drop, -block  the same over QUIC
-    cyclone-wireguard        Cyclone DDS in a WireGuard tunnel
 
 Each carries camera (30 Hz, raw or JPEG, best effort), lidar (10 Hz), tf (100 Hz), a map, service calls, and cmd_vel
 back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one way, from when a message was due.

@@ -20,12 +20,12 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Final, Literal
 
-from numbered_flow import NumberedFlow, open_sessions
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
 from gdp.host.run_registry import RunRegistry
 from internet.access import Access
+from internet.flow import NumberedFlow, open_sessions
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 from lab.process import until

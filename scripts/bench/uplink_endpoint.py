@@ -1,17 +1,15 @@
-"""Endpoint processes of the uplink bench: traffic of robot and cloud over one system, TCP and WireGuard.
+"""Endpoint processes of the uplink bench: traffic of robot and cloud over one system, and TCP.
 
 Processes of their own, started by ``uplink.py``::
 
-    robot, cloud             the traffic over ``system``: gdp, zenoh or cyclone
+    robot, cloud             the traffic over ``system``: gdp or zenoh
     tcp-send, tcp-read       one TCP flow (CUBIC) from the robot to the cloud
-    wireguard                a WireGuard device at either, until standard input ends
 """
 
 from __future__ import annotations
 
 import json
 import os
-import selectors
 import socket
 import sys
 import time
@@ -24,14 +22,9 @@ from thin_link.exchange import Arrival, Carrier, Exchange, Window
 from thin_link.relay import MARKED_PORT
 from thin_link.traffic import Direction, streams
 
-from gdp.control.endpoints import Endpoint
-from gdp.ports.tunnel.wireguard import open_wireguard
-
 _PATIENCE_S: Final = 30.0
 _POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
-_WIREGUARD_PORT: Final = 51_820
-_ALIAS: Final = "gdp-bench uplink"
 
 Settings = Mapping[str, Any]
 
@@ -43,13 +36,9 @@ def _carrier(settings: Settings, arrived: Arrival) -> Carrier:
         from thin_link.gdp_carrier import GdpCarrier
 
         return GdpCarrier(own, arrived)
-    if settings["system"] == "zenoh":
-        from thin_link.zenoh_carrier import ZenohCarrier
+    from thin_link.zenoh_carrier import ZenohCarrier
 
-        return ZenohCarrier(own, arrived)
-    from thin_link.cyclone_carrier import CycloneCarrier
-
-    return CycloneCarrier(own, arrived)
+    return ZenohCarrier(own, arrived)
 
 
 def traffic(settings: Settings, direction: Direction) -> None:
@@ -106,33 +95,11 @@ def tcp_read(settings: Settings) -> None:
                 pass
 
 
-def wireguard(settings: Settings) -> None:
-    """Make a WireGuard device to the other end, until standard input ends."""
-    peer = Endpoint(settings["peer_address"], _WIREGUARD_PORT)
-    device = open_wireguard(
-        ifname=settings["ifname"],
-        private_key=bytes.fromhex(settings["key"]),
-        listen_port=_WIREGUARD_PORT,
-        inner=settings["inner"],
-        mtu=settings["mtu"],
-        alias=_ALIAS,
-    )
-    device.set_peer(bytes.fromhex(settings["peer_key"]), inner=settings["peer_inner"], endpoint=peer, keepalive_s=25)
-    say(event="ready", backend=device.backend)
-    with selectors.DefaultSelector() as selector:
-        for source in (sys.stdin, device):
-            selector.register(source, selectors.EVENT_READ)
-        while not any(key.fileobj is sys.stdin for key, _ in selector.select()):
-            device.handle_events()
-    device.close()
-
-
 _ROLES: Final[Mapping[str, Callable[[Settings], None]]] = {
     "robot": lambda settings: traffic(settings, "up"),
     "cloud": lambda settings: traffic(settings, "down"),
     "tcp-send": tcp_send,
     "tcp-read": tcp_read,
-    "wireguard": wireguard,
 }
 
 if __name__ == "__main__":

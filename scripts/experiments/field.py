@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from testbed import Lab, OverlayNodes, ros_environment
+from testbed import Lab, OverlayNodes
 
 from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
+from lab.dds import ros_environment
 from lab.process import LabProcess
 from lab.topology import Topology, flat_topology
 

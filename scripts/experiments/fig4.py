@@ -13,10 +13,11 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
-from recovery_stage import DEDICATED, REPLICA
 from samples import Sample, Series
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
+
+from fog_demo.cluster import DEDICATED, REPLICA
 
 REQUESTS, QUICK = 100, 10
 DIRECT: Final = "direct"

@@ -4,7 +4,6 @@
     sudo .venv/bin/python scripts/experiments/fig5.py --quick          # a few seconds: does it work?
     sudo .venv/bin/python scripts/experiments/fig5.py --no-planning    # only the servers that wait: 4 minutes
     sudo .venv/bin/python scripts/experiments/fig5.py --trials 100 --timeout 100    # computed as in the paper: hours
-    sudo .venv/bin/python scripts/experiments/fig5.py --problem Cubicles --planner RRT --out /tmp/fig5
 
 Two planners that share a machine's cores do not show the effect of two machines. So there are also servers that wait
 as long as a recorded run took, and compute nothing. The time of each request is then known before, and the result can
@@ -16,7 +15,6 @@ from __future__ import annotations
 import argparse
 import random
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from statistics import fmean
 from typing import Final
 
@@ -33,6 +31,8 @@ TYPE: Final = "nav_msgs/srv/GetPlan"
 TRIALS: Final = {"Home": 12, "Cubicles": 60, "Twistycool": 5}
 TIMEOUT_S: Final = 45.0
 QUICK: Final = ("Slit", 3, 5)  # problem, trials, waits
+_MESHES: Final = DATA / "planning"
+_PLANNER: Final = "RRTConnect"
 _ONE, _TWO = "/plan/m1", "/plan"
 _MACHINES: Final = ("m1", "m2")
 _WAITS: Final = 100
@@ -61,17 +61,17 @@ _SETTING: Final = (
 
 def measure(options: Options) -> Report:
     """Plan motions with one server and with two replicas."""
-    counts = {each: options.trials or TRIALS.get(each, 20) for each in options.problem or TRIALS}
-    waits, timeout, planner = options.waits, options.timeout, options.planner
+    counts = {each: options.trials or count for each, count in TRIALS.items()}
+    waits, timeout = options.waits, options.timeout
     if options.quick:
         counts, waits = {QUICK[0]: QUICK[1]}, min(waits, QUICK[2])
     counts = counts if options.planning else {}
     if counts:
-        _check(counts, planner, options.meshes)
+        _check(counts)
     groups: dict[str, list[Sample]] = {}
     findings: list[Finding] = []
     plan = {
-        "folder": str(options.meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout
+        "folder": str(_MESHES), "problems": " ".join(counts), "planner": _PLANNER, "patience_s": timeout
     }  # fmt: skip
     if counts:
         with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, plan), _STOP, timeout + _SLACK_S)) as here:
@@ -98,7 +98,7 @@ def measure(options: Options) -> Report:
         {
             "computed trials": ", ".join(f"{n} {count}" for n, count in counts.items()) or "none",
             "timeout, s": timeout,
-            "planner": planner,
+            "planner": _PLANNER,
             "trials of each wait": waits,
         },
         lambda path, title: save_distributions(path, title, panels, "latency, s"),
@@ -109,20 +109,15 @@ def _named(what: str, found: Mapping[str, list[Sample]]) -> dict[str, list[Sampl
     return {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
 
 
-def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
-    """Refuse a planner or a problem that is not available. Raises ``RefusedError``: one is not."""
+def _check(problems: Collection[str]) -> None:
+    """Refuse to plan without the libraries or the problems. Raises ``RefusedError``: one is missing."""
     try:
-        from planning import PROBLEMS, planners
+        from planning import PROBLEMS
     except ImportError as error:
         missing = f"{error.name} is not installed: pip install 'gdp-ros[experiments]', or go without: --no-planning"
         raise RefusedError(missing) from error
-    if planner not in planners():
-        raise RefusedError(f"--planner {planner}: expected one of {', '.join(planners())}")
     for each in problems:
-        if each not in PROBLEMS:
-            raise RefusedError(f"--problem {each}: expected one of {', '.join(PROBLEMS)}")
-        files = [f"{PROBLEMS[each]}{kind}" for kind in (".cfg", "_env.dae", "_robot.dae")]
-        data_folder(meshes.name, files, meshes.parent)
+        data_folder("planning", [f"{PROBLEMS[each]}{kind}" for kind in (".cfg", "_env.dae", "_robot.dae")])
 
 
 def _fleet(
@@ -208,11 +203,8 @@ def _notes(counts: Mapping[str, int], timeout_s: float) -> list[str]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__)
-    parser.add_argument("--problem", action="append", help="to compute; may be repeated (default: all three)")
     parser.add_argument("--trials", type=int, default=0, help="of each problem; 0: a number that a person waits for")
     parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds of a planner (default: %(default)s)")
-    parser.add_argument("--planner", default="RRTConnect", help="class in ompl.geometric (default: %(default)s)")
     parser.add_argument("--waits", type=int, default=_WAITS, help="trials of each wait; 0: none (default: %(default)s)")
-    parser.add_argument("--meshes", type=Path, default=DATA / "planning", help="folder of the problems")
     parser.add_argument("--planning", action=argparse.BooleanOptionalAction, default=True, help="plan, or only wait")
     run_experiment(parser, measure)

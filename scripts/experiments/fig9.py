@@ -15,11 +15,12 @@ from typing import Final
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
 from pictures import Span, save_timeline
-from recovery_stage import DEDICATED
 from report import progress
 from samples import Sample, Series, Summary
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
+
+from fog_demo.cluster import DEDICATED
 
 MINUTES: Final = 2.0
 QUICK_MINUTES: Final = 0.25

@@ -136,12 +136,6 @@ def limits(folder: Path, name: str) -> tuple[Place, Place, Place, Place]:
     return start, goal, low, high
 
 
-def planners() -> list[str]:
-    """Return the names of all available planners."""
-    kinds = {name: getattr(geometric, name) for name in dir(geometric)}
-    return [name for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, base.Planner)]
-
-
 def be_quiet() -> None:
     """Switch off the log of OMPL."""
     util.setLogLevel(util.LogLevel.LOG_NONE)

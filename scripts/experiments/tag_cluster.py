@@ -1,6 +1,6 @@
 """Machines of ``fog`` that find a tag's pose, and the robot that calls them: the stage of figures 4 and 9.
 
-I/O. ``recovery_stage.py`` makes the machines, and the supervisor replaces them.
+I/O. ``fog_demo.cluster`` makes the machines, and the supervisor replaces them.
 ::
 
     robot (proxy, switch, RIB) === uplink === gateway --+-- m1       gateway: a switch of its own, or one of the
@@ -15,13 +15,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-import bench_path  # noqa: F401 - finds the stage
+import bench_path  # noqa: F401 - finds the packages of scripts
 from image_request import TYPE
 from pyroute2 import IPRoute
-from recovery_stage import ROBOT, Cluster
 
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import MACHINE_DEVICE, UP
+from fog_demo.cluster import Cluster
 from gdp.host import netns_files
 from lab.process import LabProcess
 
@@ -63,7 +63,8 @@ class TagCluster(Cluster):
 
     def client(self, place: str, role: str, **settings: object) -> LabProcess:
         """Start a client at the robot: a role of ``robot.py`` and its settings."""
-        return self._lab.start(place, role, [str(_HERE / "robot.py"), role, json.dumps(settings)], self._environment)
+        del place  # there is one robot
+        return self.start(role, [str(_HERE / "robot.py"), role, json.dumps(settings)])
 
     def received_bytes(self) -> tuple[int, int, int]:
         """Return the bytes that have arrived over the robot's uplink: at its far end, at the robot, at all machines.
@@ -72,7 +73,7 @@ class TagCluster(Cluster):
         """
         machines = [find(self._runs, each.id) for each in self.machines()]
         far = netns_files.inside(machines[0].gateway, partial(_received, UP))
-        near = self._lab.inside(ROBOT, partial(_received, self._site.uplink))
+        near = self.inside(partial(_received, self._site.uplink))
         at_machines = (netns_files.inside(each.netns_path, partial(_received, MACHINE_DEVICE, UP)) for each in machines)
         return far, near, sum(at_machines)
 

@@ -5,22 +5,20 @@ I/O. Exit status: 0 no failure, 1 a failure, 2 wrong input, 130 and 143 for Ctrl
 
 from __future__ import annotations
 
-import asyncio
 import json
+import signal
 import sys
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from types import FrameType
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
-from fog_demo.environment import Environment, end_all_of, standing_runs, sweep
 from fog_demo.scenario import Display, Outcome, Pace, run_scenario
-from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
-from gdp.host.run_registry import Run
+from gdp.host.interruption import let_nothing_interrupt
 from lab.command import FAILED, PASSED, console_of, exit_with, new_app
 
 _PACE: Final = Pace()
@@ -43,7 +41,7 @@ def demo(
     notice: Annotated[float, typer.Option(min=1, help="Seconds from the notice to the preemption.")] = _PACE.notice_s,
     as_json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON; all else on stderr.")] = False,
 ) -> None:
-    """A robot in a ring of five switches calls a service on two spot machines, which are taken away.
+    """A robot calls a service on two spot machines, which are taken away.
 
     One machine is preempted with notice, the other one killed, and each is replaced elsewhere while requests flow. It
     takes about a minute; the last line says how many of the requests failed. Everything is gone afterwards, also after
@@ -58,36 +56,22 @@ def main() -> None:
 
 
 def _run(launch_file: Path, pace: Pace, console: Console, as_json: bool) -> int:
-    """Run the scenario, and take down everything."""
-    runs = standing_runs("demo")
-    for swept in sweep(runs):
-        print(f"took down what run {swept} had left behind", file=sys.stderr)
-    run = runs.start()
-    try:
-        outcome = asyncio.run(interruptible(_play(run, launch_file, pace, console)))
-    except Interrupted as interrupted:
-        console.print("interrupted")
-        return interrupted.exit_code
-    finally:
-        let_nothing_interrupt()
-        console.print("[dim]giving machines back, taking the ring down[/dim]")
-        end_all_of(run)
+    """Run the scenario."""
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, _end)
+    with Display(console) as display:
+        outcome = run_scenario(launch_file, pace, display)
     _tell(outcome, console, as_json=as_json)
     return FAILED if outcome.counts.failed or not outcome.counts.requests else PASSED
 
 
-async def _play(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome:
-    environment = Environment(run)
-    try:
-        with Display(console) as display:
-            return await run_scenario(environment, launch_file, pace, display)
-    finally:
-        environment.children.forget()
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    del frame
+    let_nothing_interrupt()  # what is up is taken down on the way out
+    sys.exit(128 + number)
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
-    for line in outcome.complaints:
-        console.print(escape(line), highlight=False, soft_wrap=True)
     for what, seconds in outcome.steps_s.items():
         console.print(f"{what}: {seconds:.2f} s", highlight=False)
     if as_json:

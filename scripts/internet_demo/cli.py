@@ -15,7 +15,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Final
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Console
@@ -41,10 +41,6 @@ Examples:
 """
 
 app = new_app()
-
-
-class _Ended(Exception):  # noqa: N818  (not an error)
-    """A signal ends the demonstration; ``args[0]`` is its number."""
 
 
 @app.command(epilog=_EXAMPLES)
@@ -83,9 +79,6 @@ def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, conso
             signal.signal(each, _end)
         with Laboratory(run) as laboratory, Display(console) as display:
             outcome = play(laboratory, pace, display)
-    except _Ended as ended:
-        console.print("interrupted")
-        return 128 + int(ended.args[0])
     finally:
         let_nothing_interrupt()
         run.end()
@@ -93,9 +86,9 @@ def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, conso
     return FAILED if outcome.lost or outcome.doubled or not outcome.images else PASSED
 
 
-def _end(number: int, frame: FrameType | None) -> None:
+def _end(number: int, frame: FrameType | None) -> NoReturn:
     del frame
-    raise _Ended(number)
+    sys.exit(128 + number)
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:

@@ -40,9 +40,9 @@ class Display(StepDisplay):
 
 
 def _counts(traffic: Traffic) -> str:
-    got = ", ".join(f"{each.label} {len(each.counts)}" for each in traffic.readers.values())
+    got = ", ".join(f"{label} {count}" for label, count in traffic.counts.items())
     calls = traffic.calls
-    return f"{traffic.camera.sent} images ({got}), {calls.answered} of {calls.begun} calls"
+    return f"{len(traffic.images.sent_s)} images ({got}), {calls.answered} of {calls.begun} calls"
 
 
 def _ways(tunnels: Sequence[Link]) -> str:
@@ -133,15 +133,15 @@ def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcom
         traffic = Traffic(sessions["robot"], sessions["cloud-a"], readers, pace.rate_hz, pace.image_bytes)
         try:
             for text, act in _events(stage):
-                traffic.reset_pauses()
+                since_s = time.monotonic()
                 display.step(text)
                 act()
                 _watch(stage, traffic, display, pace.calm_s)
-                outcome.events.append(Event(text, max(each.longest_s for each in traffic.readers.values())))
+                outcome.events.append(Event(text, traffic.images.silence_ms(since_s, time.monotonic()) / 1e3))
         finally:
             traffic.end()
-        outcome.images, outcome.calls, outcome.lost = traffic.camera.sent, traffic.calls.begun, traffic.lost
-        outcome.doubled = sum(each.doubled for each in traffic.readers.values())
+        outcome.images, outcome.calls, outcome.lost = len(traffic.images.sent_s), traffic.calls.begun, traffic.lost
+        outcome.doubled = traffic.images.doubled
         outcome.reasons = list(traffic.calls.reasons)
     return outcome
 

@@ -343,7 +343,7 @@ def test_the_camera_is_compressed_on_a_thin_link() -> None:
 
 def test_ours_is_compared_with_the_better_transport_of_zenoh() -> None:
     over = Rounds()
-    for name, value in (("zenoh-tls-drop", 5.0), ("zenoh-quic-drop", 3.0), ("cyclone-wireguard", 1.0)):
+    for name, value in (("zenoh-tls-drop", 5.0), ("zenoh-quic-drop", 3.0), ("gdp", 1.0)):
         over.add(name, "case", "column", value)
     assert uplink.better_zenoh(over, "case", "column", at_most=True) == "zenoh-quic-drop"
     assert uplink.better_zenoh(over, "case", "column", at_most=False) == "zenoh-tls-drop"

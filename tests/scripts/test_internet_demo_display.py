@@ -16,9 +16,10 @@ def test_a_line_of_progress_of_the_usual_counts_fits_100_columns(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(display, "_PLAIN_EVERY_S", 0.0)
-    readers = {name: SimpleNamespace(label=name, counts=range(988)) for name in ("cloud-a", "edge")}
     calls = SimpleNamespace(answered=987, begun=988)
-    traffic = SimpleNamespace(readers=readers, camera=SimpleNamespace(sent=988), calls=calls)
+    traffic = SimpleNamespace(
+        counts={"cloud-a": 988, "edge": 988}, images=SimpleNamespace(sent_s=range(988)), calls=calls
+    )
     ways = (("cloud-b", False), ("cloud-b", False), ("cloud-a", True), ("edge", True))
     tunnels = [Link(peer, "wlan0", is_direct, "198.51.100.2:51820") for peer, is_direct in ways]
     display.Display(Console(width=160)).show((), {"robot": tunnels}, cast(Any, traffic))

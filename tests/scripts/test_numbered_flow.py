@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from numbered_flow import NumberedFlow
 
+from internet.flow import NumberedFlow
 from lab.process import FailedError, until
 
 
@@ -13,7 +13,7 @@ def flow() -> NumberedFlow:
     """Return a flow of five messages, a second apart, of which number 1 came twice and number 3 never."""
     made = NumberedFlow.__new__(NumberedFlow)
     made.sent_s = [10.0, 11.0, 12.0, 13.0, 14.0]
-    made.arrivals = [(10.25, 0), (11.5, 1), (11.75, 1), (12.25, 2), (14.25, 4)]
+    made.arrivals = [[(10.25, 0), (11.5, 1), (11.75, 1), (12.25, 2), (14.25, 4)]]
     return made
 
 

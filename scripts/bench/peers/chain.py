@@ -8,12 +8,11 @@ right end .2; the three in the middle forward IPv4::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from machine import offload_text, offloads, set_offloads
+from machine import clear_offloads
 from pyroute2 import IPRoute
 from testbed import Lab, add_address
 
@@ -42,18 +41,12 @@ def routes(node: str) -> dict[str, str]:
 
 
 class Chain(Lab):
-    """The five machines, addressed and routed. Raises ``LocalError``: the kernel refuses."""
+    """The five machines, addressed and routed, without offloads. Raises ``LocalError``: the kernel refuses."""
 
     def __init__(self, mtu: int, run: Run) -> None:
         super().__init__(run, row(mtu))
-        self.mtu = mtu
         for node in NODES:
             self.inside(node, partial(_number, node))
-
-    def set_offloads(self, *, on: bool) -> str:
-        """Switch the offloads of every device of the row; return the states that the devices report."""
-        found = [self.inside(node, partial(_switch_offloads, _neighbours(node), on=on)) for node in NODES]
-        return offload_text([one for each in found for one in each])
 
 
 def _neighbours(node: str) -> tuple[str, ...]:
@@ -64,14 +57,9 @@ def _neighbours(node: str) -> tuple[str, ...]:
 def _number(node: str) -> None:
     for other in _neighbours(node):
         add_address(other, address(node, other))
+        clear_offloads(other)
     with IPRoute() as here:
         for network, gateway in routes(node).items():
             here.route("add", dst=network, gateway=gateway)
     if node in MIDDLE:
         _FORWARD.write_text("1", encoding="ascii")
-
-
-def _switch_offloads(devices: Sequence[str], *, on: bool) -> list[dict[str, bool]]:
-    for device in devices:
-        set_offloads(device, on=on)
-    return [offloads(device) for device in devices]

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -32,7 +31,7 @@ from peers.jsonl import EndSettings, say
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE: Final = 16
 _FOREVER_S: Final = 3_600.0
-PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian; the answer needs one
+_PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian; the answer needs one
 
 
 @dataclass
@@ -40,27 +39,6 @@ class Opaque(IdlStruct, typename="bench::Opaque"):  # type: ignore[call-arg, mis
     """Any serialised message."""
 
     first: uint8
-
-
-def write(writer: DataWriter, message: bytes) -> None:
-    """Write a serialised message; a reliable writer waits while its cache is full, and then refuses by ``OSError``."""
-    if (result := ddspy_write(writer._ref, message)) < 0:
-        raise OSError(f"Cyclone DDS does not write: {result}")
-
-
-def waiting_for(participant: DomainParticipant, reader: DataReader) -> WaitSet:
-    """Return what waits for messages of a reader."""
-    waiting = WaitSet(participant)
-    waiting.attach(ReadCondition(reader, _ANY))
-    return waiting
-
-
-def take(reader: DataReader) -> Iterator[bytes]:
-    """Return the serialised messages that have come."""
-    taken = ddspy_take(reader._ref, _ANY, _AT_ONCE)
-    if not isinstance(taken, list):
-        raise OSError(f"Cyclone DDS does not read: {taken}")
-    return (message for message, info in taken if info.valid_data)
 
 
 class CycloneWay:
@@ -75,12 +53,14 @@ class CycloneWay:
         participant = DomainParticipant(0)
         self._writer = DataWriter(participant, Topic(participant, writes, Opaque), qos=qos)
         self._reader = DataReader(participant, Topic(participant, reads, Opaque), qos=qos)
-        self._waiting = waiting_for(participant, self._reader)
+        self._waiting = WaitSet(participant)
+        self._waiting.attach(ReadCondition(self._reader, _ANY))
         self._arrived = deque[bytes]()
 
     def send(self, message: bytes) -> None:
-        """Send a message."""
-        write(self._writer, message)
+        """Send a message; it waits while the cache is full, and then refuses by ``OSError``."""
+        if (result := ddspy_write(self._writer._ref, message)) < 0:
+            raise OSError(f"Cyclone DDS does not write: {result}")
 
     def receive(self, deadline_s: float) -> bytes | None:
         """Return the next message; None when the monotonic second has passed."""
@@ -89,13 +69,16 @@ class CycloneWay:
             if rest_s <= 0:
                 return None
             self._waiting.wait(int(rest_s * 1e9))
-            self._arrived.extend(take(self._reader))
+            taken = ddspy_take(self._reader._ref, _ANY, _AT_ONCE)
+            if not isinstance(taken, list):
+                raise OSError(f"Cyclone DDS does not read: {taken}")
+            self._arrived.extend(message for message, info in taken if info.valid_data)
         return self._arrived.popleft()
 
     def wait(self, deadline_s: float) -> bytes | None:
         """Return the next answer without its prefix; None when the monotonic second has passed."""
         message = self.receive(deadline_s)
-        return None if message is None else message[len(PREFIX) : len(PREFIX) + ANSWER.size]
+        return None if message is None else message[len(_PREFIX) : len(_PREFIX) + ANSWER.size]
 
 
 def main() -> None:
@@ -104,12 +87,12 @@ def main() -> None:
     os.environ["CYCLONEDDS_URI"] = settings.own["xml"]  # read when the participant is made
     if settings.role == "ping":
         pids = {"sender": [os.getpid()], **settings.pids}
-        say(series="cyclone", sizes=exchange(CycloneWay("ping", "pong"), settings.load, pids))
+        say(**exchange(CycloneWay("ping", "pong"), settings.size, settings.count, pids))
         return
     way = CycloneWay("pong", "ping")
     say(event="ready")
     while (message := way.receive(time.monotonic() + _FOREVER_S)) is not None:
-        way.send(PREFIX + answer_to(message))
+        way.send(_PREFIX + answer_to(message))
 
 
 if __name__ == "__main__":

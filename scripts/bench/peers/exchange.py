@@ -19,7 +19,6 @@ import struct
 import time
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 IMAGE: Final = "sensor_msgs/msg/Image"
@@ -27,25 +26,11 @@ PATIENCE_S: Final = 20.0
 ANSWER: Final = struct.Struct("!QII")  # number, bytes, CRC-32 or 0
 _NUMBER: Final = struct.Struct("!Q")
 _CHECKED: Final = 1 << 63  # in a number: answer with the CRC
-_LARGE_BYTES: Final = 100_000
 _GREETING_S: Final = 0.1
-_WARM_UP_SHARE: Final = 5  # a fifth more, before: windows open, caches fill
 
 # CDR_LE; stamp; frame_id "cam"; height 1, width; encoding "mono8"; is_bigendian, step; length of data.
 _IMAGE_HEAD: Final = struct.Struct("<4siII4sIII6sBxII")
 SIZE_MIN: Final = _IMAGE_HEAD.size + _NUMBER.size
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """Numbers and sizes of messages. ``count`` is for messages above 100 kB; of smaller ones four times as many."""
-
-    sizes: tuple[int, ...]
-    count: int
-
-    def repeats(self, size: int) -> int:
-        """Return how many messages of a size are measured."""
-        return self.count if size > _LARGE_BYTES else 4 * self.count
 
 
 class Way(Protocol):
@@ -76,28 +61,22 @@ def answer_to(message: bytes) -> bytes:
     return ANSWER.pack(number, len(message), zlib.crc32(message) if number & _CHECKED else 0)
 
 
-def exchange(way: Way, load: Load, pids: Mapping[str, Sequence[int]]) -> list[dict[str, object]]:
-    """Measure every size; return for each its ``size``, ``rtt_s`` of every message, and ``cpu_s`` a message by machine.
+def exchange(way: Way, size: int, count: int, pids: Mapping[str, Sequence[int]]) -> dict[str, object]:
+    """Measure ``count`` messages of a size; return ``rtt_s`` of every message, and ``cpu_s`` a message by machine.
 
     ``pids``: of the processes at each machine. Raises ``TimeoutError``: an answer did not come. Raises ``ValueError``:
     B received other bytes than were sent.
     """
     clocks = {place: [_clock(pid) for pid in each] for place, each in pids.items()}
-    numbers = iter(range(1, _CHECKED))
+    numbers, message = iter(range(1, _CHECKED)), image(size)
     _greet(way)
-    found: list[dict[str, object]] = []
-    for size in load.sizes:
-        message, repeats, rtts = image(size), load.repeats(size), list[float]()
-        _once(way, message, next(numbers) | _CHECKED)
-        for _ in range(repeats // _WARM_UP_SHARE):
-            _once(way, message, next(numbers))
-        before = _read(clocks)
-        for _ in range(repeats):
-            rtts.append(_once(way, message, next(numbers)))
-        after = _read(clocks)
-        cpu = {place: (after[place] - before[place]) / repeats for place in clocks}
-        found.append({"size": size, "rtt_s": rtts, "cpu_s": cpu})
-    return found
+    _once(way, message, next(numbers) | _CHECKED)
+    for _ in range(count):  # windows open, caches fill
+        _once(way, message, next(numbers))
+    before = _read(clocks)
+    rtts = [_once(way, message, next(numbers)) for _ in range(count)]
+    after = _read(clocks)
+    return {"rtt_s": rtts, "cpu_s": {place: (after[place] - before[place]) / count for place in clocks}}
 
 
 def _greet(way: Way) -> None:

@@ -11,19 +11,18 @@ import sys
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from peers.exchange import Load
-
 
 @dataclass(frozen=True, slots=True)
 class EndSettings:
     """Settings of an endpoint, the same for every baseline.
 
-    ``role``: ``ping`` (A) or ``pong`` (B). ``load``: what to measure. ``pids``: processes whose CPU counts, by machine;
-    A adds itself. ``own``: further settings of this baseline's endpoint.
+    ``role``: ``ping`` (A) or ``pong`` (B). ``size``, ``count``: of the measured messages. ``pids``: processes whose CPU
+    counts, by machine; A adds itself. ``own``: further settings of this baseline's endpoint.
     """
 
     role: str
-    load: Load
+    size: int
+    count: int
     pids: dict[str, list[int]]
     own: dict[str, str]
 
@@ -34,9 +33,7 @@ class EndSettings:
     @classmethod
     def from_argument(cls) -> EndSettings:
         """Read the only argument of this process."""
-        fields = json.loads(sys.argv[1])
-        load = Load(tuple(fields["load"]["sizes"]), fields["load"]["count"])
-        return cls(fields["role"], load, fields["pids"], fields["own"])
+        return cls(**json.loads(sys.argv[1]))
 
 
 def say(**values: object) -> None:

@@ -1,32 +1,29 @@
 """Baselines of the message bench: ways to carry a message on the row, each with its processes by machine.
 
-I/O. Starts processes. ``labels`` of a baseline are its rows: an encoding each, where it has several.
+I/O. Starts processes.
 
 GDP has a switch on each of the three in the middle, the RIB at s2, and a member at A and at B. Zenoh has a router on
-each of the three and a client at either end, with mutual TLS or plain TCP; every hop is a link of its own, so a message
-is encrypted and decrypted at each. Cyclone DDS is unsecured: peers by address, no multicast, the kernel forwards IPv4;
-all its other settings are the defaults, including its packet sizes.
+each of the three and a client at either end, with mutual TLS; every hop is a link of its own, so a message is encrypted
+and decrypted at each. Cyclone DDS is unsecured: peers by address, no multicast, the kernel forwards IPv4; all its other
+settings are the defaults, including its packet sizes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final, Literal, Protocol
 
-from testbed import Lab, OverlayNodes
+from testbed import OverlayNodes
 
 from gdp.trust.right import Right
-from lab.process import FailedError, LabProcess
+from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
 from peers.chain import NODES, Chain, address
-from peers.exchange import Load
-from peers.gdp_endpoint import PONG, ping_topic
+from peers.gdp_endpoint import PING, PONG
 from peers.jsonl import EndSettings
 
-ENCODINGS: Final = ("json", "cbor", "cdr")
 _GDP: Final = "peers.gdp_endpoint"
 _ZENOH: Final = "peers.zenoh_endpoint"
 _CYCLONE: Final = "peers.cyclone_endpoint"
@@ -34,101 +31,75 @@ _ZENOH_PORT: Final = 7447
 _READY_S: Final = 20.0
 _MEASURED_S: Final = 180.0
 
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One size by one baseline: seconds of every message, CPU seconds a message by machine.
-
-    ``resent``: retransmitted parts, over all sizes; known of GDP only.
-    """
-
-    label: str
-    size: int
-    rtt_s: tuple[float, ...]
-    cpu_s: dict[str, float]
-    resent: int = 0
+Measured = Mapping[str, Any]  # what ``exchange`` returns
+Pids = Mapping[str, Sequence[int]]
 
 
-class GdpNet:
-    """Switches with one data plane.
+class Baseline(Protocol):
+    """A way to carry messages."""
 
-    Args:
-        plane: as ``gdp-switch --data-plane``.
-        encodings: measured one after the other, by the same processes.
-        path: kind of endpoint: ``library``; ``unicast`` or ``session``: a request and its response, signed or under a
-            session secret.
-    """
+    @property
+    def name(self) -> str:
+        """Return the name of its row."""
 
-    def __init__(self, plane: str, encodings: tuple[str, ...], path: str = "library") -> None:
-        self.name = f"gdp-{plane}" if path == "library" else f"gdp-{plane}-{path}"
-        self._path = path
-        self.labels = tuple(f"{self.name} {encoding}" for encoding in encodings)
-        self._plane = plane
-        self._encodings = encodings
-
-    def measure(self, chain: Chain, load: Load) -> list[Measured]:
-        """Start switches, RIB, B, A.
+    def measure(self, chain: Chain, size: int, count: int) -> Measured:
+        """Start its processes, and measure messages of one size.
 
         Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
         """
-        with ExitStack() as stack:
-            nodes = OverlayNodes(chain, MIDDLE, plane=self._plane, label=self.name)
-            stack.callback(nodes.close)
-            between = [switch.pid for switch in nodes.switches]
-            pong = stack.enter_context(self._end(nodes, RIGHT, load, {}))
-            pong.read(_READY_S)
-            pids = {"receiver": [pong.pid], "between": between}
-            ping = stack.enter_context(self._end(nodes, LEFT, load, pids))
-            return ask_end(ping, dict(zip(self._encodings, self.labels, strict=True)))
 
-    def _end(self, nodes: OverlayNodes, node: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
-        pings = [ping_topic(encoding) for encoding in self._encodings]
-        published, read = (pings, [PONG]) if node == LEFT else ([PONG], pings)
-        rights = {Right.PUBLISH: published, Right.READ: read}
-        if self._path in ("unicast", "session"):
-            rights = {Right.CALL if node == LEFT else Right.SERVE: pings}
-        own = {
-            "config": str(nodes.admit_member(node, rights)),
-            "encodings": " ".join(self._encodings),
-            "path": self._path,
-        }
-        return start_end(nodes.lab, _GDP, node, load, own, pids)
+
+class GdpNet:
+    """Switches with the data plane ``kernel``. ``sign``: what authenticates messages."""
+
+    def __init__(self, sign: Literal["always", "session"]) -> None:
+        self.name = "gdp-kernel" if sign == "always" else "gdp-kernel-session"
+        self._sign = sign
+
+    def measure(self, chain: Chain, size: int, count: int) -> Measured:
+        """Start switches, RIB, B, A; as ``Baseline.measure``."""
+        with ExitStack() as stack:
+            nodes = OverlayNodes(chain, MIDDLE, plane="kernel", label=self.name)
+            stack.callback(nodes.close)
+            own = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
+            between = [switch.pid for switch in nodes.switches]
+            return _measured(stack, chain, _GDP, own, {"between": between}, (size, count))
+
+    def _admit(self, nodes: OverlayNodes, node: str) -> object:
+        if self._sign == "session":
+            return nodes.admit_member(node, {Right.CALL if node == LEFT else Right.SERVE: [PING]})
+        written, read = (PING, PONG) if node == LEFT else (PONG, PING)
+        return nodes.admit_member(node, {Right.PUBLISH: [written], Right.READ: [read]})
 
 
 class ZenohNet:
-    """Zenoh, secured or not."""
+    """Zenoh with mutual TLS."""
 
-    def __init__(self, *, secured: bool) -> None:
-        self._scheme = "tls" if secured else "tcp"
-        self.name = "zenoh-mtls" if secured else "zenoh-tcp"
-        self.labels = (self.name,)
+    name = "zenoh-mtls"
 
-    def measure(self, chain: Chain, load: Load) -> list[Measured]:
-        """Start routers from the left, then B, then A. Raises ``FailedError``: as ``GdpNet.measure``."""
+    def measure(self, chain: Chain, size: int, count: int) -> Measured:
+        """Start routers from the left, then B, then A; as ``Baseline.measure``."""
         with ExitStack() as stack:
             routers = []
             for before, node in zip(NODES, MIDDLE, strict=False):
-                own = {"listen": f"{self._scheme}/0.0.0.0:{_ZENOH_PORT}", **self._identity(chain, node)}
+                own = {"listen": f"tls/0.0.0.0:{_ZENOH_PORT}", **self._identity(chain, node)}
                 if before in MIDDLE:
                     own["connect"] = self._at(before, node)
-                routers.append(stack.enter_context(_router(chain, node, own)))
+                settings = EndSettings("router", 0, 0, {}, own)
+                started = chain.start(node, "zenoh_router", ["-m", _ZENOH, settings.to_argument()])
+                routers.append(stack.enter_context(started))
                 routers[-1].read(_READY_S)
-            pids = {"between": [each.pid for each in routers]}
-            pong = stack.enter_context(self._end(chain, RIGHT, MIDDLE[-1], load, {}))
-            pong.read(_READY_S)
-            ping = stack.enter_context(self._end(chain, LEFT, MIDDLE[0], load, {"receiver": [pong.pid], **pids}))
-            return ask_end(ping, {"zenoh": self.name})
+            ends = [
+                {"connect": self._at(router, node), **self._identity(chain, node)}
+                for node, router in ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))
+            ]
+            return _measured(stack, chain, _ZENOH, ends, {"between": [each.pid for each in routers]}, (size, count))
 
-    def _end(self, chain: Chain, node: str, router: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
-        own = {"connect": self._at(router, node), **self._identity(chain, node)}
-        return start_end(chain, _ZENOH, node, load, own, pids)
-
-    def _at(self, router: str, seen_from: str) -> str:
-        return f"{self._scheme}/{address(router, seen_from)}:{_ZENOH_PORT}"
+    def _at(self, router: str, towards: str) -> str:
+        return f"tls/{address(router, towards)}:{_ZENOH_PORT}"
 
     def _identity(self, chain: Chain, node: str) -> dict[str, str]:
-        if self._scheme != "tls":
-            return {}
+        """Return the path of a machine's certificate; the first call makes all of them."""
         directory = chain.directory / "tls"
         if not directory.exists():
             links = chain.topology.links
@@ -137,16 +108,10 @@ class ZenohNet:
         return {"certificate": str(directory / node)}
 
 
-def _router(chain: Chain, node: str, own: dict[str, str]) -> LabProcess:
-    settings = EndSettings("router", Load((), 0), {}, own)
-    return chain.start(node, "zenoh_router", ["-m", _ZENOH, settings.to_argument()])
-
-
 def cyclone_xml(own: str, other: str) -> str:
-    """Return the configuration of an end at the address ``own``, of IPv4 or IPv6, whose only peer is at ``other``."""
-    transport = "<Transport>udp6</Transport>" if ":" in own else ""
+    """Return the configuration of an end at the IPv4 address ``own``, whose only peer is at ``other``."""
     return (
-        f'<CycloneDDS><Domain id="any"><General>{transport}<Interfaces><NetworkInterface address="{own}"/></Interfaces>'
+        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{own}"/></Interfaces>'
         "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f'<MaxAutoParticipantIndex>1</MaxAutoParticipantIndex><Peers><Peer address="{other}"/></Peers></Discovery>'
         "</Domain></CycloneDDS>"
@@ -157,47 +122,30 @@ class CycloneNet:
     """Cyclone DDS, reliable."""
 
     name = "cyclone"
-    labels = ("cyclone",)
 
-    def measure(self, chain: Chain, load: Load) -> list[Measured]:
-        """Start B, then A. Raises ``FailedError``: as ``GdpNet.measure``."""
+    def measure(self, chain: Chain, size: int, count: int) -> Measured:
+        """Start B, then A; as ``Baseline.measure``."""
+        left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
+        own = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
         with ExitStack() as stack:
-            pong = stack.enter_context(_cyclone_end(chain, RIGHT, load, {}))
-            pong.read(_READY_S)
-            ping = stack.enter_context(_cyclone_end(chain, LEFT, load, {"receiver": [pong.pid]}))
-            return ask_end(ping, {"cyclone": self.name})
+            return _measured(stack, chain, _CYCLONE, own, {}, (size, count))
 
 
-def _cyclone_end(chain: Chain, node: str, load: Load, pids: dict[str, list[int]]) -> LabProcess:
-    left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
-    own, other = (left, right) if node == LEFT else (right, left)
-    return start_end(chain, _CYCLONE, node, load, {"xml": cyclone_xml(own, other)}, pids)
+BASELINES: Final[Mapping[str, Baseline]] = {
+    each.name: each for each in (GdpNet("always"), GdpNet("session"), ZenohNet(), CycloneNet())
+}
 
 
-Baseline: TypeAlias = "GdpNet | ZenohNet | CycloneNet"
+def _measured(
+    stack: ExitStack, chain: Chain, module: str, own: Sequence[dict[str, str]], pids: Pids, load: tuple[int, int]
+) -> Measured:
+    """Start the endpoints at B and A, whose settings ``own`` has in the other order; return the figures of A."""
 
+    def start(role: str, node: str, settings: dict[str, str], counted: Pids) -> LabProcess:
+        every = EndSettings(role, *load, {place: list(each) for place, each in counted.items()}, settings)
+        argv = ["-m", module, every.to_argument()]
+        return stack.enter_context(chain.start(node, module.rpartition(".")[2], argv))
 
-def start_end(
-    chain: Lab, module: str, node: str, load: Load, own: Mapping[str, str], pids: Mapping[str, Sequence[int]]
-) -> LabProcess:
-    """Start an endpoint, ``ping`` at A or ``pong`` at B."""
-    settings = EndSettings(
-        "ping" if node == LEFT else "pong", load, {place: list(each) for place, each in pids.items()}, dict(own)
-    )
-    return chain.start(node, module.rpartition(".")[2], ["-m", module, settings.to_argument()])
-
-
-def ask_end(ping: LabProcess, labels: Mapping[str, str]) -> list[Measured]:
-    """Return the figures of A.
-
-    ``labels``: row by the name that the endpoint uses. Raises ``FailedError``: it failed.
-    """
-    found: list[Measured] = []
-    for series, label in labels.items():
-        said = ping.read(_MEASURED_S)
-        sizes, resent = said.get("sizes"), said.get("resent", 0)
-        if said.get("series") != series or not isinstance(sizes, list) or not isinstance(resent, int):
-            raise FailedError(f"figures of {series} were expected, not {said}")
-        for each in sizes:
-            found.append(Measured(label, each["size"], tuple(each["rtt_s"]), dict(each["cpu_s"]), resent))
-    return found
+    pong = start("pong", RIGHT, own[1], {})
+    pong.read(_READY_S)
+    return start("ping", LEFT, own[0], {"receiver": [pong.pid], **pids}).read(_MEASURED_S)

@@ -89,7 +89,7 @@ def main() -> None:
     with zenoh.open(config) as session:
         if settings.role == "ping":
             pids = {"sender": [os.getpid()], **settings.pids}
-            say(series="zenoh", sizes=exchange(ZenohWay(session), settings.load, pids))
+            say(**exchange(ZenohWay(session), settings.size, settings.count, pids))
             return
         if settings.role == "pong":
             back = _publisher(session, _PONG)

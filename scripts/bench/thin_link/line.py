@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from machine import set_offloads
+from machine import clear_offloads
 from testbed import Lab, add_address, add_neighbour, mac_addresses
 
 from gdp.host.run_registry import Run
@@ -120,8 +120,8 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     for node, address in ADDRESSES.items():
         lab.inside(node, partial(add_address, LINE, address))
         _set_tcp_control(lab, node, tcp_control)
-        lab.inside(node, partial(set_offloads, LINE, on=False))
-        lab.inside(LINE, partial(set_offloads, node, on=False))
+        lab.inside(node, partial(clear_offloads, LINE))
+        lab.inside(LINE, partial(clear_offloads, node))
     macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
     for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
         lab.inside(node, partial(add_neighbour, LINE, ADDRESSES[other], macs[other]))  # no ARP crosses the link

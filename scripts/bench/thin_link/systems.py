@@ -6,26 +6,21 @@ I/O. Starts processes; a context manager ends them.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final, TypeAlias
 
-from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from peers.certificates import make_certificates
-from peers.systems import cyclone_xml
 from testbed import Lab, OverlayNodes
 
 from gdp.trust.right import Right
-from lab.process import FailedError, LabProcess
+from lab.process import LabProcess
 from thin_link.line import ADDRESSES, CLOUD, ROBOT
 from thin_link.traffic import streams
 
 _READY_S: Final = 45.0
 _MODULE: Final = "uplink_endpoint"
 _PORT: Final = 7_447
-_WIREGUARD_MTU: Final = 1_420
-_INNER: Final = {ROBOT: "fd00::1", CLOUD: "fd00::2"}
 
 Ends = tuple[LabProcess, LabProcess]
 
@@ -96,42 +91,7 @@ class Zenoh:
             yield ends
 
 
-class Cyclone:
-    """Two participants of Cyclone DDS in one WireGuard tunnel."""
-
-    name = "cyclone-wireguard"
-
-    @contextmanager
-    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, as ``Gdp.run``."""
-        with _tunnel(lab):
-            own = [{"xml": cyclone_xml(_INNER[a], _INNER[b])} for a, b in ((ROBOT, CLOUD), (CLOUD, ROBOT))]
-            with _both(lab, "cyclone", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
-                yield ends
-
-
-@contextmanager
-def _tunnel(lab: Lab) -> Iterator[None]:
-    """Make a WireGuard tunnel between robot and cloud; names of devices are unique on the host."""
-    keys, tag = {node: X25519PrivateKey.generate() for node in ADDRESSES}, os.urandom(3).hex()
-    with ExitStack() as stack:
-        for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
-            settings = {
-                "ifname": f"u{tag}{node}",
-                "key": keys[node].private_bytes_raw().hex(),
-                "peer_key": keys[other].public_key().public_bytes_raw().hex(),
-                "peer_address": ADDRESSES[other],
-                "inner": _INNER[node],
-                "peer_inner": _INNER[other],
-                "mtu": _WIREGUARD_MTU,
-            }
-            device = stack.enter_context(start_role(lab, node, "wireguard", settings, has_orders=True))
-            if "backend" not in device.read(_READY_S):
-                raise FailedError("the WireGuard device did not say that it is ready")
-        yield
-
-
-System: TypeAlias = "Gdp | Zenoh | Cyclone"
+System: TypeAlias = "Gdp | Zenoh"
 
 SYSTEMS: Final[Mapping[str, System]] = {
     each.name: each
@@ -141,6 +101,5 @@ SYSTEMS: Final[Mapping[str, System]] = {
         Zenoh("tls", "block"),
         Zenoh("quic", "drop"),
         Zenoh("quic", "block"),
-        Cyclone(),
     )
 }

@@ -1,6 +1,8 @@
-"""Cluster of ``recovery.py`` and of figures 4 and 9: machines of the provider ``local``, a robot, and a calling node.
+"""Cluster of ``fog`` with the provider ``local``: machines that serve, a robot, and a node there that calls.
 
-I/O. A run owns what this module makes; ``fog down`` ends what ``fog`` makes for it, also after a crash.
+I/O. The demonstration, ``recovery.py`` and figures 4 and 9 run on it. Resources of ``fog`` outlive this process, like
+machines of a cloud. A run therefore ends with ``fog down``, and records lead to the leftovers of a killed run. The
+records are in a separate folder, which no other program sweeps.
 """
 
 from __future__ import annotations
@@ -9,36 +11,76 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final, TypeVar
-
-from report import progress
-from testbed import Lab, ros_environment
 
 from fog.providers.local import fault_injection
 from fog.site import open_site
 from fog.supervisor.background import pid_of
 from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
-from fog.supervisor.journal import Journal
-from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
+from fog.supervisor.journal import Entry, Journal
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run, RunRegistry, outer_uid
+from lab.dds import ros_environment
+from lab.namespaces import Namespaces
 from lab.process import FailedError, LabProcess, until
 from lab.topology import single
 
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 DEDICATED, REPLICA = "dedicated", "replica"
 ROBOT: Final = "robot"
+STATE: Final = "state"
 _DOMAIN: Final = 30
-_REPORT_S: Final = 1.0
+_REPORT_S: Final = 0.5
 _DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
 _PATIENCE_S: Final = 90.0
 _LAUNCH_S: Final = 200.0
+_DOWN_S: Final = 60.0
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Cluster")
+
+
+def standing_runs(what: str) -> RunRegistry:
+    """Return the records of runs of one kind, such as ``demo``, with machines of ``fog``.
+
+    Raises ``LocalError``: the folder belongs to another user.
+    """
+    return RunRegistry(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
+
+
+def sweep(runs: RunRegistry) -> list[str]:
+    """Take down the leftovers of killed runs; return their ids."""
+    dead = [each.run for each in runs.all() if each.dead]
+    for run in dead:
+        end_all_of(runs.resume(run))
+    return dead
+
+
+def end_all_of(run: Run) -> None:
+    """Release the machines of a run, and take down the rest.
+
+    Raises ``LocalError``: machines remain; the text has the output of ``fog down``.
+    """
+    if (run.directory / STATE).exists():
+        argv = [sys.executable, *_fog_command(run, ["down", "--all"])]
+        ended = subprocess.run(argv, capture_output=True, text=True, timeout=_DOWN_S, check=False)
+        if ended.returncode:
+            raise LocalError(f"run {run.id}: fog down: {(ended.stderr or ended.stdout).strip()}")
+    run.end()
+
+
+def _fog_command(run: Run, words: Sequence[str]) -> list[str]:
+    return ["-m", "fog.cli.app", *words, "--state", str(run.directory / STATE)]
+
+
+def _note(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 class Cluster:
@@ -48,23 +90,39 @@ class Cluster:
         launch_files: their texts; each has one ``FogCluster``.
         machines: how many; more than the launch files have only where there is one.
         gateway: ``DEDICATED`` or ``REPLICA``.
+        kind: of the run's records.
+        note: shows progress.
+
+    Attributes:
+        meanwhile: is called while this waits, and waits a moment itself; None: nothing is.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up.
     """
 
-    def __init__(self, launch_files: Sequence[str], machines: int, gateway: str) -> None:
+    def __init__(
+        self,
+        launch_files: Sequence[str],
+        machines: int,
+        gateway: str,
+        *,
+        kind: str = "bench",
+        note: Callable[[str], object] = _note,
+    ) -> None:
         self.gateway = gateway
+        self.meanwhile: Callable[[], object] | None = None
+        self._note = note
         self._machines_wanted = machines
-        runs = standing_runs("bench")
-        sweep(runs)
+        runs = standing_runs(kind)
+        for swept in sweep(runs):
+            note(f"took down what run {swept} had left behind")
         self._run = runs.start()
         with ExitStack() as undo:
             undo.callback(end_all_of, self._run)
-            self._lab = Lab(self._run, single(ROBOT))
+            self._space = Namespaces(single(ROBOT), self._run)[ROBOT]
             self._environment = ros_environment(self._run.directory, _DOMAIN)
-            progress(f"{machines} machines boot, gateway: {gateway}")
+            note(f"{machines} machines boot, gateway: {gateway}")
             path = self._run.directory / "cluster.launch.py"
             for text in launch_files:
                 path.write_text(text, encoding="utf-8")
@@ -73,7 +131,7 @@ class Cluster:
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             if (missing := machines - len(self.machines())) > 0:
                 self._fog("scale", "up", str(missing))
-            _until(lambda: all(each.is_serving for each in self.machines()), "all machines that serve")
+            self._until(lambda: all(each.is_serving for each in self.machines()), "all machines that serve")
             self._runs = local_provider(self._site).runs
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
@@ -88,8 +146,13 @@ class Cluster:
         """Let the robot's node call ``/echo``; return when it is answered."""
         parameters = {"rate_hz": rate_hz, "report_s": _REPORT_S, "depth": _DEPTH}
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-        self._caller = self._undo.enter_context(self._start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
-        _until(lambda: self._caller.read(_PATIENCE_S)["answered"], "an answer to the robot's node")
+        self._caller = self._undo.enter_context(self.start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
+        self._until(lambda: self._caller.read(_PATIENCE_S)["answered"], "an answer to the robot's node")
+
+    def reports(self) -> Iterator[dict[str, object]]:
+        """Yield the lines that the robot's node has printed since the last one was read."""
+        while self._caller.has_line(0.0):
+            yield self._caller.read(_PATIENCE_S)
 
     def oldest(self) -> Record:
         """Return the machine that has served for longest."""
@@ -98,7 +161,7 @@ class Cluster:
 
     def gateway_machine(self) -> Record:
         """Return the machine that is the gateway."""
-        return _until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
+        return self._until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
 
     def longest_silence(self, after_s: float) -> float:
         """Return the longest time without an answer from this moment until now, in seconds."""
@@ -129,19 +192,23 @@ class Cluster:
         if pid is None:
             raise FailedError("no supervisor lives")
         os.kill(pid, signal.SIGKILL)
-        _until(lambda: pid_of(self._site) is None, "the supervisor's end")
+        self._until(lambda: pid_of(self._site) is None, "the supervisor's end")
 
     def start_supervisor(self) -> float:
         """Start a supervisor; return the time, in seconds since 1970."""
         self._supervisors.close()
         at_s = time.time()
-        self._supervisors.enter_context(self._start("supervisor", fog_command(self._run, ["supervise"])))
+        self._supervisors.enter_context(self.start("supervisor", _fog_command(self._run, ["supervise"])))
         return at_s
 
-    def machines(self) -> list[Record]:
-        """Return all machines that are not gone."""
+    def machines(self, *, gone: bool = False) -> list[Record]:
+        """Return all machines; ``gone``: those that are gone, too."""
         plans = (each.plan for each in self._journal.clusters())
-        return [each for plan in plans for each in self._journal.machines(plan.name, gone=False)]
+        return [each for plan in plans for each in self._journal.machines(plan.name, gone=gone)]
+
+    def events(self, after: int = 0) -> list[Entry]:
+        """Return the journal's events whose number is above ``after``."""
+        return self._journal.events(after=after)
 
     def replacement(self, after_s: float) -> Record | None:
         """Return the first machine that was requested after this moment and serves."""
@@ -149,7 +216,7 @@ class Cluster:
 
     def await_replacement(self, after_s: float) -> Record:
         """Return the replacement when it serves."""
-        return _until(lambda: self.replacement(after_s), "a replacement that serves")
+        return self._until(lambda: self.replacement(after_s), "a replacement that serves")
 
     def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
         """Return when one of these events was recorded of a machine, or of any, in seconds since 1970."""
@@ -158,7 +225,7 @@ class Cluster:
             found = (e for e in self._journal.events() if machine in (None, e.machine) and e.what in what)
             return next((each.unix_s for each in found if each.unix_s >= after_s), None)
 
-        return _until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
+        return self._until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
 
     def await_whole(self, victim: Record) -> None:
         """Return when this machine is gone and the wanted number of other machines serve."""
@@ -168,31 +235,45 @@ class Cluster:
             is_rid = all(each.name != victim.name for each in there)
             return is_rid and len(there) == self._machines_wanted and all(each.is_serving for each in there)
 
-        _until(is_whole, "as many machines as are wanted that serve, and no other")
+        self._until(is_whole, "as many machines as are wanted that serve, and no other")
 
-    def end_caller(self) -> dict[str, float]:
-        """End the robot's node; return how many requests it made, and how many failed."""
+    def end_caller(self) -> dict[str, object]:
+        """End the robot's node; return its last line, in which all calls have ended. Its complaints are noted."""
         os.kill(self._caller.pid, signal.SIGUSR1)
         while not (said := self._caller.read(_PATIENCE_S))["done"]:
             pass  # an earlier line of progress
-        for line in (self._run.directory / f"caller-at-{ROBOT}.log").read_text(encoding="utf-8").splitlines():
-            progress(f"caller: {line}")
-        calls, answered, wrong, unserved = (int(str(said[key])) for key in ("calls", "answered", "wrong", "unserved"))
-        return {"requests": calls + unserved, "failed": calls - answered + wrong + unserved}
+        for line in self._caller.log.read_text(encoding="utf-8", errors="replace").splitlines():
+            self._note(f"caller: {line}")
+        return said
+
+    def start(self, what: str, arguments: Sequence[str]) -> LabProcess:
+        """Start Python at the robot, with the environment of ROS; ``what`` names its log."""
+        argv = self._space.command(["env", *self._environment, sys.executable, *arguments])
+        return LabProcess(self._run, what, argv)
+
+    def inside(self, work: Callable[[], T]) -> T:
+        """Call ``work`` in the robot's namespace."""
+        return self._space.inside(work)
 
     def _fog(self, *words: str) -> None:
-        argv = [sys.executable, *fog_command(self._run, words)]
-        command = self._lab.command(ROBOT, argv, self._environment)
+        argv = ["env", *self._environment, sys.executable, *_fog_command(self._run, words)]
+        command = self._space.command(argv)
         ended = subprocess.run(command, capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
         if ended.returncode:
             raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
 
-    def _start(self, what: str, arguments: Sequence[str]) -> LabProcess:
-        return self._lab.start(ROBOT, what, arguments, self._environment)
+    def _until(self, found: Callable[[], T | None], what: str) -> T:
+        """Poll until a state is reached that sends no event."""
+        value = until(found, lambda: what, _PATIENCE_S, self.meanwhile)
+        assert value
+        return value
 
 
-def _until(found: Callable[[], T | None], what: str) -> T:
-    """Poll until a state is reached that sends no event."""
-    value = until(found, lambda: what, _PATIENCE_S)
-    assert value
-    return value
+def requests_in(said: dict[str, object]) -> tuple[int, int]:
+    """Return how many requests a line of the robot's node counts, and how many of them failed.
+
+    Requests that were not sent for lack of a server count; those under way have failed in the last line.
+    """
+    count = {key: int(str(said[key])) for key in ("calls", "failed", "wrong", "unserved", "under_way")}
+    left = count["under_way"] if said["done"] else 0
+    return count["calls"] + count["unserved"], count["failed"] + count["wrong"] + count["unserved"] + left
