@@ -19,19 +19,20 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.table import Table
 from internet.laboratory import Laboratory
 from internet.space import TOOLS
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import python_path
 from netns_tests import lifetimes
-from netns_tests.spaces import Space
-from tests.clones import make_clone
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
-from tests.script_packages import share_script_packages
+from tests.pages import ROOT
 
 MakeKernel = Callable[..., KernelPlane]
 PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
 
 
 def pytest_configure() -> None:
-    """Let the processes that tests start import the ring and the demonstration."""
-    share_script_packages()
+    """Let the processes that tests start import the project and its laboratory."""
+    os.environ["PYTHONPATH"] = python_path()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -59,11 +60,31 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(_REASON)
 
 
+def _make_clone(tree: Path) -> None:
+    """Clone this tree into a folder that does not exist; skips the test where it is no clone itself."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("this tree is no clone of its repository")
+    _git("clone", "--quiet", str(ROOT), str(tree))
+    changed = _git("-C", str(ROOT), "diff", "--name-only", "-z", "HEAD")
+    added = _git("-C", str(ROOT), "ls-files", "--others", "--exclude-standard", "-z")
+    for path in filter(None, f"{changed}{added}".split("\0")):
+        if (ROOT / path).exists():
+            (tree / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / path, tree / path)
+        else:
+            (tree / path).unlink()
+
+
+def _git(*words: str) -> str:
+    argv = ["git", "-c", "safe.directory=*", *words]
+    return subprocess.run(argv, check=True, capture_output=True, text=True).stdout
+
+
 @pytest.fixture(scope="session")
 def in_clone(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Return a function that runs a script by its path in a clone that has nothing around it."""
     tree = tmp_path_factory.mktemp("clone") / "main"
-    make_clone(tree)
+    _make_clone(tree)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tree), str(tree / "scripts")))}
 
     def run(script: str, *words: str, patience_s: float) -> subprocess.CompletedProcess[str]:
@@ -80,6 +101,13 @@ def space() -> Iterator[Space]:
     """Network namespace of its own, in which the test runs."""
     with Space() as entered:
         yield entered
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Iterator[LabMachine]:
+    """LabMachine in the namespace of the test, for the processes that it starts."""
+    with LabMachine(tmp_path) as made:
+        yield made
 
 
 @pytest.fixture

@@ -27,18 +27,18 @@ from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Role
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import Run
 from gdp.stores.keyring import load_identity
 from lab.credentials import Carried, Kind, OverlayCredentials, Side
+from lab.machine import LabMachine
 from lab.namespaces import Namespaces
-from lab.process import LabProcess, end_processes
+from lab.process import LabProcess, new_run, python_path
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
 from tests.proxy.endpoints.dds_peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
-from tests.script_packages import PYTHON_PATH
 
 PATIENCE_S: Final = 30.0
 _MASTER: Final = "http://127.0.0.1:11311"
@@ -56,7 +56,6 @@ _ENVIRONMENT: Final = {
     "CYCLONEDDS_URI": CYCLONE,
     "ROS_MASTER_URI": _MASTER,
     "ROS_HOSTNAME": "127.0.0.1",
-    "PYTHONPATH": PYTHON_PATH,
 }
 _TOPOLOGY: Final = Topology(
     links=(Link("a", "b"),),
@@ -105,7 +104,6 @@ class Proxy:
     def __init__(self, pair: Pair, label: str) -> None:
         self._pair = pair
         self._label = label
-        self._log = pair.folder / f"proxy-{label}.log"
         self._process: LabProcess | None = None
         self._port = 9_110 + list(_GRAPHS).index(label)
 
@@ -133,19 +131,17 @@ class Proxy:
     @property
     def said(self) -> str:
         """Return its log since the first start."""
-        return self._log.read_text()
+        return (self._pair.folder / f"proxy-{self._label}.log").read_text()
 
     def start(self) -> None:
         """Start it; return when it is attached."""
-        argv = ["proxy.cli.proxy", "--config", str(self._pair.write_proxy(self._label, self._port))]
-        self._process = self._pair.start(self.machine, argv, self._log, " is attached", self._label)
+        self._process = self._pair.start_proxy(self._label, self._port)
 
     def end(self, how: signal.Signals = signal.SIGTERM) -> None:
         """End it, by signal or kill; idempotent."""
         process, self._process = self._process, None
         if process is not None:
-            process.send(how)
-            process.reap(PATIENCE_S)
+            process.finish(how, PATIENCE_S)
 
     def warnings(self, name: str) -> list[str]:
         """Return its warnings about a local name: fault and detail."""
@@ -180,7 +176,12 @@ class Pair:
         self.folder = run.directory
         self.spaces = Namespaces(_TOPOLOGY, run)
         self._undo = undo
-        self._run = run
+        self.machines = {
+            each: undo.enter_context(LabMachine(self.folder, self.spaces[each].command([]), run=run))
+            for each in _TOPOLOGY.nodes
+        }
+        for each in self.machines.values():
+            each.environment |= {**_ENVIRONMENT, "ROS_LOG_DIR": str(self.folder / "ros")}
         self._crossings = crossings
         self._hidden = hidden
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
@@ -188,9 +189,9 @@ class Pair:
         self._nodes: dict[str, Peer] = {}
         self._credentials = OverlayCredentials(_TOPOLOGY, self.folder, lease_s=LEASE_S)
         for machine in _TOPOLOGY.nodes:
-            self._start_node(machine, "switch", self._credentials.switch(machine, "auto"))
+            self.machines[machine].start("switch", self._credentials.switch(machine, "auto").stem)
         (rib,) = _TOPOLOGY.attached("rib")
-        self._start_node(rib.switch, "rib", self._credentials.rib(rib))
+        self.machines[rib.switch].start("rib", self._credentials.rib(rib).stem)
 
     def proxy(self, label: str) -> Proxy:
         """Return a running proxy."""
@@ -221,14 +222,15 @@ class Pair:
         """Limit the traffic from machine "a" to "b", such as ``20mbit``; empty: no limit."""
         words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
         change = words if rate else ["del", "dev", "b", "root"]
-        subprocess.run(self.spaces["a"].command(["tc", "qdisc", *change]), check=True)
+        self.machines["a"].output("tc", "qdisc", *change)
 
     def start_master(self) -> None:
         """Start the ROS 1 master, if it does not run."""
         if self._master is None:
             need_ros1()
-            argv = ["ring.nodes.master", _MASTER.rpartition(":")[2]]
-            self._master = self.start("b", argv, self.folder / "master.log", "ready")
+            argv = [sys.executable, "-m", "ring.nodes.master", _MASTER.rpartition(":")[2]]
+            self._master = self.machines["b"].launch(argv, "master")
+            self._master.read_until("ready", patience_s=PATIENCE_S)
 
     def stop_master(self) -> None:
         """Kill the ROS 1 master."""
@@ -236,20 +238,19 @@ class Pair:
         assert process is not None
         process.kill_group()
 
-    def start(self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = "") -> LabProcess:
-        """Start a command of ours on a machine; return it when it has printed this."""
-        words = [*self.spaces[machine].command([]), *self._environment(graph)]
-        if graph in self._hidden:
-            words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
-        words += [sys.executable, "-m", *argv]
-        process = LabProcess(self._run, argv[0], words, environment=_ENVIRONMENT, log=log)
-        self._undo.callback(end_processes, [process], PATIENCE_S)
-        while sign.encode() not in process.read_line(PATIENCE_S):
-            pass
-        return process
+    def start_proxy(self, label: str, port: int) -> LabProcess:
+        """Start a proxy, and return it when it is attached."""
+        config, words = self._write_proxy(label, port), self._environment(label)
+        if label in self._hidden:
+            words.append(f"PYTHONPATH={python_path(self._hide(self._hidden[label]))}")
+        machine = self.machines[self._proxies[label].machine]
+        return machine.ready(machine.launch_node("proxy", config.stem, before=words))
 
-    def write_proxy(self, label: str, port: int) -> Path:
-        """Make a proxy's keys, delegations and file; return the file."""
+    def identity(self, label: str, role: Role = Role.PROXY) -> Path:
+        """Return the directory of a node's keys."""
+        return self._credentials.identity(role, label)
+
+    def _write_proxy(self, label: str, port: int) -> Path:
         if (path := self._credentials.file("proxy", label)).exists():
             return path
         (at,) = (each for each in _TOPOLOGY.attached("proxy") if each.ifname == f"to_{label}")
@@ -259,13 +260,6 @@ class Pair:
             "import": [each.carried for each in self._crossings if label in each.readers.split()],
         }
         return self._credentials.proxy(at, rules, label=label, ros=_GRAPHS[label], metrics={"port": port})
-
-    def identity(self, label: str, role: Role = Role.PROXY) -> Path:
-        """Return the directory of a node's keys."""
-        return self._credentials.identity(role, label)
-
-    def _start_node(self, machine: str, role: str, path: Path) -> None:
-        self.start(machine, [f"gdp.cli.{role}", "--config", str(path)], path.with_suffix(".log"), " is up")
 
     def _hide(self, package: str) -> Path:
         """Return a folder, first on the path, that holds only an empty package of this name."""
@@ -277,7 +271,7 @@ class Pair:
         machine = "a" if graph == "a" else "b"
         words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph == "one":
-            logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{PYTHON_PATH}"}
+            logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": python_path(Path(need_ros1()))}
             node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})
         else:
             node = Peer(name, words, _ENVIRONMENT)
@@ -294,9 +288,7 @@ class Pair:
 @contextmanager
 def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> Iterator[Pair]:
     """Two machines with proxies for these rules; ``hidden``: a package that a proxy lacks. All ends on leaving."""
-    run = RunRegistry().start()
-    with ExitStack() as undo:
-        undo.callback(run.end)
+    with new_run() as run, ExitStack() as undo:
         yield Pair(run, undo, crossings, hidden or {})
 
 

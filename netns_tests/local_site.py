@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -17,11 +16,13 @@ from fog.providers.local.provider import LocalProvider
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
+from gdp.stores.issue import delegate, install_delegation, make_node
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from lab.process import LabProcess, end_processes
-from tests.pages import ROOT
+from lab.credentials import make_nodes
+from lab.machine import LabMachine, NodeProgram
+from lab.process import LabProcess, calling, python_path
+from netns_tests import uplink_child
 
 PATIENCE_S: Final = 30.0
 _TICKS: Final = "import time\nprint('ready')\nwhile True:\n    time.sleep(0.01)\n    print('tick')"
@@ -79,8 +80,8 @@ class Domain:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._running: list[LabProcess] = []
-        make_domain(folder / "domain", "test")
+        self._robot = LabMachine(folder / "robot")
+        make_nodes(folder, {})
 
     def gateway(self, label: str, ifaces: Sequence[str]) -> MachineBundle:
         """Return the nodes of a gateway."""
@@ -103,8 +104,15 @@ class Domain:
         files |= {f"proxy/{path.relative_to(keys)}": path.read_bytes() for path in keys.rglob("*") if path.is_file()}
         words = (served.to_text(), "{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
         wait = 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"'
-        member = ("env", f"PYTHONPATH={ROOT}", "sh", "-c", wait, "member")  # a machine has no checkout of the tests
-        program = Program("proxy", (*member, "{python}", "-m", "netns_tests.uplink_child", *words), "up")
+        member = (
+            "env",
+            f"PYTHONPATH={python_path()}",
+            "sh",
+            "-c",
+            wait,
+            "member",
+        )  # a machine has no checkout of tests
+        program = Program("proxy", (*member, "{python}", *calling(uplink_child.main, *words)[1:]), "up")
         return MachineBundle(files, (_command("switch", "gdp.cli.switch"), program))
 
     def start_robot(self, uplink: str, *attach: str) -> None:
@@ -117,22 +125,18 @@ class Domain:
         keys, name = self._member("client", service, Right.CALL)
         root = self._folder / "domain" / ROOT_CERTIFICATE
         words = [name.to_text(), str(keys), str(root), iface, "call", str(requests), str(size)]
-        argv = [sys.executable, "-m", "netns_tests.uplink_child", *words]
-        client = LabProcess(None, "client", argv, log=self._folder / "client.log", has_orders=True)
-        self._running.append(client)
+        client = self._robot.launch(calling(uplink_child.main, *words), "client", has_orders=True)
         assert client.read_line(PATIENCE_S) == b"up"
         return client
 
     def close(self) -> None:
         """End the robot's side."""
-        end_processes(self._running, PATIENCE_S)
+        self._robot.close()
 
     def _member(self, label: str, service: Metadata, right: Right) -> tuple[Path, Name]:
-        keys = self._folder / f"member-{label}"
+        keys, owner = self._folder / f"member-{label}", self._folder / "owner"
         make_node(keys, Role.PROXY, label, self._folder / "domain")
-        if not (self._folder / "owner").exists():
-            make_owner(self._folder / "owner")
-        given = delegate(self._folder / "owner", keys / CARD, service, [right])
+        given = delegate(owner, keys / CARD, service, [right])
         install_delegation(keys, given)
         return keys, given.name
 
@@ -147,15 +151,12 @@ class Domain:
         reported = {"identity": role.value, "domain": {"root": f"{role.value}/root.crt"}, **content}
         return {**files, f"{role.value}.yaml": yaml.safe_dump(reported).encode()}
 
-    def _start(self, role: str, files: Mapping[str, bytes]) -> None:
-        home = self._folder / "robot"
+    def _start(self, role: NodeProgram, files: Mapping[str, bytes]) -> None:
         for path, content in files.items():
-            (home / path).parent.mkdir(parents=True, exist_ok=True)
-            (home / path).write_bytes(content)
-            (home / path).chmod(0o600)
-        argv = [sys.executable, "-m", f"gdp.cli.{role}", "--config", str(home / f"{role}.yaml")]
-        self._running.append(LabProcess(None, role, argv, log=home / f"{role}.log"))
-        assert b" is up" in self._running[-1].read_line(PATIENCE_S)
+            (self._robot.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (self._robot.folder / path).write_bytes(content)
+            (self._robot.folder / path).chmod(0o600)
+        self._robot.start(role, role)
 
 
 def _command(role: str, module: str, sign: str = " is up") -> Program:

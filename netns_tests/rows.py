@@ -19,9 +19,9 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import NOWHERE, Table
-from netns_tests.spaces import Space
+from lab.namespaces import Space
+from lab.process import until
 from netns_tests.test_planes import LOOK_S, far_end
-from tests.waiting import until
 
 B, UNKNOWN, NOWHERE_NAME, FORGOTTEN = (bytes([0xE0 + n]) * 32 for n in range(4))
 KINDS: Mapping[str, Callable[[Sequence[str], Table], NetdevPlane]] = {"raw": RawPlane, "kernel": KernelPlane}

@@ -10,31 +10,29 @@ that news (in the tests: the next poll). It counts as forwarded.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import DropReason, LocalError
+from gdp.frame.codec import decode
+from gdp.frame.kinds import Flag
 from gdp.ports import sockets
+from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import LabProcess, calling
 from netns_tests.rows import FORGOTTEN, KINDS, NOWHERE_NAME, UNKNOWN, B, Row, frame, mac_of
-from netns_tests.spaces import Space
 from netns_tests.test_planes import PATIENCE_S, far_end, poll_until
 
 pytestmark = pytest.mark.netns
 
 MakeRow = Callable[..., Row]
-ROOT = Path(__file__).parents[1]
-WHERE = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
 
 @pytest.fixture(params=list(KINDS))
@@ -102,12 +100,12 @@ def test_a_link_that_is_taken_down_under_a_stream_costs_only_what_is_counted(lay
     row = lay()
     row.send(*[frame()] * 40)
     row.poll(0)
-    row.space.ip("set", end, "down")
+    row.space.ip("link", "set", end, "down")
     row.send(*[frame()] * 40)  # before the switches receive the link event
     row.until(lambda: not row.planes[1].port_state(1))
     row.send(*[frame()] * 40)
     row.settle()
-    row.space.ip("set", end, "up")
+    row.space.ip("link", "set", end, "up")
     row.until(lambda: row.planes[1].port_state(1) and row.planes[2].port_state(0))
     before = len(row.delivered)
     row.send(*[frame()] * 40)
@@ -123,7 +121,7 @@ def test_what_had_arrived_from_a_device_that_is_deleted_goes_on_and_the_rest_is_
     row.send(*[frame(number=number) for number in range(500)])
     for _ in range(50):
         row.poll(0, 1)  # now they wait at the third switch, unless the kernel has brought them to B
-    row.space.ip("del", "c0")
+    row.space.ip("link", "del", "c0")
     row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
     row.send(*[frame()] * 40)
     row.settle()
@@ -137,7 +135,7 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
         row.send(*[frame()] * 100)
         row.poll()
         row.discarded += discarded("c1")  # sent by the second switch before the third had opened the device
-        row.space.ip("del", "c0")
+        row.space.ip("link", "del", "c0")
         row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
         row.send(*[frame()] * 10)
         row.space.veth("c0", "c1", mac_of("c0"), mac_of("c1"))
@@ -192,44 +190,61 @@ def test_what_comes_to_a_reader_that_has_left_is_counted_by_its_device(lay: Make
     assert (len(row.delivered), discarded("d1"), row.drops()) == (50, 50, {})
 
 
-@contextlib.contextmanager
-def readers(**buffers: int) -> Iterator[list[subprocess.Popen[str]]]:
-    """Child processes that read one device each with this buffer size in bytes; all are killed at the end."""
-    with contextlib.ExitStack() as stack:
-        started = []
-        for ifname, buffer_bytes in buffers.items():
-            argv = [sys.executable, "-m", "netns_tests.reader_child", ifname, str(buffer_bytes)]
-            child = stack.enter_context(subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=ROOT))
-            stack.callback(child.kill)
-            started.append(child)
-        for child in started:
-            assert child.stdout is not None
-            assert child.stdout.readline() == "ready\n"
-        yield started
+def count_frames(ifname: str, buffer_bytes: str) -> None:
+    """Count a device's frames until an urgent one has come and no more follow; a process of its own.
+
+    ``buffer_bytes``: of socket memory on each lane.
+    """
+    sockets._BUFFER_BYTES = int(buffer_bytes)  # type: ignore[misc]
+    plane = RawPlane([ifname])
+    print("ready", flush=True)
+    numbers: list[int] = []
+    is_over = False
+    while True:
+        arrivals = plane.poll(0.0 if is_over else None)
+        headers = [decode(each.frame) for each in arrivals]
+        numbers += [each.number for each in headers if not each.flags & Flag.URGENT]
+        if is_over and not arrivals:
+            break
+        is_over = is_over or len(headers) > sum(not each.flags & Flag.URGENT for each in headers)
+    said = {"numbers": numbers, "dropped": plane.counters.drops[DropReason.PORT_FULL]}
+    plane.close()
+    print(json.dumps(said), flush=True)
+
+
+def readers(machine: LabMachine, **buffers: int) -> list[LabProcess]:
+    """Start processes that read one device each with this buffer size in bytes; return them when they do."""
+    started = [machine.launch(calling(count_frames, *each)) for each in buffers.items()]
+    for child in started:
+        assert child.read_line(PATIENCE_S) == b"ready"
+    return started
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_three_readers_the_one_that_stands_still_alone_loses_and_counts_it(space: Space, kind: str) -> None:
+def test_of_three_readers_the_one_that_stands_still_alone_loses_and_counts_it(
+    space: Space, machine: LabMachine, kind: str
+) -> None:
     count, large, small = 2_000, 16 << 20, 256 << 10
     for link in "abcd":
         space.veth(f"{link}0", f"{link}1", mac_of(f"{link}0"), mac_of(f"{link}1"))
     hops = tuple((at, mac_of(f"{link}1") + mac_of(f"{link}0")) for at, link in enumerate("bcd", 1))
     table = Table()
     table.install(B, hops, float("inf"))
-    with far_end("a0") as sender, readers(b1=large, c1=large, d1=small) as (*quick, slow):
+    *quick, slow = readers(machine, b1=large, c1=large, d1=small)
+    with far_end("a0") as sender:
         try:
             plane = KINDS[kind](["a1", "b0", "c0", "d0"], table)
         except LocalError as error:
             pytest.skip(str(error).partition("\n")[0])
-        slow.send_signal(signal.SIGSTOP)
+        slow.send(signal.SIGSTOP)
         for number in range(count):
             sender.send(frame(payload=bytes(500), number=number))
             plane.poll(0)
         poll_until(plane, lambda: plane.counters.forwarded >= 3 * count)
         sender.send(frame(urgent=True))
         poll_until(plane, lambda: plane.counters.forwarded >= 3 * (count + 1))
-        slow.send_signal(signal.SIGCONT)
-        said = [json.loads(each.communicate(timeout=PATIENCE_S)[0]) for each in (*quick, slow)]
+        slow.send(signal.SIGCONT)
+        said = [json.loads(each.output(PATIENCE_S)) for each in (*quick, slow)]
         drops = plane.counters.drops
         plane.close()
     assert sum(drops) == 0

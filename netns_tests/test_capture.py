@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from scapy.layers.l2 import Ether
@@ -17,12 +14,14 @@ from scapy.utils import PcapNgReader, RawPcapReader
 
 from gdp.frame.codec import Header, encode, ethernet
 from gdp.frame.kinds import Kind
-from netns_tests.spaces import Space
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import LabProcess
 
 pytestmark = pytest.mark.netns
 
 MACS = [bytes([2, 0, 0, 0, 0, number]) for number in range(4)]
-ROOT = Path(__file__).parents[1]
+PATIENCE_S = 20.0
 
 
 @pytest.fixture
@@ -38,10 +37,8 @@ def links(space: Space) -> Iterator[list[socket.socket]]:
         end.close()
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "gdp.ports.capture", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+def start(machine: LabMachine, *arguments: str) -> LabProcess:
+    return machine.launch([sys.executable, "-m", "gdp.ports.capture", *arguments])
 
 
 def frame(number: int) -> bytes:
@@ -51,19 +48,17 @@ def frame(number: int) -> bytes:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_every_frame_of_both_links_is_in_the_file_when_it_is_ended(
-    number: signal.Signals, links: list[socket.socket], tmp_path: Path
+    number: signal.Signals, links: list[socket.socket], machine: LabMachine
 ) -> None:
-    file = tmp_path / "seen.pcap"
-    with start("--iface", "b0", "--iface", "a1", str(file)) as capture:
-        assert capture.stdout is not None
-        assert json.loads(capture.stdout.readline()) == {"event": "ready", "file": str(file)}
-        for at in range(300):
-            links[0].send(frame(at))  # comes in at b0
-        links[1].send(frame(1_000))  # goes out of a1
-        links[1].send(frame(1_001)[:12] + b"\x08\x00" + bytes(60))
-        capture.send_signal(number)
-        out, err = capture.communicate(timeout=20)
-    assert (capture.returncode, err) == (0, "")
+    file = machine.folder / "seen.pcap"
+    capture = start(machine, "--iface", "b0", "--iface", "a1", str(file))
+    assert capture.read(PATIENCE_S) == {"event": "ready", "file": str(file)}
+    for at in range(300):
+        links[0].send(frame(at))  # comes in at b0
+    links[1].send(frame(1_000))  # goes out of a1
+    links[1].send(frame(1_001)[:12] + b"\x08\x00" + bytes(60))
+    out = capture.finish(number)
+    assert (capture.code, capture.logged) == (0, "")
     assert json.loads(out) == {"event": "done", "frames": 302, "lost": 0}
     with RawPcapReader(str(file)) as reader:
         assert not isinstance(reader, PcapNgReader)
@@ -75,8 +70,8 @@ def test_every_frame_of_both_links_is_in_the_file_when_it_is_ended(
     assert Ether(seen[0][0]).payload.name == "GDP"
 
 
-def test_a_device_that_is_not_there_ends_it_with_a_word(space: Space, tmp_path: Path) -> None:
-    with start("--iface", "nothing", str(tmp_path / "seen.pcap")) as capture:
-        _, err = capture.communicate(timeout=20)
-    assert capture.returncode == 2
-    assert "device nothing: No such device" in err
+def test_a_device_that_is_not_there_ends_it_with_a_word(space: Space, machine: LabMachine) -> None:
+    capture = start(machine, "--iface", "nothing", str(machine.folder / "seen.pcap"))
+    capture.reap(PATIENCE_S)
+    assert capture.code == 2
+    assert "device nothing: No such device" in capture.logged

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -14,15 +13,16 @@ from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
-from faults.store import NOT_WRITTEN, Disk, has_server, snapshot_faults
+from faults.store import NOT_WRITTEN, Disk, StoreCluster, has_server, snapshot_faults
 
 from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process
 from gdp.host.run_registry import RunRegistry
+from lab.machine import LabMachine
+from lab.namespaces import Namespaces
+from lab.process import calling, new_run, python_path, until
 from lab.topology import make_topology
 from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
-from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 
@@ -53,15 +53,23 @@ def test_a_killed_run_is_taken_down_by_the_next() -> None:
     assert not any(Path(path).exists() for path in [*record.namespaces, *record.files])
 
 
+def keep_store() -> None:
+    """Make a run with a full disk and a store of six servers, print its id, and wait; a process of its own."""
+    topology, _ = make_topology({"a": ("s1",)}, {}, (), ("s1",), {"P": "s1"})
+    run = RunRegistry().start()
+    Disk(run).fill()
+    StoreCluster(run, Namespaces(topology, run), ["s1"])
+    print(run.id, flush=True)
+    signal.pause()
+
+
 @pytest.mark.skipif(not has_server(), reason="neither redis-server nor valkey-server is installed")
-def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep() -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((PYTHON_PATH, str(ROOT / "scripts" / "bench")))}
-    argv = [sys.executable, "-m", "netns_tests.store_child"]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env=environment) as child:
-        assert child.stdout is not None
-        run = child.stdout.readline().strip()
-        child.send_signal(signal.SIGKILL)
+def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep(tmp_path: Path) -> None:
+    paths = {"PYTHONPATH": python_path(ROOT / "scripts" / "bench")}
+    machine = LabMachine(tmp_path, environment=paths)
+    child = machine.launch(calling(keep_store))
+    run = child.read_line(_START_S).decode()
+    machine.kill(child)
     (record,) = (record for record in RunRegistry().all() if record.run == run)
     spaces, folder = [Path(path) for path in record.namespaces], Path(record.files[0])
     servers = processes_inside(spaces)
@@ -87,32 +95,28 @@ def rib_log(overlay: Overlay) -> str:
 def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
     topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
     plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
-    run = RunRegistry().start()
-    try:
-        with Overlay(run, plan, has_disk=True, more={"rib": {"lease_s": 2.0}}) as overlay:
-            disk = overlay.disk
-            assert disk is not None
-            overlay.start_all()
-            until(lambda: numbers(overlay, "R"), "a message")
-            until(lambda: has_written(disk, "s1"), "a slice in the snapshot")
-            disk.fill()
-            until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
-            overlay.kill("rib s1")
-            overlay.start("rib s1")
-            overlay.await_ready("rib s1")
-            assert "snapshot read live=0" not in rib_log(overlay)
-            assert "snapshot read live=" in rib_log(overlay)
-            until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk, after the restart")
-            disk.free()
-            until(lambda: "snapshot written again" in rib_log(overlay), "a word that it is written again")
-            faults = [
-                fault
-                for incarnation_id, log in overlay.logs("rib s1")
-                for fault in snapshot_faults(f"life {incarnation_id}", log, is_alive=incarnation_id == 2)
-            ]
-            assert (faults, disk.broken()) == ([], [])
-    finally:
-        run.end()
+    with new_run() as run, Overlay(run, plan, has_disk=True, more={"rib": {"lease_s": 2.0}}) as overlay:
+        disk = overlay.disk
+        assert disk is not None
+        overlay.start_all()
+        until(lambda: numbers(overlay, "R"), "a message")
+        until(lambda: has_written(disk, "s1"), "a slice in the snapshot")
+        disk.fill()
+        until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
+        overlay.kill("rib s1")
+        overlay.start("rib s1")
+        overlay.await_ready("rib s1")
+        assert "snapshot read live=0" not in rib_log(overlay)
+        assert "snapshot read live=" in rib_log(overlay)
+        until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk, after the restart")
+        disk.free()
+        until(lambda: "snapshot written again" in rib_log(overlay), "a word that it is written again")
+        faults = [
+            fault
+            for incarnation_id, log in overlay.logs("rib s1")
+            for fault in snapshot_faults(f"life {incarnation_id}", log, is_alive=incarnation_id == 2)
+        ]
+        assert (faults, disk.broken()) == ([], [])
     assert not run.directory.exists()
 
 
@@ -121,13 +125,9 @@ def overlay() -> Iterator[Overlay]:
     """Two running switches with a publisher and a reader."""
     topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
     plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
-    run = RunRegistry().start()
-    try:
-        with Overlay(run, plan, has_clocks=True) as made:
-            made.start_all()
-            yield made
-    finally:
-        run.end()
+    with new_run() as run, Overlay(run, plan, has_clocks=True) as made:
+        made.start_all()
+        yield made
 
 
 def numbers(overlay: Overlay, member: str) -> list[int]:

@@ -10,21 +10,37 @@ import json
 import os
 import re
 import shutil
+import signal
+import struct
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Final, TypeAlias
 
 import pytest
 
+from gdp.crypto.keys import PublicKey
+from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
-from netns_tests.datacenter.debian_root import cache_folder
+from lab.debian import cache_folder
+from lab.process import calling
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.context import BridgeContext
+from proxy.config.rule import Rule
+from proxy.doors.rules import DoorRules
+from proxy.endpoints.core.qos import default
+from proxy.node.door import door_config
+from proxy.node.node import run_node
 from tests.pages import ROOT
-from tests.proxy.doors.fibonacci import FIBONACCI
+from tests.proxy.bridge import known
+from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES, STATUS
+from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph, Publication
 
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
     pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
@@ -124,6 +140,92 @@ SUITE_S: Final = 75.0
 _RESULT: Final = re.compile(r"^tests/(\S+?)(?:\[\w+\])? (PASSED|FAILED|ERROR|SKIPPED)", re.MULTILINE)
 
 
+STEP_S: Final = 0.3
+_TICK_S: Final = 0.05
+_CDR: Final = b"\0\1\0\0"
+_ID: Final = slice(4, 20)
+_SUCCEEDED, _CANCELED = 4, 5
+Done = Callable[[bytes | str], None]
+
+
+@dataclass(slots=True)
+class _Goal:
+    order: int
+    due_s: float
+    sequence: list[int] = field(default_factory=lambda: [0, 1])
+    status: int = 0  # 0: it is executed
+    done: Done | None = None
+
+    @property
+    def body(self) -> bytes:
+        return struct.pack(f"<I{len(self.sequence)}i", len(self.sequence), *self.sequence)
+
+
+class Server:
+    """Node that serves the action, a step each ``STEP_S`` seconds."""
+
+    def __init__(self, graph: FakeGraph) -> None:
+        self._goals: dict[bytes, _Goal] = {}
+        for part, ask in (("send_goal", self._accept), ("cancel_goal", self._cancel), ("get_result", self._wait)):
+            graph.serve("/server", f"/fibonacci/_action/{part}", SERVICES[part].type_name, ask)
+        self._feedback: Publication = graph.publish("/server", "/fibonacci/_action/feedback", FEEDBACK.type_name)
+        graph.publish("/server", "/fibonacci/_action/status", STATUS, default(latched=True, depth=1))
+
+    def _accept(self, raw: bytes, done: Done) -> None:
+        self._goals[raw[_ID]] = _Goal(struct.unpack_from("<i", raw, 20)[0], time.monotonic() + STEP_S)
+        done(_CDR + struct.pack("<B3xiI", 1, 0, 0))
+
+    def _cancel(self, raw: bytes, done: Done) -> None:
+        self._goals[raw[_ID]].status = _CANCELED
+        done(_CDR + struct.pack("<b3xI", 0, 0))
+
+    def _wait(self, raw: bytes, done: Done) -> None:
+        self._goals[raw[_ID]].done = done
+
+    def work(self, now_s: float) -> None:
+        """Execute the goals."""
+        for goal_id, goal in list(self._goals.items()):
+            if goal.status == 0 and now_s >= goal.due_s:
+                goal.due_s = now_s + STEP_S
+                goal.sequence.append(sum(goal.sequence[-2:]))
+                self._feedback.publish(_CDR + goal_id + goal.body)
+                goal.status = _SUCCEEDED if len(goal.sequence) > goal.order else 0
+            if goal.status and goal.done is not None:
+                goal.done(_CDR + struct.pack("<b3x", goal.status) + goal.body)
+                del self._goals[goal_id]
+
+
+def serve(node_directory: str) -> None:
+    """Run a proxy node with servers of an action and a service, until a signal; a process of its own.
+
+    Its graph is in memory, since this machine may have no ROS; bridge, switch and delegations are real.
+    """
+    config, delegations = door_config(Path(node_directory).absolute(), None, None)
+    services = known.services() | {each.type_name: each for each in SERVICES.values()}
+    graph = FakeGraph(2, {**known.channels(), FEEDBACK.type_name: FEEDBACK}, services)
+    graph.serve("/server", "/switch", known.SET_BOOL, lambda raw, done: done(known.switched("done")))
+    endpoint, server = FakeEndpoint(graph, "/bridge"), Server(graph)
+    with run_node(config) as node:
+        held = DelegationStore(delegations, node.identity)
+        owner = PublicKey.from_compressed(next(iter(held)).delegation.subject.owner_key)
+        action = Rule.model_validate({"kind": "action", "name": "/fibonacci", "type": FIBONACCI, "owner": owner})
+        service = Rule.model_validate({"kind": "service", "name": "/switch", "type": known.SET_BOOL, "owner": owner})
+        rules = DoorRules([action, service], [])
+        bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), rules, [endpoint], held)
+        node.runtime.watch(endpoint)
+        is_ready = False
+        while not node.runtime.is_stopped:
+            node.runtime.step(time.monotonic() + _TICK_S)
+            now_s = time.monotonic()
+            server.work(now_s)
+            bridge.work(now_s)
+            node.member.flush(now_s)
+            if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
+                is_ready = True
+                print(json.dumps({"event": "ready"}), flush=True)
+        node.runtime.unwatch(endpoint)
+
+
 @pytest.fixture(scope="session")
 def suite() -> Path:
     """Return roslibpy's sources, which are kept between runs."""
@@ -179,11 +281,11 @@ def roslib() -> Path:
 def lab() -> Iterator[SessionLab]:
     """Run a node with servers, and a door that needs no token: the suites' addresses have none."""
     with session_lab(RIGHTS, TYPES) as lab:
-        robot = lab.start("-m", "netns_tests.action_child", "robot")
+        robot = lab.launch(calling(serve, "robot"))
         assert lines_of(robot, 1) == ['{"event": "ready"}']
-        door = lab.start("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json", "--no-token")
+        door = lab.python("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json", "--no-token")
         assert json.loads(lines_of(door, 1)[0])["url"] == URL
-        lab.output(lab.start("-c", WAIT, URL))
+        lab.output(sys.executable, "-c", WAIT, URL)
         yield lab
 
 
@@ -204,13 +306,12 @@ def roslib_run(roslib: Path, lab: SessionLab) -> Run:
 
 
 def _output(lab: SessionLab, command: Sequence[str]) -> str:
-    tests = lab.start_command(command)
+    tests = lab.launch(command)
     try:
-        out, errors = tests.communicate(timeout=SUITE_S)
+        printed = tests.reap(SUITE_S)
     except subprocess.TimeoutExpired:
-        tests.kill()
-        out, errors = tests.communicate()
-    return out + errors
+        printed = tests.finish(signal.SIGKILL)
+    return printed + tests.logged
 
 
 def _rows(suite: Mapping[str, str]) -> list[object]:

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,15 +16,16 @@ import pytest
 
 from fog.supervisor.core.record import Record
 from gdp.host.run_registry import Run, RunRegistry
-from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
-from netns_tests.datacenter.debian_root import debian_root, why_not
+from lab.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
+from lab.datacenter import Router
+from lab.debian import BootedMachine, debian_root, why_not
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import calling, until
 from netns_tests.local_site import leftovers
-from netns_tests.spaces import Space
-from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
 
 if TYPE_CHECKING:
-    from netns_tests.datacenter.ec2 import DataCenter
+    from lab.ec2 import DataCenter
 
 pytest.importorskip("boto3", reason="the extra `aws` is not installed")
 pytest.importorskip("moto.server", reason="moto[ec2,server] of the extra `dev` is not installed")
@@ -35,20 +35,6 @@ pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_
 NEAR, FAR = "us-west-1", "us-east-1"
 _MACHINE_S = 400.0  # one boots here in about 30 s; a loaded host takes much longer
 _ANSWER_S = 30.0
-_CALLS = "calls.jsonl"
-_CHILD = """
-import sys, time
-from pathlib import Path
-from gdp.host.run_registry import RunRegistry
-from netns_tests.datacenter.machine import BootedMachine
-from netns_tests.datacenter.router import Router
-run = RunRegistry(Path(sys.argv[1])).start()
-machine = BootedMachine(run, "m1", Path(sys.argv[2]), Router(run).add("m1"))
-while "systemd" not in machine.console:
-    time.sleep(0.02)
-print(run.id, flush=True)
-time.sleep(600)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -98,19 +84,18 @@ def account() -> dict[str, list[str]]:
 def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted(
     image: Path, software: Path, run: Run, space: Space, tmp_path: Path
 ) -> None:
-    from netns_tests.datacenter.ec2 import DataCenter, serving_ec2
+    from lab.ec2 import DataCenter, serving_ec2
 
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     endpoints = {NEAR: start_echo(0.0), FAR: start_echo(0.05)}
     site = CloudSite(run, software, {each: f"udp://127.0.0.1:{port}" for each, port in endpoints.items()})
     center = DataCenter(run, image)
-    caller: subprocess.Popen[bytes] | None = None
     try:
         with serving_ec2(center, tmp_path / "absent"):
             before = account()
             site.environment |= {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
             site.start_border()
-            caller = start_caller(site)
+            site.start_caller(5.0, "report_s:=0.5", heard=False)
             site.run("launch", str(launch_file(tmp_path)), "--detach", "--wait", str(_MACHINE_S))
             (first,) = site.serving("echo")
             assert first.spec.offer.region == NEAR
@@ -135,31 +120,29 @@ def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted
             assert site.tunnels() == []
             assert not any(each.is_up for each in center.machines.values())
     finally:
-        if caller is not None:
-            caller.kill()
-            caller.wait()
         center.close()
         site.close()
     run.end()
     assert not leftovers(tmp_path, [run.id])
 
 
-def test_a_machine_goes_also_when_its_creator_was_killed(image: Path, tmp_path: Path, space: Space) -> None:
-    runs = tmp_path / "runs"
-    child = subprocess.Popen(
-        [sys.executable, "-c", _CHILD, str(runs), str(image)],
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{PYTHON_PATH}"},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert child.stdout is not None
-    made = child.stdout.readline().strip()
-    assert made
-    assert leftovers(tmp_path, [made])
-    child.send_signal(signal.SIGKILL)
-    child.communicate()
+def boot(runs: str, image: str) -> None:
+    """Boot a machine, print the id of its run, and wait; a process of its own."""
+    run = RunRegistry(Path(runs)).start()
+    booted = BootedMachine(run, "m1", Path(image), Router(run).add("m1"))
+    until(lambda: "systemd" in booted.console)
+    print(run.id, flush=True)
+    signal.pause()
+
+
+def test_a_machine_goes_also_when_its_creator_was_killed(image: Path, machine: LabMachine, space: Space) -> None:
+    runs = machine.folder / "runs"
+    child = machine.launch(calling(boot, runs, image))
+    made = child.read_line(_MACHINE_S).decode()
+    assert leftovers(machine.folder, [made])
+    machine.kill(child)
     assert RunRegistry(runs).sweep() == [made]
-    assert not leftovers(tmp_path, [made])
+    assert not leftovers(machine.folder, [made])
 
 
 def inbound_rules() -> list[str]:
@@ -186,14 +169,8 @@ def copies_of_the_token(center: DataCenter, machine: Record) -> str:
     return center.machines[identifier].run("sh", "-c", search)
 
 
-def start_caller(site: CloudSite) -> subprocess.Popen[bytes]:
-    """Start the robot's node, which calls ``/echo`` and writes who answered to a file."""
-    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=5.0", "-p", "report_s:=0.5"]
-    with (site.folder / _CALLS).open("wb") as out:
-        return subprocess.Popen([sys.executable, *words], env=site.environment, cwd=site.folder, stdout=out)
-
-
 def answering(site: CloudSite) -> frozenset[str]:
     """Return the machines that have answered the robot's node until now."""
-    whole = [line for line in (site.folder / _CALLS).read_text().splitlines(keepends=True) if line.endswith("\n")]
+    logged = (site.folder / "caller.log").read_text().splitlines(keepends=True)
+    whole = [line for line in logged if line.startswith("{") and line.endswith("\n")]
     return frozenset(json.loads(whole[-1])["by_machine"]) if whole else frozenset()

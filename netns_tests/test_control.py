@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +11,14 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from gdp.management.control_client import find_control_socket
-from netns_tests.spaces import Space
-from netns_tests.test_rights import PATIENCE_S, Commands, Node, commands
-from tests.pages import ROOT
-from tests.waiting import until
+from lab.machine import GDP, LabMachine
+from lab.namespaces import Space
+from lab.process import LabProcess, until
+from netns_tests.test_rights import nodes, start_all
 
-__all__ = ["commands"]  # a fixture
+__all__ = ["nodes"]  # a fixture
+
+PATIENCE_S = 60.0
 
 pytestmark = [
     pytest.mark.netns,
@@ -27,70 +26,51 @@ pytestmark = [
 ]
 
 
-class Nodes:
-    """Running switch, RIB and recording proxy."""
-
-    def __init__(self, commands: Commands) -> None:
-        self.commands = commands
-        self.switch = self._start("gdp.cli.switch", "switch", "--data-plane", "raw")
-        self.rib = self._start("gdp.cli.rib", "rib", "--await-iface", "30")
-        self.proxy = self._start("proxy.cli.proxy", "proxy", "--await-iface", "30")
-
-    def gdp(self, *words: str) -> tuple[int, str]:
-        """Run ``gdp`` in the folder of the nodes; return its exit code and its whole output."""
-        argv = [sys.executable, "-m", "gdp.cli.gdp", *words]
-        ended = subprocess.run(
-            argv,
-            cwd=self.commands.home,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
-        return ended.returncode, ended.stdout
-
-    def socket(self, name: str) -> Path:
-        """Return the control socket of a node."""
-        return find_control_socket(self.commands.home / name)
-
-    def _start(self, module: str, name: str, *more: str) -> Node:
-        node = self.commands.start(module, name, *more)
-        node.until('"ready"')
-        return node
+Running = dict[str, LabProcess]
 
 
 @pytest.fixture
-def nodes(space: Space, commands: Commands) -> Nodes:
-    """Running nodes of one domain."""
-    del space
-    return Nodes(commands)
+def running(nodes: LabMachine) -> Running:
+    """Running switch, RIB and recording proxy of one domain."""
+    return dict(zip(("switch", "rib", "proxy"), start_all(nodes), strict=True))
 
 
-def reload_reads_what_sighup_reads(nodes: Nodes) -> None:
-    (nodes.commands.home / "revoked" / "x").write_bytes(b"no statement")
-    assert nodes.gdp("reload", "switch")[0] == 0
-    nodes.switch.until("revocation not taken")
-    assert nodes.gdp("reload", "rib")[0] == 0
+def gdp(nodes: LabMachine, *words: str) -> tuple[int, str]:
+    """Run ``gdp`` in the folder of the nodes; return its exit code and its whole output."""
+    done = nodes.run(*GDP, *words)
+    return done.returncode, done.stdout + done.stderr
 
 
-def a_refused_reload_says_why(nodes: Nodes) -> None:
-    for file in (nodes.commands.home / "proxy" / "delegations").iterdir():
+def socket(nodes: LabMachine, name: str) -> Path:
+    """Return the control socket of a node."""
+    return find_control_socket(nodes.folder / name)
+
+
+def reload_reads_what_sighup_reads(nodes: LabMachine, switch: LabProcess) -> None:
+    (nodes.folder / "revoked" / "x").write_bytes(b"no statement")
+    assert gdp(nodes, "reload", "switch")[0] == 0
+    switch.until_logged("revocation not taken")
+    assert gdp(nodes, "reload", "rib")[0] == 0
+
+
+def a_refused_reload_says_why(nodes: LabMachine) -> None:
+    for file in (nodes.folder / "proxy" / "delegations").iterdir():
         file.unlink()
-    code, text = nodes.gdp("reload", "proxy")
+    code, text = gdp(nodes, "reload", "proxy")
     assert code == 1
     assert "no delegation for" in text
 
 
-def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(nodes: Nodes) -> None:
+def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(
+    nodes: LabMachine, running: Running
+) -> None:
     def is_measured() -> bool:
-        shown = json.loads(nodes.gdp("status", "switch", "--json")[1])
+        shown = json.loads(gdp(nodes, "status", "switch", "--json")[1])
         return bool(len(shown["link_quality"]) == shown["neighbours"] > 0)
 
     until(is_measured, "the switch has measured its links")
     for name in ("rib", "proxy", "switch"):
-        code, text = nodes.gdp("status", name, "--json")
+        code, text = gdp(nodes, "status", name, "--json")
         shown = json.loads(text)
         assert code == 0
         assert (shown["state"], shown["role"]) == ("running", name)
@@ -100,31 +80,29 @@ def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(n
         "port", "neighbour", "rtt_ms", "rtt_var_ms", "loss_in", "loss_out", "cost",
     }  # fmt: skip
     assert {row["cost"] for row in shown["link_quality"]} == {10}
-    reload_reads_what_sighup_reads(nodes)
+    reload_reads_what_sighup_reads(nodes, running["switch"])
     a_refused_reload_says_why(nodes)
 
 
-def test_nodes_that_drain_end_and_leave_no_socket(nodes: Nodes) -> None:
-    sockets = [nodes.socket(name) for name in ("proxy", "rib", "switch")]
+def test_nodes_that_drain_end_and_leave_no_socket(nodes: LabMachine, running: Running) -> None:
+    sockets = [socket(nodes, name) for name in ("proxy", "rib", "switch")]
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in sockets)
-    for name, node in (("proxy", nodes.proxy), ("rib", nodes.rib), ("switch", nodes.switch)):
-        code, text = nodes.gdp("drain", name, "--json")
+    for name, node in reversed(running.items()):
+        code, text = gdp(nodes, "drain", name, "--json")
         assert (code, json.loads(text)) == (0, {"state": "drained", "complete": True})
-        assert node.process.wait(PATIENCE_S) == 0
+        node.output()
     assert not any(path.exists() for path in sockets)
-    assert {path.name for path in (nodes.commands.home / "kept").iterdir()} == {"received.mcap", "routes"}
+    assert {path.name for path in (nodes.folder / "kept").iterdir()} == {"received.mcap", "routes"}
 
 
-def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:
-    nodes.proxy.process.send_signal(signal.SIGKILL)
-    nodes.proxy.process.wait(PATIENCE_S)
-    assert nodes.socket("proxy").exists()
-    code, text = nodes.gdp("status", "proxy")
+def test_the_socket_of_a_killed_node_is_replaced(nodes: LabMachine, running: Running) -> None:
+    nodes.kill(running["proxy"])
+    assert socket(nodes, "proxy").exists()
+    code, text = gdp(nodes, "status", "proxy")
     assert (code, "no process serves this control socket" in text) == (3, True)
-    (nodes.commands.home / "kept" / "received.mcap").unlink(missing_ok=True)
-    again = nodes.commands.start("proxy.cli.proxy", "proxy")
-    again.until('"ready"')
-    assert nodes.gdp("status", "proxy")[0] == 0
+    (nodes.folder / "kept" / "received.mcap").unlink(missing_ok=True)
+    nodes.start("proxy", "proxy")
+    assert gdp(nodes, "status", "proxy")[0] == 0
 
 
 def measured_links(page: ClientConnection) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -141,22 +119,17 @@ def measured_links(page: ClientConnection) -> tuple[dict[str, Any], dict[str, An
     return shown["structure"], shown["figures"]
 
 
-def test_the_live_view_shows_running_nodes_that_dropped_their_rights(space: Space, nodes: Nodes) -> None:
-    space.ip("set", "lo", "up")
-    home = nodes.commands.home
-    words = [word for name in ("switch", "rib", "proxy") for word in ("--node", str(home / name))]
-    command = [sys.executable, "-m", "gdp.cli.gdp", "dashboard", "--json", *words]
-    with subprocess.Popen(
-        command, cwd=home, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True
-    ) as view:
-        try:
-            assert view.stdout is not None
-            ready = json.loads(view.stdout.readline())
-            with connect(ready["url"].replace("http", "ws") + "live") as page:
-                structure, figures = measured_links(page)
-        finally:
-            view.terminate()
-        assert view.wait(PATIENCE_S) == 0
+def test_the_live_view_shows_running_nodes_that_dropped_their_rights(
+    space: Space, nodes: LabMachine, running: Running
+) -> None:
+    space.ip("link", "set", "lo", "up")
+    words = [word for name in running for word in ("--node", name)]
+    view = nodes.launch([*GDP, "dashboard", "--json", *words])
+    url = str(view.read(PATIENCE_S)["url"])
+    with connect(url.replace("http", "ws") + "live") as page:
+        structure, figures = measured_links(page)
+    view.finish(signal.SIGTERM)
+    assert view.code == 0
     assert sorted(role for _, role, _, _, is_near in structure["nodes"] if is_near) == ["proxy", "rib", "switch"]
     assert len(structure["links"]) == 2
     assert all(rtt_ms is not None for _, _, rtt_ms, _ in figures["links"])

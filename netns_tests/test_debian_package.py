@@ -15,8 +15,9 @@ from typing import Final
 
 import pytest
 
-from netns_tests.datacenter.debian_root import cache_folder, debian_root, why_not
-from netns_tests.spaces import Space
+from lab.debian import cache_folder, debian_root, why_not
+from lab.machine import LabMachine
+from lab.namespaces import Space
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -203,14 +204,9 @@ def test_the_image_runs_the_nodes_of_a_machine(package: Path, tmp_path: Path, sp
     container = images.run("from", "gdp-ros")
     assert images.run("run", "--isolation", "chroot", container, "--", "gdp", "--version") == "gdp 0.1.0"
     assert images.run("run", "--isolation", "chroot", container, "--", "id", "-un") == "gdp"
-    space.ip("add", "cable", "type", "veth", "peer", "name", "far")
-    space.ip("set", "cable", "up")
-    subprocess.run(
-        [sys.executable, "-m", "gdp.cli.gdp", "lab", "robot", "--iface", "cable"],
-        cwd=tmp_path,
-        check=True,
-        capture_output=True,
-    )
+    space.ip("link", "add", "cable", "type", "veth", "peer", "name", "far")
+    space.ip("link", "set", "cable", "up")
+    LabMachine(tmp_path).gdp("lab", "robot", "--iface", "cable")
     options = ["run", "--isolation", "chroot", "--user", "0", "--cap-add", "CAP_NET_ADMIN", "--cap-add", "CAP_NET_RAW"]
     options += ["--volume", f"{tmp_path / 'robot'}:/srv/gdp"]
     entry, health = shlex.join(made["Entrypoint"] + made["Cmd"]), shlex.join(made["Healthcheck"]["Test"][1:])

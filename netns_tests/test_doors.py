@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -84,10 +83,10 @@ def _configure(lab: SessionLab, label: str, *names: str) -> None:
 
 
 def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -> None:
-    door = lab.start("-m", "gdp.cli.gdp", "foxglove", "viewer", "--json")
+    door = lab.python("-m", "gdp.cli.gdp", "foxglove", "viewer", "--json")
     ready = json.loads(lines_of(door, 1)[0])
     assert (ready["event"], sorted(ready["reads"])) == ("ready", ["/camera/image", "/odom"])
-    client = lab.start("-c", CLIENT, ready["url"])
+    client = lab.python("-c", CLIENT, ready["url"])
     info, channels = lines_of(client, 2)
     assert info == "serverInfo"
     assert json.loads(channels) == {
@@ -95,13 +94,12 @@ def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -
     }  # and not /tf, for which the door has no delegation
     (status,) = lines_of(client, 1)
     assert "gdp delegate name --right publish --kind topic --name /cmd_vel" in json.loads(status)["message"]
-    replay = lab.start("-m", "proxy.cli.replay", "drive.mcap", "--config", "all.yaml")
-    lab.output(replay)
-    counts, sizes = json.loads(lab.output(client).splitlines()[-1])
+    replay = lab.python("-m", "proxy.cli.replay", "drive.mcap", "--config", "all.yaml")
+    replay.output()
+    counts, sizes = json.loads(client.output().splitlines()[-1])
     assert counts == {"/camera/image": 20, "/odom": 40}
     assert sizes["/camera/image"] > 20 * 640 * 480
-    door.send_signal(signal.SIGINT)
-    assert json.loads(lab.output(door).splitlines()[-1])["dropped"] == 0
+    assert json.loads(door.finish().splitlines()[-1])["dropped"] == 0
 
 
 ROSLIBPY = """
@@ -129,14 +127,14 @@ ros.terminate()
 
 def test_a_replayed_recording_reaches_roslibpy(lab: SessionLab) -> None:
     pytest.importorskip("roslibpy")
-    door = lab.start("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json")
+    door = lab.python("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json")
     ready = json.loads(lines_of(door, 1)[0])
     assert ready["event"] == "ready"
-    client = lab.start("-c", ROSLIBPY, ready["url"])
+    client = lab.python("-c", ROSLIBPY, ready["url"])
     assert lines_of(client, 1) == ["ready"]
-    replay = lab.start("-m", "proxy.cli.replay", "drive.mcap", "--config", "odom.yaml")
-    lab.output(replay)
-    heard, error = lab.output(client).splitlines()
+    replay = lab.python("-m", "proxy.cli.replay", "drive.mcap", "--config", "odom.yaml")
+    replay.output()
+    heard, error = client.output().splitlines()
     count, frame, topics, type_name = json.loads(heard)
     assert (count, frame, type_name) == (40, "odom", TYPES["/odom"])
     assert sorted(topics) == ["/camera/image", "/odom"]

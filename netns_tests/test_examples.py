@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import sys
 
 import pytest
 
@@ -17,9 +19,9 @@ pytestmark = pytest.mark.netns
 
 def test_a_subscriber_prints_what_the_example_publishes() -> None:
     with session_lab({"robot": {"greeting": [Right.PUBLISH]}, "server": {"greeting": [Right.READ]}}) as lab:
-        subscriber = lab.start(str(EXAMPLES / "publish_subscribe.py"), "subscribe", "server")
-        lab.output(lab.start(str(EXAMPLES / "publish_subscribe.py"), "publish", "robot"))
-        said = lab.output(subscriber).splitlines()
+        subscriber = lab.python(str(EXAMPLES / "publish_subscribe.py"), "subscribe", "server")
+        lab.output(sys.executable, str(EXAMPLES / "publish_subscribe.py"), "publish", "robot")
+        said = subscriber.output().splitlines()
     assert [line.split(" from ")[0] for line in said] == [f"{number + 1} hello {number}" for number in range(10)]
 
 
@@ -30,11 +32,11 @@ def test_a_client_gets_responses_while_one_of_two_replicas_is_killed() -> None:
         "robot": {"reverse": [Right.CALL]},
     }
     with session_lab(rights) as lab:
-        servers = [lab.start(str(EXAMPLES / "request_response.py"), "serve", label) for label in ("edge", "cloud")]
+        servers = [lab.python(str(EXAMPLES / "request_response.py"), "serve", label) for label in ("edge", "cloud")]
         assert [lines_of(server, 1) for server in servers] == [["serving"], ["serving"]]
-        before = lab.output(lab.start(str(EXAMPLES / "request_response.py"), "call", "robot")).splitlines()
-        servers[0].kill()
-        after = lab.output(lab.start(str(EXAMPLES / "request_response.py"), "call", "robot")).splitlines()
+        before = lab.output(sys.executable, str(EXAMPLES / "request_response.py"), "call", "robot").splitlines()
+        servers[0].send(signal.SIGKILL)
+        after = lab.output(sys.executable, str(EXAMPLES / "request_response.py"), "call", "robot").splitlines()
     words = ["tobor", "rosnes", "rennalp"]
     assert [line.split()[0] for line in before] == words
     assert [line.split()[0] for line in after] == words
@@ -42,10 +44,10 @@ def test_a_client_gets_responses_while_one_of_two_replicas_is_killed() -> None:
 
 def test_the_camera_example_shows_images_of_full_size() -> None:
     with session_lab({"robot": {"camera": [Right.PUBLISH]}, "server": {"camera": [Right.READ]}}) as lab:
-        viewer = lab.start(str(EXAMPLES / "camera.py"), "show", "server")
-        sender = lab.start(str(EXAMPLES / "camera.py"), "send", "robot")
+        viewer = lab.python(str(EXAMPLES / "camera.py"), "show", "server")
+        sender = lab.python(str(EXAMPLES / "camera.py"), "send", "robot")
         first = lines_of(viewer, 3)
-        lab.output(sender)
+        sender.output()
     assert all("307200 bytes" in line for line in first), first
 
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,10 +17,10 @@ from gdp.crypto.certificates import Role
 from gdp.diagnosis.answer import Answer, Cause
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.host.ros_processes import ros_processes
+from lab.machine import GDP
+from lab.process import until
 from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
-from tests.script_packages import PYTHON_PATH
-from tests.waiting import until
 
 needs("std_msgs", "std_srvs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -54,7 +51,6 @@ def serve_gate():
         return response
     kept.append(node.create_service(SetBool, '/gate', answer))
 """
-_TIMEOUT_S = 30.0
 _PATIENCE_S = 20.0
 _WINDOW_S = 0.5
 
@@ -85,14 +81,7 @@ class Asked:
     def type(self, name: str) -> tuple[int, Mapping[str, object]]:
         """Type the command at machine b; return its exit code and its JSON object."""
         given = ["--node", str(self.pair.identity("b")), "--seconds", "0.5", "--json"]
-        ended = subprocess.run(
-            self.pair.spaces["b"].command([sys.executable, "-m", "gdp.cli.gdp", "explain", name, *given]),
-            env={**os.environ, "PYTHONPATH": PYTHON_PATH},
-            capture_output=True,
-            text=True,
-            timeout=_TIMEOUT_S,
-            check=False,
-        )
+        ended = self.pair.machines["b"].run(*GDP, "explain", name, *given)
         assert ended.stdout, ended.stderr
         return ended.returncode, json.loads(ended.stdout)
 
@@ -110,15 +99,12 @@ class Asked:
             answers.append(self.explain(name, directly=directly))
             return answers[-1].cause is cause
 
-        try:
-            until(is_named, cause.value, _PATIENCE_S)
-        except AssertionError as error:
-            raise AssertionError(f"{cause.value}: {answers[-1]}") from error
+        until(is_named, lambda: f"{cause.value}: {answers[-1]}", _PATIENCE_S)
 
     def tc(self, machine: str, device: str, *words: str) -> None:
         """Run ``tc qdisc`` on a machine."""
         command = ["tc", "qdisc", words[0], "dev", device, "root", *words[1:]]
-        subprocess.run(self.pair.spaces[machine].command(command), check=True, capture_output=True)
+        self.pair.machines[machine].output(*command)
 
     def _node(self, graph: str, name: str) -> Peer:
         node = self.pair.node(graph, name)

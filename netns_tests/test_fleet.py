@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 
 import pytest
 
+from lab.machine import gdp as gdp_command
+from lab.process import until
 from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
-from tests.waiting import until
 
 needs("std_msgs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -39,10 +38,8 @@ def pair() -> Iterator[Pair]:
 
 def gdp(pair: Pair, label: str, *words: str) -> list[Mapping[str, object]]:
     """Return what a command about a running proxy prints as JSON, a line each."""
-    argv = [sys.executable, "-m", "gdp.cli.gdp", *words, "--config", str(pair.folder / f"proxy-{label}.yaml"), "--json"]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    printed = gdp_command(*words, "--config", pair.folder / f"proxy-{label}.yaml", "--json")
+    return [json.loads(line) for line in printed.splitlines()]
 
 
 def started(pair: Pair, graph: str) -> Peer:

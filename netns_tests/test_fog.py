@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -19,11 +18,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
+from lab.cloud_site import FogSite
+from lab.machine import GDP, LabMachine
+from lab.namespaces import Space
+from lab.process import python_path, until
 from netns_tests.local_site import PATIENCE_S
-from netns_tests.spaces import Space
 from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 pytest.importorskip("rclpy", reason="needs the extra ros2")
@@ -31,44 +31,20 @@ _LAUNCH = ROOT / "examples" / "echo.launch.py"
 _MACHINES_S = 3 * PATIENCE_S
 
 
-class Fog:
-    """Command with a state folder of its own, run in the namespace of the test."""
+class Fog(FogSite):
+    """Site with a state folder of its own, in the namespace of the test."""
 
-    def __init__(self, state: Path) -> None:
-        self.state = state
-        self.environment = {
-            **os.environ,
-            "FOG_STATE": str(state),
-            "ROS_DOMAIN_ID": "171",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "PYTHONPATH": f"{PYTHON_PATH}{os.pathsep}{ROOT / 'examples' / 'grasp'}",
-        }
-
-    def run(self, *words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "fog.cli.app", *words],
-            env=self.environment,
-            cwd=self.state.parent,
-            capture_output=True,
-            text=True,
-            timeout=_MACHINES_S,
-            check=False,
-        )
-        assert done.returncode == 0, f"fog {' '.join(words)}: {done.stdout}{done.stderr}{self.log()}"
-        return done.stdout
-
-    def log(self) -> str:
-        path = self.state / "supervisor.log"
-        return path.read_text() if path.exists() else ""
+    def __init__(self, folder: Path) -> None:
+        state = folder / "state"
+        paths = {"FOG_STATE": str(state), "PYTHONPATH": python_path(ROOT / "examples" / "grasp")}
+        super().__init__(LabMachine(folder, environment={"ROS_DOMAIN_ID": "171", **paths}), state)
 
     def status(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(self.run("status", "--json"))
         return found
 
     def living(self) -> list[Record]:
-        with closing(Journal(self.state / "journal.sqlite3")) as journal:
-            return journal.machines("echo", gone=False)
+        return self.machines("echo")
 
     def events(self) -> list[str]:
         with closing(Journal(self.state / "journal.sqlite3")) as journal:
@@ -83,36 +59,28 @@ class Fog:
 
 @pytest.fixture
 def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-    made = Fog(tmp_path / "state")
+    space.ip("link", "set", "lo", "up")
+    made = Fog(tmp_path)
     yield made
     made.run("down", "--all")
+    made.host.close()
 
 
 def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(fog: Fog) -> None:
     fog.run("launch", str(_LAUNCH), "--detach")
-    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
-    caller = subprocess.Popen(
-        [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert caller.stdout is not None
-        while not json.loads(caller.stdout.readline())["answered"]:
-            pass
-        first, second = fog.serving()
-        os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
-        fog.run("local", "kill", first)  # the fault is not observed yet
-        fog.run("status")  # any command starts another supervisor
-        fog.until(lambda: len({*fog.serving()} - {first}) == 2, "a killed machine is replaced")
-        fog.run("local", "notice", second, "--seconds", "5")
-        fog.until(lambda: len({*fog.serving()} - {first, second}) == 2, "a machine with notice is replaced")
-        caller.send_signal(signal.SIGINT)
-        last = json.loads(caller.communicate(timeout=PATIENCE_S)[0].splitlines()[-1])
-        assert last["done"]
-        assert last["failed"] == last["wrong"] == last["unserved"] == 0
-    finally:
-        caller.kill()
-        caller.wait()
+    caller = fog.start_caller(20.0)
+    while not caller.read(PATIENCE_S)["answered"]:
+        pass
+    first, second = fog.serving()
+    os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
+    fog.run("local", "kill", first)  # the fault is not observed yet
+    fog.run("status")  # any command starts another supervisor
+    fog.until(lambda: len({*fog.serving()} - {first}) == 2, "a killed machine is replaced")
+    fog.run("local", "notice", second, "--seconds", "5")
+    fog.until(lambda: len({*fog.serving()} - {first, second}) == 2, "a machine with notice is replaced")
+    last = json.loads(caller.finish().splitlines()[-1])
+    assert last["done"]
+    assert last["failed"] == last["wrong"] == last["unserved"] == 0
     events = [json.loads(line) for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
     assert {"enrolled", "preempted", "notice", "draining"} <= {each["what"] for each in events}
     assert "alarm" not in {each["what"] for each in events}
@@ -130,28 +98,20 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
 def test_the_live_view_shows_machines_first_answers_and_a_loss(fog: Fog) -> None:
     fog.run("launch", str(_LAUNCH), "--detach")
     first, second = fog.serving()
-    words = [sys.executable, "-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
-    caller = subprocess.Popen(words, env=fog.environment, cwd=fog.state.parent, stdout=subprocess.DEVNULL)
-    words = [sys.executable, "-m", "gdp.cli.gdp", "dashboard", "--json"]
-    view = subprocess.Popen(words, env=fog.environment, stdout=subprocess.PIPE, text=True)
-    try:
-        assert view.stdout is not None
-        url = json.loads(view.stdout.readline())["url"]
-        with connect(url.replace("http", "ws", 1) + "live", max_size=None) as page:
-            shown = Shown(page)
-            shown.until(lambda: shown.serving() == 2 and len(shown.first_answers()) == 2)
-            assert {each["name"] for each in shown.cluster()["machines"]} >= {first, second}
-            before = sum(shown.first_answers().values())
-            shown.until(lambda: sum(shown.first_answers().values()) > before + 20)
-            fog.run("local", "kill", first)
-            shown.until(lambda: any(first in text for text in shown.bad))
-            shown.until(lambda: shown.serving() == 2 and first not in fog.serving())
-        view.send_signal(signal.SIGINT)
-        assert view.wait(PATIENCE_S) == 0
-    finally:
-        for each in (caller, view):
-            each.kill()
-            each.communicate()
+    fog.start_caller(20.0, heard=False)
+    view = fog.host.launch([*GDP, "dashboard", "--json"])
+    url = str(view.read(PATIENCE_S)["url"])
+    with connect(url.replace("http", "ws", 1) + "live", max_size=None) as page:
+        shown = Shown(page)
+        shown.until(lambda: shown.serving() == 2 and len(shown.first_answers()) == 2)
+        assert {each["name"] for each in shown.cluster()["machines"]} >= {first, second}
+        before = sum(shown.first_answers().values())
+        shown.until(lambda: sum(shown.first_answers().values()) > before + 20)
+        fog.run("local", "kill", first)
+        shown.until(lambda: any(first in text for text in shown.bad))
+        shown.until(lambda: shown.serving() == 2 and first not in fog.serving())
+    view.finish()
+    assert view.code == 0
 
 
 @pytest.mark.parametrize("command", ["fog launch", "ros2 launch"])
@@ -167,9 +127,7 @@ def test_the_listing_of_the_paper_plans_grasps_on_two_machines_and_the_robot_fin
     elif (ros2 := shutil.which("ros2")) is None:
         pytest.skip("ROS 2's launch is not installed: no command ros2")
     else:
-        environment = {**fog.environment, "PYTHONUNBUFFERED": "1"}
-        words = [ros2, "launch", listing]
-        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=_MACHINES_S, check=False)
+        done = fog.host.run("env", "PYTHONUNBUFFERED=1", ros2, "launch", listing, patience_s=_MACHINES_S)
         said = done.stdout + done.stderr
     assert "3 of 3 grasps are right" in said
     assert said.count("planned on m") == 3  # a machine of the cluster, not the robot
@@ -202,15 +160,9 @@ def test_load_adds_a_machine_and_one_on_demand_takes_the_place_of_a_spot_machine
     (first,) = fog.living()
     assert not first.spec.offer.is_spot
     fog.run("local", "sold-out", "--off")
-    words = [sys.executable, "-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
-    caller = subprocess.Popen(words, env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True)
-    try:
-        fog.until(lambda: len(fog.serving()) == 2, "a second machine for the load")
-        caller.send_signal(signal.SIGINT)
-        last = json.loads(caller.communicate(timeout=PATIENCE_S)[0].splitlines()[-1])
-    finally:
-        caller.kill()
-        caller.wait()
+    caller = fog.start_caller(20.0)
+    fog.until(lambda: len(fog.serving()) == 2, "a second machine for the load")
+    last = json.loads(caller.finish().splitlines()[-1])
     assert last["failed"] == last["wrong"] == last["unserved"] == 0
     assert [each.spec.offer.is_spot for each in fog.living()] == [False, True]
     assert "scaled" in fog.events()
@@ -226,15 +178,16 @@ class Shown:
         self.bad: list[str] = []
 
     def until(self, is_met: Callable[[], object]) -> None:
-        end_s = time.monotonic() + _MACHINES_S
-        while not self._figures or not is_met():
-            assert time.monotonic() < end_s, (self._structure, self._figures, self.bad)
-            message = json.loads(self._page.recv(PATIENCE_S))
-            if message["kind"] == "structure":
-                self._structure = message
-            elif message["kind"] == "figures":
-                self._figures = message
-                self.bad += [each["text"] for each in message["events"] if each["is_bad"] or each["what"] == "cluster"]
+        what = "the live view shows it"
+        until(lambda: self._figures and is_met(), lambda: (what, self._structure, self.bad), _MACHINES_S, self._receive)
+
+    def _receive(self) -> None:
+        message = json.loads(self._page.recv(PATIENCE_S))
+        if message["kind"] == "structure":
+            self._structure = message
+        elif message["kind"] == "figures":
+            self._figures = message
+            self.bad += [each["text"] for each in message["events"] if each["is_bad"] or each["what"] == "cluster"]
 
     def cluster(self) -> dict[str, Any]:
         (found,) = (each for each in self._structure["clusters"] if each["name"] == "echo")
@@ -252,19 +205,9 @@ class Shown:
 
 @pytest.mark.nightly
 def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_journal_is_gone(fog: Fog) -> None:
-    launch = subprocess.Popen(
-        [sys.executable, "-m", "fog.cli.app", "launch", str(_LAUNCH), "--json"],
-        env=fog.environment,
-        cwd=fog.state.parent,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert launch.stdout is not None
-    for line in launch.stdout:
-        if '"requested"' in line:
-            break
-    launch.kill()
-    launch.communicate()
+    launch = fog.host.launch([sys.executable, "-m", "fog.cli.app", "launch", str(_LAUNCH), "--json"])
+    launch.read_until('"requested"')
+    fog.host.kill(launch)
     pid = int((fog.state / "supervisor.lock").read_text())
     fog.until(lambda: list((fog.state / "local").glob("*.json")), "a machine is begun")
     os.kill(pid, signal.SIGKILL)

@@ -11,11 +11,12 @@ from gdp.crypto.certificates import Role
 from gdp.stores.issue import admit_node, make_node_keys
 from gdp.stores.keyring import store_again
 from gdp.stores.token import generate_token_key
-from netns_tests.spaces import Space
-from netns_tests.test_rights import Commands, commands
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from netns_tests.test_rights import end, nodes
 from tests.gdp.stores.tokens import PIN, soft_token
 
-__all__ = ["commands"]
+__all__ = ["nodes"]
 
 pytestmark = [
     pytest.mark.netns,
@@ -25,25 +26,24 @@ pytestmark = [
 
 
 def test_a_switch_signs_with_its_token_and_a_rib_with_a_key_under_a_passphrase(
-    commands: Commands, space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    nodes: LabMachine, space: Space, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GDP_PASSPHRASE", PIN)
     with soft_token(tmp_path / "token", monkeypatch) as token:
         key = generate_token_key(token.uri("switch"))
         make_node_keys(tmp_path / "switch", Role.SWITCH, "lab", key=key, passphrase=PIN.encode(), force=True)
-        admit_node(tmp_path / "lab", tmp_path / "switch", force=True)
+        admit_node(tmp_path / "domain", tmp_path / "switch", force=True)
         store_again(tmp_path / "rib", PIN.encode())
         with (tmp_path / "switch.yaml").open("a") as file:
             file.write("token_folders: [token]\n")
-        switch = commands.start("gdp.cli.switch", "switch", "--data-plane", "raw")
-        switch.until('"ready"')
-        rib = commands.start("gdp.cli.rib", "rib", "--await-iface", "30")
-        rib.until('"ready"')
-        switch.until("neighbour up port=rib0-s role=rib")
-        assert "node.key=token kem.key=passphrase" in switch.log.read_text()
-        assert "node.key=passphrase kem.key=passphrase" in rib.log.read_text()
-        assert (switch.end(), rib.end()) == (0, 0)
+        switch = nodes.start("switch", "switch", "--data-plane", "raw")
+        rib = nodes.start("rib", "rib", "--await-iface", "30")
+        switch.until_logged("neighbour up port=rib0-s role=rib")
+        assert "node.key=token kem.key=passphrase" in switch.logged
+        assert "node.key=passphrase kem.key=passphrase" in rib.logged
+        assert (end(switch), end(rib)) == (0, 0)
         monkeypatch.setenv("GDP_PASSPHRASE", "another")
-        refused = commands.start("gdp.cli.rib", "rib", "--check")
-        assert refused.process.wait(60) == 2
-        assert "rib/node.key: does not open: a wrong passphrase" in refused.log.read_text()
+        refused = nodes.launch_node("rib", "rib", "--check")
+        said = refused.reap()
+        assert refused.code == 2
+        assert "rib/node.key: does not open: a wrong passphrase" in said + refused.logged

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -19,6 +17,8 @@ from internet.access import TRAITS, Access
 from internet.host import ETHERNET, Host
 from internet.laboratory import Laboratory
 from internet.probe import SILENCE_S, UdpProbe, observe
+from lab.machine import LabMachine
+from lab.process import calling
 
 pytestmark = pytest.mark.netns
 
@@ -286,30 +286,24 @@ def test_a_delay_without_a_delay_line_is_refused(laboratory: Laboratory) -> None
         laboratory.add_site("home", Access.PUBLIC).set_delay(1.0)
 
 
-ORPHAN = """
-import sys, signal
-from pathlib import Path
-from gdp.host.run_registry import RunRegistry
-from internet.access import Access
-from internet.laboratory import Laboratory
-run = RunRegistry(Path(sys.argv[1])).start()
-laboratory = Laboratory(run)
-site = laboratory.add_site("home", Access.DOUBLE_NAT, has_line=True)
-laboratory.add_host("robot", site)
-print(run.directory, *run.record.namespaces, flush=True)
-signal.pause()
-"""
+def keep_laboratory(runs: str) -> None:
+    """Make a laboratory with a host, print what it left, and wait; a process of its own."""
+    run = RunRegistry(Path(runs)).start()
+    made = Laboratory(run)
+    made.add_host("robot", made.add_site("home", Access.DOUBLE_NAT, has_line=True))
+    print(run.directory, *run.record.namespaces, flush=True)
+    signal.pause()
 
 
-def test_what_a_killed_laboratory_left_is_removed_by_the_next_start(laboratory: Laboratory, tmp_path: Path) -> None:
-    argv = [sys.executable, "-c", ORPHAN, str(tmp_path / "runs")]
-    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
-        assert process.stdout is not None
-        left = [Path(word) for word in process.stdout.readline().split()]
-        process.send_signal(signal.SIGKILL)
+def test_what_a_killed_laboratory_left_is_removed_by_the_next_start(
+    laboratory: Laboratory, machine: LabMachine
+) -> None:
+    runs = machine.folder / "runs"
+    process = machine.launch(calling(keep_laboratory, runs))
+    left = [Path(word) for word in process.read_line(60.0).decode().split()]
+    machine.kill(process)
     assert len(left) == 6
     assert all(path.exists() for path in left[1:])
-    assert len(RunRegistry(tmp_path / "runs").sweep()) == 1
+    assert len(RunRegistry(runs).sweep()) == 1
     assert not any(path.exists() for path in left)
     assert laboratory.core.path.exists()

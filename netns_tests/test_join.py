@@ -7,7 +7,6 @@ import json
 import select
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,13 +19,13 @@ from gdp.stores.keyring import CARD, load_card
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
-from netns_tests.traces import traced
-from tests.waiting import until
+from lab.machine import GDP, gdp
+from lab.process import until
+from netns_tests.test_trace import traced
 
 pytestmark = pytest.mark.netns
 
 PATIENCE_S = 90.0
-GDP = (sys.executable, "-m", "gdp.cli.gdp")
 
 
 @contextlib.contextmanager
@@ -50,11 +49,6 @@ def running(host: Host, folder: Path, *words: str, answer: str = "") -> Iterator
             process.send_signal(signal.SIGINT)
             process.stdin = None  # closed: communicate() would flush it
             process.communicate(timeout=PATIENCE_S)
-
-
-def run(*words: str) -> str:
-    """Run a command of the border's operator, and return what it prints."""
-    return subprocess.run([*GDP, *words], check=True, capture_output=True, text=True, timeout=PATIENCE_S).stdout
 
 
 def links(directory: Path) -> list[dict[str, object]]:
@@ -96,7 +90,7 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         created = stack.enter_context(running(border, tmp_path, *words))
         assert created.stdout is not None
         assert select.select([created.stdout], [], [], PATIENCE_S)[0]
-        tokens = [created.stdout.readline(), run("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
+        tokens = [created.stdout.readline(), gdp("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
         until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
         for host, token in zip((robot, arm), tokens, strict=True):
             home = str(tmp_path / host.label)
@@ -106,7 +100,7 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         until(lambda: "border" in up(tmp_path / "robot"), said, PATIENCE_S)
         until(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), said, PATIENCE_S)
         rows = {
-            each["label"]: each for each in json.loads(run("domain", "ls", "lab", "--directory", str(lab), "--json"))
+            each["label"]: each for each in json.loads(gdp("domain", "ls", "lab", "--directory", str(lab), "--json"))
         }
         assert rows.keys() == {"border", "robot", "arm"}
         (path,) = traced("two WireGuard tunnels", switch_name(tmp_path / "arm"), tmp_path / "robot" / "switch")
@@ -115,5 +109,5 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         assert {path["hops"][0]["out"]["port"], path["hops"][1]["in"]["port"]} <= devices(tmp_path / "robot") | devices(
             lab
         )
-        run("domain", "remove", "lab", "robot", "--directory", str(lab))
+        gdp("domain", "remove", "lab", "robot", "--directory", str(lab))
         until(lambda: {each["label"] for each in links(lab)} == {"arm"}, said, PATIENCE_S)

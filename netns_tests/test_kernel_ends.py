@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from pyroute2 import IPRoute
@@ -30,7 +25,9 @@ from gdp.ports.kernel.syscall import (
     program_name,
 )
 from gdp.switch.table import Table
-from netns_tests.spaces import Space
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import LabProcess, calling, until
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import MTUS, ONE, PEER_MACS, WIDE, filled, frame, leaves
 
@@ -38,8 +35,6 @@ pytestmark = pytest.mark.netns
 
 TCX_INGRESS = 46
 PATIENCE_S = 20.0
-PROJECT = Path(__file__).parents[1]
-WHERE = os.environ | {"PYTHONPATH": os.pathsep.join([str(PROJECT), *filter(None, sys.path)])}
 
 
 @pytest.fixture
@@ -53,16 +48,18 @@ def ports(space: Space) -> list[str]:
     return [f"p{port}" for port in PORT_MACS]
 
 
-@contextlib.contextmanager
-def running(mode: str, ports: list[str]) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """Process with a kernel plane and its program; killed at the end in any case."""
-    argv = [sys.executable, "-m", "netns_tests.kernel_child", mode, *ports]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT) as child:
-        try:
-            assert child.stdout is not None
-            yield child, [int(each) for each in child.stdout.readline().split()]
-        finally:
-            child.kill()
+def keep_plane(mode: str, *ports: str) -> None:
+    """Print the programs of a kernel plane, and poll it until killed; a process of its own."""
+    plane = KernelPlane(ports, table(), clsact=mode == "filter")
+    print(*(program_id(plane._loaded.program_of(port)) for port in plane.ports), flush=True)
+    while True:
+        plane.poll(None)
+
+
+def running(machine: LabMachine, mode: str, ports: list[str]) -> tuple[LabProcess, list[int]]:
+    """Start a process with a kernel plane; return it with its programs."""
+    child = machine.launch(calling(keep_plane, mode, *ports))
+    return child, [int(each) for each in child.read_line(PATIENCE_S).split()]
 
 
 def loaded() -> dict[int, str]:
@@ -77,12 +74,7 @@ def links_of(program: int) -> int:
 
 def gone(program: int) -> bool:
     """Wait until a program is gone: the kernel frees it a moment after its last user."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while program in loaded():
-        if time.monotonic() > deadline_s:
-            return False
-        os.sched_yield()
-    return True
+    return until(lambda: program not in loaded(), f"the end of program {program}", PATIENCE_S)
 
 
 def filters(ifname: str) -> list[str]:
@@ -129,26 +121,24 @@ def test_opening_and_closing_again_and_again_leaves_nothing(ports: list[str], cl
     assert not any(map(has_clsact, ports))
 
 
-def test_a_killed_switch_leaves_no_program_and_no_link(ports: list[str]) -> None:
-    with running("link", ports) as (child, mine):
-        assert list(map(links_of, mine)) == [1] * len(ports)
-        assert crosses(PATIENCE_S)
-        child.send_signal(signal.SIGKILL)
-        child.wait()
+def test_a_killed_switch_leaves_no_program_and_no_link(machine: LabMachine, ports: list[str]) -> None:
+    child, mine = running(machine, "link", ports)
+    assert list(map(links_of, mine)) == [1] * len(ports)
+    assert crosses(PATIENCE_S)
+    machine.kill(child)
     assert all(map(gone, mine))
     assert not crosses(0.1)
     assert attached(socket.if_nametoindex(ports[0]), TCX_INGRESS) == []
 
 
-def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replaces_it(ports: list[str]) -> None:
-    with running("filter", ports) as (child, mine):
-        assert crosses(PATIENCE_S)
-        child.send_signal(signal.SIGKILL)
-        child.wait()
+def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replaces_it(
+    machine: LabMachine, ports: list[str]
+) -> None:
+    child, mine = running(machine, "filter", ports)
+    assert crosses(PATIENCE_S)
+    machine.kill(child)
     assert [name.startswith(f"{PROGRAM}:{child.pid}:") for name in filters(ports[0])] == [True]
-    deadline_s = time.monotonic() + PATIENCE_S
-    while crosses(0.1):  # until its lease ends
-        assert time.monotonic() < deadline_s
+    until(lambda: not crosses(0.1), "the end of its lease", PATIENCE_S)
     plane = KernelPlane(ports, table(), clsact=True)
     assert all(map(gone, mine))
     assert [name.split(":")[1] for name in filters(ports[0])] == [str(os.getpid())]
@@ -159,11 +149,13 @@ def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replace
 
 @pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
 @pytest.mark.parametrize(("first", "words"), [("link", "a live switch"), ("filter", "live process {pid}")])
-def test_a_device_that_a_live_switch_has_is_refused(ports: list[str], first: str, words: str, clsact: bool) -> None:
-    with running(first, ports) as (child, _):
-        with pytest.raises(LocalError, match=words.format(pid=child.pid)):
-            KernelPlane(ports, table(), clsact=clsact)
-        assert crosses(PATIENCE_S)
+def test_a_device_that_a_live_switch_has_is_refused(
+    machine: LabMachine, ports: list[str], first: str, words: str, clsact: bool
+) -> None:
+    child, _ = running(machine, first, ports)
+    with pytest.raises(LocalError, match=words.format(pid=child.pid)):
+        KernelPlane(ports, table(), clsact=clsact)
+    assert crosses(PATIENCE_S)
 
 
 @pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
@@ -201,26 +193,25 @@ chosen.plane.close()
 
 
 @pytest.mark.parametrize("lacks", ["bpf,-sys_admin", "net_admin,-sys_admin"])
-def test_without_the_capability_it_says_so_and_takes_the_next_best(ports: list[str], lacks: str) -> None:
+def test_without_the_capability_it_says_so_and_takes_the_next_best(
+    machine: LabMachine, ports: list[str], lacks: str
+) -> None:
     drop = [f"--bounding-set=-{lacks}", f"--inh-caps=-{lacks}"]
     with_less = ["setpriv", *drop, "--", sys.executable, "-c", CHOOSE]
-    run = {"capture_output": True, "text": True, "env": WHERE, "cwd": PROJECT}
-    auto = subprocess.run([*with_less, "auto"], check=False, **run)  # type: ignore[call-overload]
+    auto = machine.run(*with_less, "auto")
     assert auto.returncode == 0, auto.stderr
     name, reason = auto.stdout.strip().split("|")
     assert name == "raw"
     assert "EPERM" in reason
     assert "CAP_BPF" in reason
-    kernel = subprocess.run([*with_less, "kernel"], check=False, **run)  # type: ignore[call-overload]
+    kernel = machine.run(*with_less, "kernel")
     assert kernel.returncode == 1
     assert "data plane kernel:" in kernel.stderr
     assert "EPERM" in kernel.stderr
 
 
-def test_where_it_is_allowed_it_is_what_auto_takes(ports: list[str]) -> None:
-    argv = [sys.executable, "-c", CHOOSE, "auto"]
-    ended = subprocess.run(argv, check=True, capture_output=True, text=True, env=WHERE, cwd=PROJECT)
-    assert ended.stdout == "kernel|\n"
+def test_where_it_is_allowed_it_is_what_auto_takes(machine: LabMachine, ports: list[str]) -> None:
+    assert machine.output(sys.executable, "-c", CHOOSE, "auto") == "kernel|\n"
 
 
 def test_a_device_that_another_switch_still_holds_is_opened_when_that_lets_go(space: Space) -> None:
@@ -229,15 +220,12 @@ def test_a_device_that_another_switch_still_holds_is_opened_when_that_lets_go(sp
     try:
         index = later.add_port("moved", may_be_absent=True)
         for words in (("set", "one", "down"), ("set", "one", "name", "moved"), ("set", "moved", "up")):
-            space.ip(*words)
+            space.ip("link", *words)
         end_s = time.monotonic() + 1.0
         while time.monotonic() < end_s:
             later.poll(0.1)
         assert not later.port_state(index)
         former.close()
-        end_s = time.monotonic() + PATIENCE_S
-        while not later.port_state(index) and time.monotonic() < end_s:
-            later.poll(1.0)
-        assert later.port_state(index)
+        until(lambda: later.port_state(index), meanwhile=lambda: later.poll(1.0))
     finally:
         later.close()

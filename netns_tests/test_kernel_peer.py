@@ -6,17 +6,13 @@ import contextlib
 import os
 import socket
 import struct
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import LocalError
-from gdp.host.netns_files import inside
 from gdp.ports.kernel.abi import PortAt, PortFlag
 from gdp.ports.kernel.assembler import Assembler
 from gdp.ports.kernel.device import peer_is_bare
@@ -24,10 +20,10 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.program import UP
 from gdp.ports.kernel.syscall import Command, address, bpf, create_link, load_program
 from gdp.ports.netlink import NetlinkSocket
-from lab.namespaces import wait_for_carrier
+from lab.namespaces import Space, wait_for_carrier
+from lab.process import until
 from netns_tests.conftest import MakeKernel
-from netns_tests.spaces import Space
-from netns_tests.test_kernel_plane import LOOK_S, PATIENCE_S
+from netns_tests.test_kernel_plane import LOOK_S
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import (
     BOTH,
@@ -44,19 +40,6 @@ pytestmark = pytest.mark.netns
 
 TCX_EGRESS, XDP = 47, 37
 XDP_PROGRAM = 6
-
-
-@contextlib.contextmanager
-def elsewhere() -> Iterator[int]:
-    """Namespace held open by a process."""
-    with subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdin is not None
-        assert holder.stdout is not None
-        holder.stdin.write(b"here\n")
-        holder.stdin.flush()
-        holder.stdout.readline()  # so it is in its namespace
-        yield holder.pid
-        holder.stdin.close()
 
 
 @contextlib.contextmanager
@@ -83,9 +66,14 @@ def test_the_other_end_is_reached_straight_only_where_nothing_is_passed_by(space
     space.veth("p0", "q0", PORT_MACS[IN], PEER_MACS[IN])
     port = socket.if_nametoindex("p0")
     asking = NetlinkSocket()
-    with contextlib.closing(asking), elsewhere() as holder, passing_program() as program, passing_xdp() as xdp:
+    with (
+        contextlib.closing(asking),
+        contextlib.closing(Space()) as there,
+        passing_program() as program,
+        passing_xdp() as xdp,
+    ):
         assert not peer_is_bare(asking, port)  # the other end is here
-        space.ip("set", "q0", "netns", str(holder))
+        space.ip("link", "set", "q0", "netns", str(there.path))
         assert peer_is_bare(asking, port)
         with IPRoute() as ask:
             ask.tc("add", "pfifo", port, handle=0x10000)
@@ -101,8 +89,7 @@ def test_the_other_end_is_reached_straight_only_where_nothing_is_passed_by(space
         assert not peer_is_bare(asking, port)
         os.close(link)
         assert peer_is_bare(asking, port)
-        there = Path(f"/proc/{holder}/ns/net")
-        link = inside(there, lambda: create_link(xdp, socket.if_nametoindex("q0"), XDP))
+        link = there.inside(lambda: create_link(xdp, socket.if_nametoindex("q0"), XDP))
         assert not peer_is_bare(asking, port)
         os.close(link)
         assert peer_is_bare(asking, port)
@@ -118,21 +105,17 @@ def is_straight(plane: KernelPlane, port: int) -> bool:
 def test_a_frame_reaches_another_namespace_straight_or_by_the_queue_that_was_put_in_between(
     make_kernel: MakeKernel, space: Space, peer: bool
 ) -> None:
-    with elsewhere() as holder, far_end("q0") as sender:
-        space.ip("set", "q1", "netns", str(holder))
-        there = Path(f"/proc/{holder}/ns/net")
-        inside(there, lambda: space.ip("set", "q1", "up"))
+    with contextlib.closing(Space()) as there, far_end("q0") as sender:
+        space.ip("link", "set", "q1", "netns", str(there.path))
+        there.ip("link", "set", "q1", "up")
         wait_for_carrier("p1")
         plane = make_kernel(filled(), peer=peer)
-        with inside(there, lambda: far_end("q1")) as receiver, IPRoute() as ask:
+        with there.inside(lambda: far_end("q1")) as receiver, IPRoute() as ask:
             assert is_straight(plane, WIDE) == peer
             sender.send(frame(ONE))
             assert receiver.recv(1 << 16) == leaves(frame(ONE), WIDE)[WIDE]
             ask.tc("add", "tbf", socket.if_nametoindex("p1"), handle=0x10000, rate=1_000_000, burst=3_000, limit=9_000)
-            deadline_s = time.monotonic() + PATIENCE_S
-            while is_straight(plane, WIDE):
-                assert time.monotonic() < deadline_s
-                plane.poll(LOOK_S)
+            until(lambda: not is_straight(plane, WIDE), meanwhile=lambda: plane.poll(LOOK_S))
             sender.send(frame(BOTH))
             assert receiver.recv(1 << 16) == leaves(frame(BOTH), WIDE)[WIDE]
         assert plane._counters.frames_in == 0
@@ -145,9 +128,9 @@ def test_a_question_that_is_refused_takes_the_plain_way_until_it_is_answered(
     def refuse(*_: object) -> list[tuple[int, bytes]]:
         raise LocalError("no answer")
 
-    with elsewhere() as holder:
-        space.ip("set", "q1", "netns", str(holder))
-        inside(Path(f"/proc/{holder}/ns/net"), lambda: space.ip("set", "q1", "up"))
+    with contextlib.closing(Space()) as there:
+        space.ip("link", "set", "q1", "netns", str(there.path))
+        there.ip("link", "set", "q1", "up")
         wait_for_carrier("p1")
         plane = make_kernel(filled())
         assert is_straight(plane, WIDE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -18,8 +17,9 @@ from gdp.ports.kernel.device import TxDrops
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.forwarder import Forward, decide, rewrite
 from gdp.switch.table import Hops
+from lab.namespaces import Space
+from lab.process import until
 from netns_tests.conftest import MakeKernel
-from netns_tests.spaces import Space
 from netns_tests.test_planes import PORT_MACS, far_end
 from tests.fixtures_forwarding import (
     BOTH,
@@ -57,12 +57,14 @@ def ends(make_kernel: MakeKernel) -> Iterator[dict[int, socket.socket]]:
 
 def settle(plane: KernelPlane, taken: int) -> int:
     """Poll until the plane took this many frames since it was made; return how many were punted."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    punted = 0
-    while plane.counters.frames_in < taken or plane._epoll.poll(0):
-        assert time.monotonic() < deadline_s, "frames are missing"
-        punted += len(plane.poll(LOOK_S))
-    return punted
+    punted: list[object] = []
+    until(
+        lambda: plane.counters.frames_in >= taken and not plane._epoll.poll(0),
+        "all frames",
+        PATIENCE_S,
+        lambda: punted.extend(plane.poll(LOOK_S)),
+    )
+    return len(punted)
 
 
 def waiting(end: socket.socket) -> list[bytes]:
@@ -137,10 +139,7 @@ def test_what_a_full_queue_refuses_is_counted(make_kernel: MakeKernel, ends: dic
         ends[IN].send(given)
     settle(plane, 20)
     refused = 20 - 2  # one left at once, one is queued
-    deadline_s = time.monotonic() + PATIENCE_S
-    while plane.counters.drops[DropReason.PORT_FULL] < refused:
-        assert time.monotonic() < deadline_s
-        plane.poll(LOOK_S)
+    until(lambda: plane.counters.drops[DropReason.PORT_FULL] >= refused, meanwhile=lambda: plane.poll(LOOK_S))
     assert plane._counters.frames_in == 0
     assert plane.counters.drops[DropReason.PORT_FULL] == refused
     assert plane.counters.forwarded == 20
@@ -256,11 +255,8 @@ def test_a_deleted_port_is_down_for_the_kernel_too(
     make_kernel: MakeKernel, space: Space, ends: dict[int, socket.socket]
 ) -> None:
     plane = make_kernel(filled())
-    space.ip("del", "p1")
-    deadline_s = time.monotonic() + PATIENCE_S
-    while plane.port_state(WIDE):
-        assert time.monotonic() < deadline_s
-        plane.poll(LOOK_S)
+    space.ip("link", "del", "p1")
+    until(lambda: not plane.port_state(WIDE), meanwhile=lambda: plane.poll(LOOK_S))
     for each in (frame(ONE), frame(BOTH)):
         ends[IN].send(each)
     settle(plane, 2)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import sys
 
 import pytest
 
@@ -25,16 +27,15 @@ def test_the_tutorial_of_the_library_does_what_it_says() -> None:
     with session_lab({}) as lab:
         (lab.folder / rights.title).write_text(rights.text)
         for script in (make, delegate):
-            lab.output(lab.start_command(["bash", "-e", "-c", script]))
+            lab.output("bash", "-e", "-c", script)
         for line in nodes.splitlines():
-            node = lab.start_command([*line.removesuffix(" &").split(), "--json"])
+            node = lab.launch([*line.removesuffix(" &").split(), "--json"])
             assert '"ready"' in lines_of(node, 1)[0]
         for program in (subscribe, subscribe_async):
-            reader = lab.start("-c", program)
-            lab.output(lab.start("-c", publish))
+            reader = lab.python("-c", program)
+            lab.output(sys.executable, "-c", publish)
             assert "b'hello'" in lines_of(reader, 1)[0]
-            reader.terminate()
-            reader.wait()
-        lab.start("-c", serve)
-        lab.start("-c", serve.replace('"edge"', '"server"'))
-        assert lab.output(lab.start("-c", call)).startswith("b'tobor' from ")
+            reader.finish(signal.SIGTERM)
+        lab.python("-c", serve)
+        lab.python("-c", serve.replace('"edge"', '"server"'))
+        assert lab.output(sys.executable, "-c", call).startswith("b'tobor' from ")

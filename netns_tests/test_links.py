@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from gdp.ports.rtnetlink import Link, LinkMonitor
-from netns_tests.spaces import Space
+from lab.namespaces import Space
 
 pytestmark = pytest.mark.netns
 
@@ -66,7 +66,7 @@ def test_a_change_is_news(
 ) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
     watch.poll()
-    space.ip(*words)
+    space.ip("link", *words)
     news: list[Link] = []
     # the kernel may report a carrier a moment later
     while not any(link.ifname == "one" and seen(link) for link in news):
@@ -77,10 +77,10 @@ def test_a_change_is_news(
 
 def test_a_device_that_leaves_a_bridge_is_not_gone(watch: LinkMonitor, space: Space) -> None:
     space.veth("one", "two", MAC, PEER_MAC)
-    space.ip("add", "bridge", "type", "bridge")
-    space.ip("set", "one", "master", "bridge")
+    space.ip("link", "add", "bridge", "type", "bridge")
+    space.ip("link", "set", "one", "master", "bridge")
     watch.poll()
-    space.ip("set", "one", "nomaster")
+    space.ip("link", "set", "one", "nomaster")
     assert not any(link.gone for link in watch.poll())
 
 
@@ -90,8 +90,8 @@ def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkMonitor, spa
     watch.poll()
     watch._news._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # space for one or two messages
     for mtu in range(1_000, 1_020):
-        space.ip("set", "one", "mtu", str(mtu))
-    space.ip("del", "three")
+        space.ip("link", "set", "one", "mtu", str(mtu))
+    space.ip("link", "del", "three")
     news = watch.poll()
     assert last(news, "one").mtu == 1_019
     assert last(news, "three").gone

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from lab.process import until
 from netns_tests.live_pair import Crossing, Pair, Proxy, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
-from tests.waiting import until
 
 needs("std_msgs", "sensor_msgs", "geometry_msgs", "std_srvs", "diagnostic_msgs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:

@@ -27,6 +27,8 @@ from gdp.errors import LocalError, StoreError
 from gdp.host import netns_files
 from gdp.host.netns_files import reach
 from gdp.host.processes import end_all
+from lab.namespaces import Space
+from lab.process import until
 from netns_tests.local_site import (
     PATIENCE_S,
     Domain,
@@ -37,9 +39,7 @@ from netns_tests.local_site import (
     spec,
     ticking,
 )
-from netns_tests.spaces import Space
 from tests.pages import ROOT
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 _ETHERTYPE = 0x88B6  # IEEE 802 local experimental 2
@@ -324,7 +324,7 @@ def test_a_gateway_that_was_killed_runs_again_when_the_network_is_opened(provide
 
 
 def test_a_device_of_somebody_else_is_no_uplink(folder: Path, space: Space) -> None:
-    space.ip("add", "fog0", "type", "veth", "peer", "name", "other")
+    space.ip("link", "add", "fog0", "type", "veth", "peer", "name", "other")
     provider = LocalProvider(folder, plain_gateway)
     with pytest.raises(LocalError, match="not ours"):
         provider.open_network()

@@ -44,10 +44,10 @@ from gdp.trust.domain import Policy
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
-from netns_tests.spaces import Space
+from lab.namespaces import Space
+from lab.process import until
 from netns_tests.test_planes import BURST, changes, far_end, poll_until
 from tests.fixtures_forwarding import frame
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -124,7 +124,7 @@ class Lab:
     def resize(self, mtu: int, ifnames: Sequence[str], reported: int) -> None:
         """Change devices; return when the publisher has received the new size."""
         for ifname in ifnames:
-            self.space.ip("set", ifname, "mtu", str(mtu))
+            self.space.ip("link", "set", ifname, "mtu", str(mtu))
         self.until(lambda: self.heard[-1] == reported)
 
     def crosses_in(self, message: bytes) -> tuple[int, int]:
@@ -237,7 +237,7 @@ def test_a_stream_under_which_the_link_changes_loses_nothing(lab: Lab) -> None:
 
 def test_a_link_too_narrow_for_any_node_is_down_until_it_is_wider_again(lab: Lab) -> None:
     for ifname in ("a0", "a1"):
-        lab.space.ip("set", ifname, "mtu", str(MTU_MIN_BYTES - 1))
+        lab.space.ip("link", "set", ifname, "mtu", str(MTU_MIN_BYTES - 1))
     lab.until(lambda: not lab.planes[0].port_state(1))
     lab.resize(JUMBO, ("a0", "a1"), JUMBO)
     assert lab.crosses_in(os.urandom(MEGABYTE))[0] == JUMBO
@@ -252,7 +252,7 @@ def test_a_port_tells_of_another_mtu(make: type[RawPlane] | type[ScapyPlane], sp
     with closing(make(["p0"])) as plane:
         heard = changes(plane)
         for mtu in (JUMBO, 1_200):
-            space.ip("set", "p0", "mtu", str(mtu))
+            space.ip("link", "set", "p0", "mtu", str(mtu))
             poll_until(plane, lambda mtu=mtu: plane.ports[0].mtu == mtu)  # type: ignore[misc]
         assert heard == [(0, True), (0, True)]
 
@@ -267,7 +267,7 @@ def test_what_waits_at_a_port_while_its_mtu_changes_is_not_lost(
             sent = [frame(bytes(32), bytes([number])) for number in range(BURST)]
             for each in sent:
                 end.send(mac_of("p0") + each[MAC_BYTES:])
-            space.ip("set", "p0", "mtu", str(mtu))
+            space.ip("link", "set", "p0", "mtu", str(mtu))
             arrivals = poll_until(plane, lambda mtu=mtu: plane.ports[0].mtu == mtu)  # type: ignore[misc]
             while len(arrivals) < BURST and (more := plane.poll(0)):
                 arrivals += more
@@ -279,13 +279,13 @@ def test_a_port_with_another_address_is_another_port(make: type[RawPlane] | type
     space.veth("p0", "q0", mac_of("p0"), mac_of("q0"))
     with closing(make(["p0"])) as plane:
         heard = changes(plane)
-        space.ip("set", "p0", "address", mac_of("z0").hex(":"))
+        space.ip("link", "set", "p0", "address", mac_of("z0").hex(":"))
         poll_until(plane, lambda: plane.ports[0].mac == mac_of("z0"))
         assert heard == [(0, False), (0, True)]
 
 
 def test_a_switch_with_another_address_is_found_again(lab: Lab) -> None:
-    lab.space.ip("set", "a0", "address", mac_of("z0").hex(":"))
+    lab.space.ip("link", "set", "a0", "address", mac_of("z0").hex(":"))
     lab.until(lambda: lab.planes[0].ports[1].mac == mac_of("z0"))
     message = os.urandom(MEGABYTE)
     lab.publish(message)

@@ -16,8 +16,8 @@ from gdp.errors import LocalError
 from gdp.host.processes import Process
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from lab.namespaces import Namespaces
+from lab.process import until
 from lab.topology import chain, ring5
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -149,8 +149,7 @@ signal.pause()
 
 def test_what_a_killed_process_left_behind_is_swept_by_the_next(runs: RunRegistry, tmp_path: Path) -> None:
     argv = [sys.executable, "-c", ORPHAN, str(tmp_path)]
-    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         leashed, free, path = process.stdout.readline().split()
         leash, loose = os.pidfd_open(int(leashed)), Process.from_pid(int(free))

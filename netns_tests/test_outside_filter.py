@@ -38,7 +38,7 @@ def sites() -> Iterator[tuple[Site, Site]]:
     with two_sites() as (one, two):
         for site, address in ((one, OUTSIDE), (two, ELSEWHERE)):
             for scope in ("all", "default", "u0"):
-                site.write(f"ipv6/conf/{scope}/disable_ipv6", "0")
+                site.space.set(f"ipv6/conf/{scope}/disable_ipv6", "0")
             site.ip("address", "add", f"{address}/64", "dev", "u0", "nodad")
         yield one, two
 

@@ -13,7 +13,7 @@ from gdp.links.uplink import wait_for_device
 from gdp.links.veth import attach_pairs
 from gdp.names import Name
 from gdp.ports.rtnetlink import LinkMonitor
-from netns_tests.spaces import Space
+from lab.namespaces import Space
 
 pytestmark = [pytest.mark.netns, pytest.mark.usefixtures("space")]
 
@@ -48,7 +48,7 @@ def test_the_pair_of_another_switch_is_left_alone() -> None:
 
 
 def test_somebody_elses_device_is_refused_and_what_was_made_before_it_is_gone(space: Space) -> None:
-    space.ip("add", "rib0-s", "type", "bridge")
+    space.ip("link", "add", "rib0-s", "type", "bridge")
     with pytest.raises(LocalError, match="rib0-s exists"), attach_pairs(["px0", "rib0"], ONE, 1_500):
         pass
     assert devices().keys() == {"rib0-s"}

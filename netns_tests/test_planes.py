@@ -29,8 +29,8 @@ from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.switch.table import Table
-from lab.namespaces import wait_for_carrier
-from netns_tests.spaces import Space
+from lab.namespaces import Space, wait_for_carrier
+from lab.process import until
 from tests.fixtures_forwarding import (
     BOTH,
     CASES,
@@ -47,7 +47,6 @@ from tests.fixtures_forwarding import (
     frame,
     leaves,
 )
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -327,14 +326,14 @@ def test_a_cut_link_is_noticed_and_so_is_its_repair(
     switch: Plane, space: Space, ends: dict[int, socket.socket]
 ) -> None:
     heard = changes(switch)
-    space.ip("set", "q1", "down")
+    space.ip("link", "set", "q1", "down")
     poll_until(switch, lambda: heard == [(WIDE, False)])
     assert not switch.port_state(WIDE)
     ends[IN].send(MARK)
     take_in(switch, 1)
     assert ends[NARROW].recv(1 << 16) == leaves(MARK, NARROW)[NARROW]
     assert switch.counters.drops[DropReason.PORT_DOWN] == 1
-    space.ip("set", "q1", "up")
+    space.ip("link", "set", "q1", "up")
     poll_until(switch, lambda: heard == [(WIDE, False), (WIDE, True)])
     wait_for_carrier("q1")
     ends[WIDE].close()
@@ -348,10 +347,10 @@ def test_a_device_switched_off_is_a_port_down_and_works_again_when_on(
     node: Plane, space: Space, ends: dict[int, socket.socket]
 ) -> None:
     heard = changes(node)
-    space.ip("set", "p0", "down")
+    space.ip("link", "set", "p0", "down")
     poll_until(node, lambda: heard == [(0, False)])
     assert node.transmit(0, PEER_MACS[IN], [bytes(96)]) == 0
-    space.ip("set", "p0", "up")
+    space.ip("link", "set", "p0", "up")
     poll_until(node, lambda: heard == [(0, False), (0, True)])
     wait_for_carrier("q0")
     ends[IN].send(MARK)
@@ -362,7 +361,7 @@ def test_a_deleted_device_is_a_port_down_until_one_of_its_name_returns(
     node: Plane, space: Space, ends: dict[int, socket.socket]
 ) -> None:
     heard = changes(node)
-    space.ip("del", "p0")
+    space.ip("link", "del", "p0")
     poll_until(node, lambda: heard == [(0, False)])
     assert node.transmit(0, PEER_MACS[IN], [bytes(96)]) == 0
     new_mac = bytes([2, 0, 0, 0, 0, 77])
@@ -379,7 +378,7 @@ def test_a_deleted_device_is_a_port_down_until_one_of_its_name_returns(
 
 def test_a_larger_mtu_lets_larger_frames_through(node: Plane, space: Space, ends: dict[int, socket.socket]) -> None:
     for name in ("p0", "q0"):
-        space.ip("set", name, "mtu", "9000")
+        space.ip("link", "set", name, "mtu", "9000")
     poll_until(node, lambda: node.ports[0].mtu == 9_000)
     large = frame(ONE, os.urandom(9_000 - 96))
     ends[IN].send(large)
@@ -427,7 +426,7 @@ def test_a_device_given_twice_is_refused(node: Plane) -> None:
 
 
 def test_a_device_with_too_small_an_mtu_is_refused(node: Plane, space: Space) -> None:
-    space.ip("set", "p1", "mtu", "500")
+    space.ip("link", "set", "p1", "mtu", "500")
     with pytest.raises(LocalError, match="MTU 500 is below"):
         node.add_port("p1")
 

@@ -18,7 +18,7 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
-from tests.waiting import until
+from lab.process import until
 
 pytestmark = [
     pytest.mark.netns,

@@ -14,8 +14,8 @@ from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.ports.raw import RawPlane
 from gdp.sansio import ReceivedFrame
+from lab.namespaces import Space
 from netns_tests.rows import KINDS, Row, frame, mac_of
-from netns_tests.spaces import Space
 from netns_tests.test_planes import far_end, poll_until
 
 pytestmark = pytest.mark.netns

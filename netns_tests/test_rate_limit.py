@@ -14,7 +14,7 @@ from gdp.frame.kinds import ETHERTYPE
 from gdp.ports.kernel.device import TxDrops
 from gdp.ports.netlink import NetlinkSocket
 from gdp.ports.tunnel.rate_limit import limit_rate
-from netns_tests.spaces import Space
+from lab.namespaces import Space
 
 pytestmark = pytest.mark.netns
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from netns_tests.cable import Terminals, sim_link
-from netns_tests.spaces import Space
+from lab.namespaces import Space, cable
 from proxy.recordings.compare import compare
 from tests.machines import Machines
 from tests.pages import ROOT, Block, blocks
@@ -25,33 +24,12 @@ _TOPIC = "/camera/image"
 def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_page(
     page: list[Block], space: Space, tmp_path: Path
 ) -> None:
-    machines = Machines(tmp_path)
-    with sim_link(space) as into_server:
-        terminals = Terminals(machines, into_server)
-        try:
-            printed = _follow(machines, terminals, page)
-            said = terminals.end()
-        finally:
-            terminals.close()
+    with cable(space) as server, Machines(tmp_path, server) as machines:
+        printed = machines.follow(page)
+        said = machines.end()
     assert "100 messages sent, 100 confirmed" in printed
     assert said.keys() == {f"gdp-{each}, exit 0" for each in ("switch", "rib", "proxy")}
     assert "100 messages received, 0 lost" in said["gdp-proxy, exit 0"]
     result = compare(machines.robot / "drive.mcap", machines.server / "server/received.mcap", exact=False)
     (image,) = (each for each in result if each.topic == _TOPIC)
     assert (image.delivered, image.identical, image.in_order) == (100, True, True)
-
-
-def _follow(machines: Machines, terminals: Terminals, page: list[Block]) -> str:
-    """Follow the page in its order; return the output."""
-    printed = ""
-    for block in page:
-        if block.language == "yaml":
-            machines.write(block)
-        elif block.title:
-            home = machines.home_of(block)
-            for line in block.lines:
-                if line.startswith(("gdp-switch", "gdp-rib", "gdp-proxy")):
-                    terminals.start(line, home)
-                else:
-                    printed += machines.run(line, home)
-    return printed

@@ -14,7 +14,7 @@ import gdp
 from gdp.trust.right import Right
 from internet.laboratory import Laboratory
 from internet_demo.stage import Stage
-from tests.waiting import until
+from lab.process import until
 
 pytestmark = [
     pytest.mark.netns,

@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
@@ -34,6 +32,8 @@ from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.limits import CALL_QUIET_S
 from gdp.metadata import Metadata
+from lab.namespaces import Space
+from lab.process import until
 from netns_tests.local_site import (
     PATIENCE_S,
     Domain,
@@ -44,11 +44,9 @@ from netns_tests.local_site import (
     spec,
     ticking,
 )
-from netns_tests.spaces import Space
 from netns_tests.test_fog import Fog, left_of
 from netns_tests.test_uplink import BYTES, OVERHEAD_BYTES, PARTS, REQUESTS, tell
 from tests.pages import ROOT
-from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
@@ -153,10 +151,11 @@ def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gatew
 
 @pytest.fixture
 def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-    made = Fog(tmp_path / "state")
+    space.ip("link", "set", "lo", "up")
+    made = Fog(tmp_path)
     yield made
     made.run("down", "--all")
+    made.host.close()
     assert not left_of(made)
 
 
@@ -165,40 +164,31 @@ def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) ->
     fog.run("launch", str(ECHO), "--gateway", "replica", "--detach")
     fog.run("scale", "up")
     fog.until(lambda: len(fog.serving()) == 3 and all(each.up_unix_s for each in fog.living()), "three replicas serve")
-    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0", "-p", "depth:=1000"]
-    caller = subprocess.Popen(
-        [sys.executable, *words], env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert caller.stdout is not None
-        while not json.loads(caller.stdout.readline())["answered"]:
-            pass
-        (lost,) = (each for each in fog.living() if each.gateway)
-        host = find(local_provider(open_site(None, fog.state)).runs, lost.id).host
-        assert host is not None
-        moves, looks = (fog.events().count(each) for each in ("gateway", "reconciled"))
-        os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
-        fog.until(lambda: not background.is_running(open_site(None, fog.state)), "the supervisor has gone")
-        (known,) = (each["name"] for each in fog.status()["members"] if each["gateway"])  # starts another supervisor
-        assert known == lost.name
-        fog.until(lambda: fog.events().count("reconciled") > looks, "the other supervisor has looked")
-        assert fog.events().count("gateway") == moves
-        os.kill(host.pid, signal.SIGKILL)  # the kernel ends its programs; its devices stay
-        fog.until(lambda: {each.name for each in fog.living() if each.gateway} - {lost.name}, "the role moves")
-        fog.until(lambda: len({*fog.serving()} - {lost.name}) == 3, "the killed machine is replaced")
-        (now,) = (each.name for each in fog.living() if each.gateway)
-        caller.send_signal(signal.SIGUSR1)
-        lines = [json.loads(line) for line in caller.communicate(timeout=PATIENCE_S)[0].splitlines()]
-        last, silence_s = lines[-1], max(each["silence_ms"] for each in lines) / 1e3
-        counts = {key: last[key] for key in ("calls", "answered", "failed", "wrong", "unserved")}
-        print(f"silence {silence_s:.2f} s, {counts}")  # visible with pytest -s: the cost of a lost gateway
-        assert last["answered"] + last["failed"] == last["calls"]
-        if silence_s < CALL_QUIET_S:  # on a busy machine the hand-over may take longer; then servers count as gone
-            assert last["failed"] == last["wrong"] == last["unserved"] == 0
-        assert lines[-2]["answered"] < last["answered"]
-    finally:
-        caller.kill()
-        caller.wait()
+    caller = fog.start_caller(20.0, "depth:=1000")
+    while not caller.read(PATIENCE_S)["answered"]:
+        pass
+    (lost,) = (each for each in fog.living() if each.gateway)
+    host = find(local_provider(open_site(None, fog.state)).runs, lost.id).host
+    assert host is not None
+    moves, looks = (fog.events().count(each) for each in ("gateway", "reconciled"))
+    os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
+    fog.until(lambda: not background.is_running(open_site(None, fog.state)), "the supervisor has gone")
+    (known,) = (each["name"] for each in fog.status()["members"] if each["gateway"])  # starts another supervisor
+    assert known == lost.name
+    fog.until(lambda: fog.events().count("reconciled") > looks, "the other supervisor has looked")
+    assert fog.events().count("gateway") == moves
+    os.kill(host.pid, signal.SIGKILL)  # the kernel ends its programs; its devices stay
+    fog.until(lambda: {each.name for each in fog.living() if each.gateway} - {lost.name}, "the role moves")
+    fog.until(lambda: len({*fog.serving()} - {lost.name}) == 3, "the killed machine is replaced")
+    (now,) = (each.name for each in fog.living() if each.gateway)
+    lines = [json.loads(line) for line in caller.finish(signal.SIGUSR1).splitlines()]
+    last, silence_s = lines[-1], max(each["silence_ms"] for each in lines) / 1e3
+    counts = {key: last[key] for key in ("calls", "answered", "failed", "wrong", "unserved")}
+    print(f"silence {silence_s:.2f} s, {counts}")  # visible with pytest -s: the cost of a lost gateway
+    assert last["answered"] + last["failed"] == last["calls"]
+    if silence_s < CALL_QUIET_S:  # on a busy machine the hand-over may take longer; then servers count as gone
+        assert last["failed"] == last["wrong"] == last["unserved"] == 0
+    assert lines[-2]["answered"] < last["answered"]
     assert now in fog.run("status")
     with closing(Journal(fog.state / "journal.sqlite3")) as journal:
         moved = [(each.machine, each.detail) for each in journal.events("echo") if each.what == "gateway"]

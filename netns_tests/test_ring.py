@@ -12,17 +12,23 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
+from unittest import mock
 
 import pytest
 from scapy.utils import RawPcapReader
 
 from gdp.client.capture_opener import Outcome
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import RunRegistry
+from gdp.stores.issue import make_node
+from lab.process import calling
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.recordings.reader import BagReader
+from ring import cli
 from tests.tshark import assert_same, needs_tshark, shown_by_tshark, tshark
 
 pytestmark = pytest.mark.netns
@@ -41,7 +47,6 @@ RECORDINGS: Final = (
 PATIENCE_S: Final = 240
 LASTING: Final = ("--seconds", 7, "--lease", LEASE_S)  # past three leases
 FAST: Final = "sent as fast as it goes: what is compared is the content"
-WHERE: Final = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 def command(*arguments: object) -> list[str]:
@@ -50,7 +55,7 @@ def command(*arguments: object) -> list[str]:
 
 def ring(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        command(*arguments), capture_output=True, text=True, timeout=PATIENCE_S, env=WHERE, cwd=PROJECT, check=False
+        command(*arguments), capture_output=True, text=True, timeout=PATIENCE_S, cwd=PROJECT, check=False
     )
 
 
@@ -76,7 +81,7 @@ def make_demo(folder: Path, seconds: float, *more: str) -> Path:
     path = folder / ("demo.bag" if "--ros1" in more else "demo.mcap")
     script = PROJECT / "scripts" / "make_demo_bag.py"
     argv = [sys.executable, str(script), "--seconds", str(seconds), "-o", str(path), *more]
-    subprocess.run(argv, check=True, env=WHERE, cwd=PROJECT)
+    subprocess.run(argv, check=True, cwd=PROJECT)
     return path
 
 
@@ -142,6 +147,20 @@ def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, t
     crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
 
 
+def run_ordered(least: str, *arguments: str) -> None:
+    """Run the ring whose RIB of one domain has the least name: it begins with a small byte; a process of its own."""
+
+    def make(directory: Path, role: Role, label: str, domain: Path) -> Identity:
+        identity = make_node(directory, role, label, domain)
+        while role is Role.RIB and (identity.name[0] < 0x40) != (domain.name == least):
+            identity = make_node(directory, role, label, domain, force=True)
+        return identity
+
+    sys.argv = ["ring", *arguments]
+    with mock.patch("lab.credentials.make_node", make):
+        cli.main()
+
+
 @pytest.mark.parametrize(
     "least", ["backbone", *(pytest.param(each, marks=pytest.mark.nightly) for each in ("school", "cloud"))]
 )
@@ -150,10 +169,8 @@ def test_every_rib_dies_one_after_the_other_and_no_message_is_lost_whichever_has
 ) -> None:
     kills = ["--kill", "rib:backbone@0.5", "--kill", "rib:school@12", "--kill", "rib:cloud@12"]
     arguments = [demo, "--seconds", 18.5, "--lease", LEASE_S, *kills, "--json", tmp_path / "result.json"]
-    argv = [sys.executable, "-m", "netns_tests.ordered_ring", least, *map(str, arguments)]
-    ended = subprocess.run(
-        argv, capture_output=True, text=True, timeout=PATIENCE_S, env=WHERE, cwd=PROJECT, check=False
-    )
+    argv = calling(run_ordered, least, *arguments)
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=PATIENCE_S, cwd=PROJECT, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     noted.append(Lifetime("the ring without RIBs", LEASE_S, 18.5 - 12))
 
@@ -185,7 +202,7 @@ def test_wireshark_shows_of_each_captured_frame_what_scapy_shows_and_each_messag
     reader = shutil.copytree(run.directory / "nodes" / "proxy-nuc5", tmp_path / "reader")
     run.end()
     argv = [sys.executable, "-m", "gdp.cli.gdp", "decrypt-pcap", seen, "--node", reader, "-o", plain, "--json"]
-    ended = subprocess.run([*map(str, argv)], capture_output=True, text=True, env=WHERE, check=True, timeout=60)
+    ended = subprocess.run([*map(str, argv)], capture_output=True, text=True, check=True, timeout=60)
     with RawPcapReader(str(seen)) as capture:
         frames = [data for data, _ in capture if data[12:14] == ETHERTYPE.to_bytes(2, "big")]
     kinds = {Kind(frame[15]) for frame in frames}
@@ -241,7 +258,7 @@ def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str]
 
 def started(demo: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
     """Start a run and wait until traffic flows; return it and its id."""
-    process = subprocess.Popen(command(demo, *more), stderr=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT)
+    process = subprocess.Popen(command(demo, *more), stderr=subprocess.PIPE, text=True, cwd=PROJECT)
     run = ""
     assert process.stderr is not None
     for line in process.stderr:

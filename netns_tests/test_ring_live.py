@@ -13,8 +13,9 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
+from lab.process import python_environment, python_path
 from netns_tests.lifetimes import LEASE_S
-from netns_tests.test_ring import PROJECT, WHERE, command, crossed, left_of, ring, topics
+from netns_tests.test_ring import PROJECT, command, crossed, left_of, ring, topics
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.nodes.content import LAMP, TALKS
 
@@ -110,7 +111,7 @@ def test_kept_nodes_continue_and_the_ring_comes_down_on_command() -> None:
 def test_an_interrupted_live_run_leaves_nothing() -> None:
     needs("ros2")
     argv = command("--live", "--seconds", 60)
-    process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT)
+    process = subprocess.Popen(argv, stderr=subprocess.PIPE, text=True, cwd=PROJECT)
     run = ""
     with process:
         assert process.stderr is not None
@@ -146,10 +147,8 @@ def test_where_a_ros_is_missing_one_sentence_says_so(tmp_path: Path) -> None:
         "import importlib.util as util\nfind = util.find_spec\n"
         "util.find_spec = lambda name, *more: None if name == 'rclpy' else find(name, *more)\n"
     )
-    path = os.pathsep.join([str(tmp_path), WHERE["PYTHONPATH"]])
-    ended = subprocess.run(
-        command("--live"), capture_output=True, text=True, timeout=60, env={**WHERE, "PYTHONPATH": path}, check=False
-    )
+    where = python_environment({"PYTHONPATH": python_path(tmp_path)})
+    ended = subprocess.run(command("--live"), capture_output=True, text=True, timeout=60, env=where, check=False)
     assert ended.returncode == 2
     assert "ROS 2 needs rclpy" in " ".join(ended.stderr.split())
     assert "five namespaces" not in ended.stderr

@@ -19,6 +19,7 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 from internet.site import Site
+from lab.process import until
 from netns_tests.lifetimes import LEASE_S
 
 pytestmark = [
@@ -77,10 +78,7 @@ class Field:
 
     def wait_for_tunnels(self, *to: str) -> None:
         """Return when the robot's tunnels to these switches are up."""
-        end_s = time.monotonic() + PATIENCE_S
-        while not self.has_tunnels(*to):
-            assert time.monotonic() < end_s, f"no tunnels to {to}"
-            self.read_one_more()
+        until(lambda: self.has_tunnels(*to), f"tunnels to {to}", PATIENCE_S, self.read_one_more)
 
     def read_one_more(self) -> None:
         """Read until a message comes that was published from now on."""

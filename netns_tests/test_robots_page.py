@@ -6,16 +6,14 @@ The keyboard input between two commands uses process numbers: a namespace shares
 from __future__ import annotations
 
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from netns_tests.cable import Terminals, sim_link
-from netns_tests.spaces import Space
+from lab.namespaces import Space, cable
 from tests.machines import Machines
-from tests.pages import ROOT, Block, blocks_between
+from tests.pages import ROOT, blocks_between
 from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import CONFINED, DOMAIN, Peer, needs, peer_of
 
@@ -26,7 +24,6 @@ if shutil.which("nsenter") is None:
 pytestmark = pytest.mark.netns
 
 PAGE = ROOT / "docs/tutorials/robots.md"
-_RUN_ON = ("gdp-switch ", "gdp-rib ", "gdp-proxy ", "roscore")
 _ROS2 = ", with ros2"
 _ROBOT = """
 from rclpy.action import ActionServer
@@ -72,39 +69,35 @@ def begun(future):
 
 
 @pytest.fixture
-def machines(tmp_path: Path) -> Machines:
+def server(space: Space) -> Iterator[Space]:
+    """Namespace of the server; the thread is on the robot."""
+    with cable(space) as there:
+        yield there
+
+
+@pytest.fixture
+def machines(server: Space, tmp_path: Path) -> Iterator[Machines]:
     """Two machines with a ROS 2 each, whose graphs do not leave them."""
-    two = Machines(tmp_path)
-    ros1 = {"ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": "http://localhost:11311", "ROS_HOME": str(tmp_path / "ros")}
-    two.environment |= {**CONFINED, **ros1, "ROS_DOMAIN_ID": str(DOMAIN)}
-    return two
+    with Machines(tmp_path, server) as two:
+        ros1 = {"ROS_HOSTNAME": "localhost", "ROS_MASTER_URI": "http://localhost:11311", "ROS_HOME": f"{tmp_path}/ros"}
+        for host in two.hosts.values():
+            host.environment |= {**CONFINED, **ros1, "ROS_DOMAIN_ID": str(DOMAIN)}
+        yield two
 
 
 @pytest.fixture
-def into_server(space: Space) -> Iterator[list[str]]:
-    with sim_link(space) as words:
-        yield words
-
-
-@pytest.fixture
-def terminals(machines: Machines, into_server: list[str]) -> Iterator[Terminals]:
-    opened = Terminals(machines, into_server)
-    yield opened
-    opened.close()
-
-
-@pytest.fixture
-def robot(into_server: list[str]) -> Iterator[Peer]:
-    """Node of the robot: the thread is on the robot."""
+def robot(server: Space) -> Iterator[Peer]:
+    """Node of the robot."""
+    del server
     with peer_of("robot") as peer:
         peer.tell("!" + _ROBOT)
         yield peer
 
 
 @pytest.fixture
-def desk(into_server: list[str]) -> Iterator[Peer]:
+def desk(server: Space) -> Iterator[Peer]:
     """Application on the server."""
-    with peer_of("desk", into_server) as peer:
+    with peer_of("desk", server.command([])) as peer:
         peer.tell("!" + _DESK)
         yield peer
 
@@ -112,43 +105,20 @@ def desk(into_server: list[str]) -> Iterator[Peer]:
 class Reader:
     """Reader of the page who follows it section by section."""
 
-    def __init__(self, machines: Machines, terminals: Terminals) -> None:
+    def __init__(self, machines: Machines) -> None:
         self._machines = machines
-        self._terminals = terminals
-        self.passed_over: list[str] = []
 
     def follow(self, heading: str) -> str:
-        """Run every command of a section; return the output."""
-        return "".join(self._do(block) for block in blocks_between(PAGE, heading) if block.title)
-
-    def _do(self, block: Block) -> str:
-        if block.language == "yaml":
-            self._machines.write(block)
-            return ""
-        home = {"on the robot": self._machines.robot, "on the server": self._machines.server}[
-            block.title.removesuffix(_ROS2)
-        ]
-        if block.title.endswith(_ROS2) and shutil.which("ros2") is None:
-            self.passed_over += block.lines
-            return ""
-        return "".join(self._run(line, home) for line in block.lines)
-
-    def _run(self, line: str, home: Path) -> str:
-        if line.startswith(_RUN_ON) and "--check" not in line:
-            self._terminals.start(line, home)
-            return ""
-        words = [*self._terminals.words(home), "bash", "-ec", line]
-        done = subprocess.run(
-            words, cwd=home, env=self._machines.environment, capture_output=True, text=True, check=False, timeout=60
-        )
-        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
-        return done.stdout
+        """Run every command of a section, those for ROS 2 where it is installed; return the output."""
+        has_ros2 = shutil.which("ros2") is not None
+        shown = [each for each in blocks_between(PAGE, heading) if has_ros2 or not each.title.endswith(_ROS2)]
+        return self._machines.follow(each for each in shown if each.title)
 
 
 @pytest.fixture
-def reader(machines: Machines, terminals: Terminals, robot: Peer, desk: Peer) -> Reader:
+def reader(machines: Machines, robot: Peer, desk: Peer) -> Reader:
     """Reader who has followed the page up to the start."""
-    made = Reader(machines, terminals)
+    made = Reader(machines)
     made.follow("What you need")
     made.follow("Keys")
     printed = made.follow("The two files")
@@ -159,7 +129,7 @@ def reader(machines: Machines, terminals: Terminals, robot: Peer, desk: Peer) ->
 
 
 def test_a_robot_and_a_server_meet_by_the_commands_of_the_page(
-    reader: Reader, terminals: Terminals, robot: Peer, desk: Peer
+    reader: Reader, machines: Machines, robot: Peer, desk: Peer
 ) -> None:
     desk.waits_for("len(heard['/camera/left']) > 0", True)
     robot.waits_for("len(heard['/cmd_vel']) > 0", True)
@@ -178,15 +148,15 @@ def test_a_robot_and_a_server_meet_by_the_commands_of_the_page(
     assert "+ publish topic /odom" in reader.follow("Change")
     desk.waits_for("len(heard['/odom']) > 0", True)
 
-    said = terminals.end()
+    said = machines.end()
     assert sorted(said) == [f"gdp-{each}, exit 0" for each in ("proxy", "rib", "switch")]
     assert " 0 faults" in said["gdp-proxy, exit 0"]
 
 
 @pytest.mark.nightly
-def test_a_ros_1_server_sees_a_ros_2_robot_by_the_commands_of_the_page(reader: Reader, terminals: Terminals) -> None:
+def test_a_ros_1_server_sees_a_ros_2_robot_by_the_commands_of_the_page(reader: Reader, machines: Machines) -> None:
     need_ros1()
-    terminals.end("gdp-proxy --config server")
+    machines.end("gdp-proxy --config server")
     looked = reader.follow("ROS 1")
     assert "/camera/left" in looked
     assert "Type: sensor_msgs/LaserScan" in looked

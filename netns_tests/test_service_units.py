@@ -12,12 +12,11 @@ from typing import Final
 import pytest
 
 from gdp.host.run_registry import Run, RunRegistry
-from netns_tests.cloud_site import wheelhouse
-from netns_tests.datacenter.debian_root import debian_root, why_not
-from netns_tests.datacenter.machine import BootedMachine
-from netns_tests.datacenter.router import Router
+from lab.cloud_site import wheelhouse
+from lab.datacenter import Router
+from lab.debian import BootedMachine, debian_root, why_not
+from lab.process import until
 from tests.pages import ROOT
-from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can")]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -30,7 +31,7 @@ def lab() -> Iterator[SessionLab]:
 def run(lab: SessionLab, code: str) -> list[str]:
     """Run a program of both nodes to its end and return the lines it printed."""
     head = "import asyncio, threading, time, gdp\n"
-    return lab.output(lab.start("-c", head + code)).splitlines()
+    return lab.output(sys.executable, "-c", head + code).splitlines()
 
 
 def test_threads_that_publish_and_receive_at_once_lose_nothing(lab: SessionLab) -> None:

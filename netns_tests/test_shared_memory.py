@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -19,6 +19,8 @@ from testbed import Lab, add_address
 
 from gdp.host.run_registry import RunRegistry
 from lab.dds import ros_environment
+from lab.machine import LabMachine
+from lab.process import ROOT, calling, new_run, python_path
 from lab.topology import chain
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
@@ -36,14 +38,11 @@ OCTETS = "sum(int(line.split()[1]) for line in open('/proc/net/dev').read().spli
 @pytest.fixture
 def lab() -> Iterator[Lab]:
     """Machines s1 and s2 at the ends of a cable with IPv4."""
-    run = RunRegistry().start()
-    try:
+    with new_run() as run:
         made = Lab(run, chain(2), own_shared_memory=("s1", "s2"))
         for node, device, address in (("s1", "s2", "10.97.0.1"), ("s2", "s1", "10.97.0.2")):
             made.inside(node, partial(add_address, device, address))
         yield made
-    finally:
-        run.end()
 
 
 def peer(lab: Lab, node: str, name: str) -> Peer:
@@ -102,30 +101,20 @@ def test_files_in_shared_memory_appear_on_their_machine_alone(lab: Lab) -> None:
     assert not Path("/dev/shm/gdp-test").exists()
 
 
-ORPHAN = """
-import sys, tempfile, signal
-from pathlib import Path
-sys.path.append(sys.argv[2])
-from testbed import Lab
-from gdp.host.run_registry import RunRegistry
-from lab.dds import ros_environment
-from lab.topology import chain
-tempfile.tempdir = sys.argv[1]
-lab = Lab(RunRegistry(Path(sys.argv[1]) / "runs").start(), chain(1), own_shared_memory=("s1",))
-print(lab.directory, flush=True)
-signal.pause()
-"""
+def keep_memory(folder: str) -> None:
+    """Make a machine with shared memory of its own, print its folder, and wait; a process of its own."""
+    tempfile.tempdir = folder
+    lab = Lab(RunRegistry(Path(folder) / "runs").start(), chain(1), own_shared_memory=("s1",))
+    print(lab.directory, flush=True)
+    signal.pause()
 
 
 @pytest.mark.nightly
-def test_the_memory_of_a_killed_run_is_swept_by_the_next(tmp_path: Path) -> None:
-    bench = Path(__file__).resolve().parents[1] / "scripts" / "bench"
-    argv = [sys.executable, "-c", ORPHAN, str(tmp_path), str(bench)]
-    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
-        assert process.stdout is not None
-        directory = process.stdout.readline().strip()
-        process.send_signal(signal.SIGKILL)
+def test_the_memory_of_a_killed_run_is_swept_by_the_next(machine: LabMachine, tmp_path: Path) -> None:
+    machine.environment["PYTHONPATH"] = python_path(ROOT / "scripts" / "bench")
+    process = machine.launch(calling(keep_memory, tmp_path))
+    directory = process.read_line(20.0).decode()
+    machine.kill(process)
     assert directory in Path("/proc/self/mounts").read_text(encoding="utf-8")
     assert len(RunRegistry(tmp_path / "runs").sweep()) == 1
     assert directory not in Path("/proc/self/mounts").read_text(encoding="utf-8")

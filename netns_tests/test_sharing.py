@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -15,14 +13,12 @@ from typing import Any
 import pytest
 
 from gdp.crypto.certificates import Role
-from gdp.management.control_client import ask_node, find_control_socket
-from gdp.metadata import Metadata
-from gdp.state.control_protocol import Command
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, DELEGATIONS
+from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.right import Right
-from netns_tests.spaces import Space
-from tests.pages import ROOT
+from lab.credentials import make_nodes
+from lab.machine import LabMachine
+from lab.namespaces import Space
+from lab.process import until
 from tests.proxy.endpoints.ros2_net import CONFINED, DOMAIN, Peer, needs
 
 needs("std_msgs")
@@ -36,7 +32,6 @@ pytestmark = [
 PATIENCE_S = 30.0
 STRING = "std_msgs/msg/String"
 CLOSES_S = 1.0
-_NODE = "domain: {root: %s/root.crt}\nidentity: %s\n"
 _TALKER = """
 import time
 from std_msgs.msg import String
@@ -82,21 +77,24 @@ def offered(topic):
 class Site:
     """A switch, a RIB and two proxies, each with a graph of its own, and a real node in each graph."""
 
-    def __init__(self, home: Path, stack: ExitStack) -> None:
-        self.home = home
-        self._stack = stack
-        make_domain(home / "lab", "lab")
-        make_owner(home / "owner")
-        for name, role in (("switch", Role.SWITCH), ("rib", Role.RIB)):
-            make_node(home / "robot" / name, role, "robot", home / "lab")
-        (home / "robot" / "revocations").mkdir()
-        attach = "attach: [rib0, robot0, server0]\nrevocations: revocations\n"
-        self._write("robot/switch.yaml", _NODE % ("switch", "switch") + attach)
-        self._write("robot/rib.yaml", _NODE % ("rib", "rib") + "iface: rib0\n")
-        self._start("gdp.cli.switch", "robot/switch", "--data-plane", "raw")
-        self._start("gdp.cli.rib", "robot/rib", "--await-iface", "30")
-        for side, label in enumerate(("robot", "server")):
-            self._add_proxy(label, DOMAIN + side, Right.READ if side else Right.PUBLISH)
+    def __init__(self, machine: LabMachine, stack: ExitStack) -> None:
+        self.machine = machine
+        nodes = {"robot/switch": Role.SWITCH, "robot/rib": Role.RIB}
+        nodes |= {"robot/proxy": Role.PROXY, "server/proxy": Role.PROXY}
+        rights = {"robot/proxy": {"/steady": [Right.PUBLISH]}, "server/proxy": {"/steady": [Right.READ]}}
+        make_nodes(machine.folder, nodes, rights, {"/steady": STRING})
+        (machine.folder / "robot" / "revocations").mkdir()
+        attach = {"attach": ["rib0", "robot0", "server0"], "revocations": "revocations"}
+        machine.write("robot/switch", "switch", **attach)
+        machine.write("robot/rib", "rib", iface="rib0")
+        machine.start("switch", "robot/switch", "--data-plane", "raw")
+        machine.start("rib", "robot/rib", "--await-iface", "30")
+        for number, (label, side) in enumerate((("robot", "expose"), ("server", "import"))):
+            ros = {"endpoint": "ros2", "domain": DOMAIN + number, "exclusive": True}
+            rules = {side: [{"name": "/steady", "type": STRING, "owner": "../owner/owner.pub"}]}
+            keys = {"iface": f"{label}0", "delegations": f"proxy/{DELEGATIONS}", "ros": ros}
+            machine.write(f"{label}/proxy", "proxy", **keys, **rules)
+            machine.start("proxy", f"{label}/proxy", "--await-iface", "30")
         self.talker, self.listener = (
             Peer(f"node_{label}", ["env", f"ROS_DOMAIN_ID={DOMAIN + side}"]) for side, label in enumerate("ab")
         )
@@ -106,28 +104,8 @@ class Site:
 
     def gdp(self, command: str, host: str, *words: str) -> dict[str, Any]:
         """Run a command of ``gdp`` on one machine; return its JSON output."""
-        argv = [
-            sys.executable,
-            "-m",
-            "gdp.cli.gdp",
-            command,
-            *words,
-            "--directory",
-            host,
-            "--exchange",
-            "common",
-            "--json",
-        ]
-        done = subprocess.run(
-            argv,
-            cwd=self.home,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        result: dict[str, Any] = json.loads(done.stdout)
+        given = ("--directory", host, "--exchange", "common", "--json")
+        result: dict[str, Any] = json.loads(self.machine.gdp(command, *words, *given))
         return result
 
     def heard(self, topic: str) -> list[tuple[int, float]]:
@@ -138,56 +116,14 @@ class Site:
 
     def until_heard(self, topic: str, more_than: int = 0) -> None:
         """Wait until more messages of a topic came than a number."""
-        end_s = time.monotonic() + PATIENCE_S
-        while len(self.heard(topic)) <= more_than:
-            assert time.monotonic() < end_s, f"{topic}: nothing came"
-            time.sleep(0.05)
-
-    def _add_proxy(self, label: str, domain: int, right: Right) -> None:
-        proxy = self.home / label / "proxy"
-        make_node(proxy, Role.PROXY, label, self.home / "lab")
-        (proxy / DELEGATIONS).mkdir()
-        metadata = Metadata({"kind": "topic", "name": "/steady", "type": STRING})
-        install_delegation(proxy, delegate(self.home / "owner", proxy / CARD, metadata, [right]))
-        side = "expose" if right is Right.PUBLISH else "import"
-        self._write(
-            f"{label}/proxy.yaml",
-            _NODE % ("proxy", "proxy")
-            + f"iface: {label}0\ndelegations: proxy/{DELEGATIONS}\n"
-            + f"ros: {{endpoint: ros2, domain: {domain}, exclusive: true}}\n"
-            + f"{side}: [{{name: /steady, type: {STRING}, owner: ../owner/owner.pub}}]\n",
-        )
-        self._start("proxy.cli.proxy", f"{label}/proxy", "--await-iface", "30")
-
-    def _write(self, name: str, text: str) -> None:
-        path = self.home / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-
-    def _start(self, module: str, name: str, *more: str) -> None:
-        path = (self.home / name).with_suffix(".yaml")
-        log = path.with_suffix(".log")
-        with log.open("wb") as errors:
-            process = subprocess.Popen(
-                [sys.executable, "-m", module, "--config", str(path), "--json", *more],
-                stdout=errors,
-                stderr=errors,
-                env={**os.environ, **CONFINED, "PYTHONPATH": str(ROOT)},
-            )
-        self._stack.callback(process.wait)
-        self._stack.callback(process.kill)
-        end_s = time.monotonic() + PATIENCE_S
-        while '"ready"' not in log.read_text():
-            assert process.poll() is None, log.read_text()
-            assert time.monotonic() < end_s, log.read_text()
-            time.sleep(0.05)
+        until(lambda: len(self.heard(topic)) > more_than, topic, PATIENCE_S)
 
 
 @pytest.fixture
 def site(space: Space, tmp_path: Path) -> Iterator[Site]:
-    space.ip("set", "lo", "up")
-    with ExitStack() as stack:
-        yield Site(tmp_path, stack)
+    space.ip("link", "set", "lo", "up")
+    with LabMachine(tmp_path, environment=CONFINED) as machine, ExitStack() as stack:
+        yield Site(machine, stack)
 
 
 def test_topics_are_shared_and_taken_back_while_another_flows_without_a_loss(site: Site) -> None:
@@ -198,9 +134,7 @@ def test_topics_are_shared_and_taken_back_while_another_flows_without_a_loss(sit
     assert site.gdp("import", "server", "/camera/**", "--from", "robot")["is_running"] is True
     assert site.gdp("expose", "robot", "/camera/**", "--to", "server", "--wait", "0")["delegated"] == []
     site.talker.tell("!say('/camera/left/image')")
-    end_s = time.monotonic() + PATIENCE_S
-    while not (delegated := site.gdp("share", "robot", "--renew")["delegated"]):
-        assert time.monotonic() < end_s
+    delegated = until(lambda: site.gdp("share", "robot", "--renew")["delegated"], "a delegation", PATIENCE_S)
     assert [(each["name"], each["node"]) for each in delegated] == [
         ("/camera/left/image", "robot"),
         ("/camera/left/image", "server"),
@@ -234,8 +168,8 @@ def test_the_far_graph_shows_a_publishers_qos_before_any_reader_and_the_first_la
 
 def test_a_name_that_its_machine_no_longer_exposes_leaves_the_far_graph_and_comes_back(site: Site) -> None:
     def imported() -> set[object]:
-        names = ask_node(find_control_socket(site.home / "server" / "proxy"), Command.STATUS, PATIENCE_S).result
-        return {each["local"] for each in names["liveliness"] if each["side"] == "import"}  # type: ignore[attr-defined]
+        names = site.machine.status("server/proxy")
+        return {each["local"] for each in names["liveliness"] if each["side"] == "import"}
 
     topic, expose = "/clock", ("expose", "robot", "/clock", "--to", "server", "--wait", str(PATIENCE_S))
     assert site.gdp("import", "server", topic)["is_running"] is True

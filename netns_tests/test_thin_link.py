@@ -16,7 +16,7 @@ from testbed import Lab
 from thin_link.conditions import Conditions, Direction
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
 
-from gdp.host.run_registry import RunRegistry
+from lab.process import new_run
 
 pytestmark = pytest.mark.netns
 
@@ -28,11 +28,8 @@ _RECEIVE_BUFFER_FORCE = 33
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    run = RunRegistry().start()
-    try:
+    with new_run() as run:
         yield thin_link_lab(run)
-    finally:
-        run.end()
 
 
 def link(*, bits_s: float, fifo_frames: int, loss: float, seed: int) -> Conditions:

@@ -20,10 +20,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from gdp.host.run_registry import RunRegistry
+from lab.machine import GDP
 from netns_tests.lifetimes import Lifetime, noted
 from netns_tests.test_ring import command
 from netns_tests.test_trace import labels, running
-from netns_tests.traces import GDP
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns

@@ -7,6 +7,7 @@ import os
 import pty
 import select
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Final
@@ -15,7 +16,8 @@ import pytest
 import yaml
 
 from gdp.trust.right import Right
-from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
+from lab.machine import GDP
+from netns_tests.session_lab import SessionLab, lines_of, session_lab
 from tests.proxy.endpoints.ros2_net import needs
 
 needs("std_msgs", "std_srvs")
@@ -77,11 +79,11 @@ def lab() -> Iterator[SessionLab]:
                 "delegations": "robot/delegations", "ros": [{"endpoint": "ros2", "domain": DOMAIN}], "expose": rules,
             }  # fmt: skip
             (lab.folder / "robot.yaml").write_text(yaml.safe_dump(config))
-            robot = lab.start("-c", ROBOT)
+            robot = lab.python("-c", ROBOT)
             assert lines_of(robot, 1) == ["ready"]
-            proxy = lab.start("-m", "proxy.cli.proxy", "--config", "robot.yaml", "--json")
+            proxy = lab.python("-m", "proxy.cli.proxy", "--config", "robot.yaml", "--json")
             while '"ready"' not in lines_of(proxy, 1)[0]:
-                assert proxy.poll() is None, proxy.communicate()[1]
+                assert proxy.code is None, proxy.logged
             yield lab
     finally:
         for key, value in kept.items():
@@ -93,9 +95,8 @@ def lab() -> Iterator[SessionLab]:
 
 def gdp(lab: SessionLab, *words: str) -> tuple[int, str, str]:
     """Run ``gdp`` on the lab's machine; return exit code, output and errors."""
-    process = lab.start("-m", "gdp.cli.gdp", *words)
-    out, errors = process.communicate(timeout=PATIENCE_S)
-    return process.returncode, out, errors
+    done = lab.run(*GDP, *words)
+    return done.returncode, done.stdout, done.stderr
 
 
 def rows(text: str) -> list[dict[str, object]]:
@@ -122,9 +123,8 @@ def test_echo_prints_whole_messages_as_lines_of_json(lab: SessionLab) -> None:
 
 def test_a_reader_of_a_pipe_that_leaves_ends_echo(lab: SessionLab) -> None:
     command = f"{sys.executable} -m gdp.cli.gdp topic echo /chat --node viewer | head -n 1"
-    process = lab.start_command(["bash", "-o", "pipefail", "-c", command])
-    out, errors = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, out.startswith("data: "), errors) == (0, True, "")
+    done = lab.run("bash", "-o", "pipefail", "-c", command)
+    assert (done.returncode, done.stdout.startswith("data: "), done.stderr) == (0, True, "")
 
 
 def test_echo_without_the_right_states_what_the_owner_types(lab: SessionLab) -> None:
@@ -170,11 +170,10 @@ def test_list_joins_what_proxy_and_switch_know(lab: SessionLab) -> None:
 
 
 def test_info_counts_the_readers_of_a_topic(lab: SessionLab) -> None:
-    reader = lab.start("-m", "gdp.cli.gdp", "topic", "echo", "/chat", "--node", "viewer", "--json")
+    reader = lab.python("-m", "gdp.cli.gdp", "topic", "echo", "/chat", "--node", "viewer", "--json")
     lines_of(reader, 1)
     code, out, _ = gdp(lab, "topic", "info", "/chat", "--json", "--seconds", "0.2")
-    reader.terminate()
-    reader.communicate(timeout=PATIENCE_S)
+    reader.finish(signal.SIGTERM)
     found = {(row["role"], row["direction"]): row for row in rows(out)}
     assert code == 0
     assert found["proxy", "out"]["readers"] == 1
@@ -210,16 +209,16 @@ def test_top_prints_lines_in_a_pipe_and_a_view_in_a_terminal(lab: SessionLab) ->
     _, out, _ = gdp(lab, "top", "--json", "-n", "2", "--interval", "0.3")
     assert len({row["at_unix_s"] for row in rows(out)}) == 2
     ours, theirs = pty.openpty()
-    process = lab.start_command(
+    process = lab.launch(
         ["bash", "-c", f"{sys.executable} -m gdp.cli.gdp top -n 2 --interval 0.3 < /dev/null > {os.ttyname(theirs)}"]
     )
     drawn = ""
-    while process.poll() is None or select.select([ours], [], [], 0)[0]:
+    while process.code is None or select.select([ours], [], [], 0)[0]:
         if select.select([ours], [], [], 0.1)[0]:
             drawn += os.read(ours, 1 << 16).decode(errors="replace")
     os.close(theirs)
     os.close(ours)
-    assert process.returncode == 0
+    assert process.code == 0
     assert "/chat" in drawn
     assert "\x1b[?1049h" in drawn  # the terminal's other screen, which is left at the end
 
@@ -245,5 +244,4 @@ def test_a_name_that_no_node_advertises_has_exit_code_1(lab: SessionLab) -> None
 def test_completion_offers_the_names_of_running_nodes(lab: SessionLab) -> None:
     words = {"_GDP_COMPLETE": "complete_bash", "COMP_WORDS": "gdp topic info /ch", "COMP_CWORD": "3"}
     command = [f"{key}={value}" for key, value in words.items()]
-    process = lab.start_command(["env", *command, sys.executable, "-m", "gdp.cli.gdp"])
-    assert lab.output(process).split() == ["/chat"]
+    assert lab.output("env", *command, *GDP).split() == ["/chat"]

@@ -7,24 +7,23 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fog_demo.cluster import STATE, standing_runs
 from gdp.host.run_registry import RunRegistry
 from gdp.management.control_client import NodeConnection, find_control_socket
+from lab.machine import GDP, gdp
 from netns_tests.test_fog_demo import command as fog_command
 from netns_tests.test_ring import command as ring_command
-from netns_tests.traces import GDP, gdp, traced
 from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
 
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("a request and its reply take milliseconds")]
 
@@ -35,10 +34,7 @@ RING_S = 60  # of traffic; the end of the tests ends it
 @contextmanager
 def running(argv: Sequence[str], is_ready: Callable[[str], bool]) -> Iterator[subprocess.Popen[str]]:
     """Run a demonstration from the line that says that it is ready; end it as Ctrl-C does."""
-    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
-    with subprocess.Popen(
-        argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=ROOT
-    ) as process:
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT) as process:
         assert process.stdout is not None
         seen: list[str] = []
         for line in process.stdout:
@@ -55,6 +51,14 @@ def running(argv: Sequence[str], is_ready: Callable[[str], bool]) -> Iterator[su
             process.send_signal(signal.SIGINT)
             process.wait(PATIENCE_S)
             reading.join(PATIENCE_S)
+
+
+def traced(where: str, name: str, node: Path) -> list[dict[str, Any]]:
+    """Trace a name from a node, print how long that took, and return the paths."""
+    result = json.loads(gdp("trace", name, "--node", node, "--json"))
+    print(f"gdp trace through {where}: {result['elapsed_ms']} ms")
+    paths: list[dict[str, Any]] = result["paths"]
+    return paths
 
 
 def labels(path: Mapping[str, object]) -> list[object]:
@@ -97,7 +101,7 @@ def test_a_trace_from_the_publisher_shows_the_tree_below_its_switch(ring: Path) 
 
 def test_a_ping_comes_back_from_the_publisher(ring: Path) -> None:
     *replies, summary = map(
-        json.loads, gdp("ping", "/scan", "--node", ring / "proxy-nuc5", "-c", 3, "-i", 0.05, "--json")
+        json.loads, gdp("ping", "/scan", "--node", ring / "proxy-nuc5", "-c", 3, "-i", 0.05, "--json").splitlines()
     )
     assert [each["label"] for each in replies] == ["proxy-nuc1"] * 3
     assert replies[0]["result"] == {"rights": ["publish"]}
@@ -135,7 +139,7 @@ def test_every_table_is_kept_by_a_node_of_the_ring(ring: Path) -> None:
     assert shown(switch, "tunnels") == []
     assert {row["role"] for row in shown(switch, "peers")} == {"switch", "rib"}
     assert all(isinstance(row["frames"], int) for row in shown(switch, "drops"))
-    header, *rows = gdp("show", "links", "--node", switch, "--columns", "port,up")
+    header, *rows = gdp("show", "links", "--node", switch, "--columns", "port,up").splitlines()
     assert header.split() == ["PORT", "UP"]
     assert sorted(row.split() for row in rows) == [["nuc1", "yes"], ["nuc3", "yes"], ["rib-s", "yes"]]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import select
@@ -18,7 +17,6 @@ from pathlib import Path
 import pytest
 
 from gdp.control.endpoints import Endpoint
-from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.ports.tunnel import uapi
 from gdp.ports.tunnel.devices import find_device
@@ -26,9 +24,8 @@ from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
 from gdp.ports.tunnel.uapi import UserspaceControl, socket_path
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
-from gdp.stores.issue import make_domain, make_node
-from netns_tests.tunnel_sites import PATIENCE_S, PORT, Site, children, crosses, numbers, payload, two_sites, until
-from tests.pages import ROOT
+from lab import process
+from netns_tests.tunnel_sites import PATIENCE_S, PORT, Site, crosses, numbers, payload, two_sites, until
 
 pytestmark = [
     pytest.mark.netns,
@@ -190,11 +187,8 @@ def test_a_device_that_another_program_removed_is_made_again(sites: tuple[Site, 
     one, two = sites
     until(crosses(one.frames(), two.frames()), *ends)
     two.ip("link", "delete", two.ifname)
-    end_s = time.monotonic() + PATIENCE_S
     with two.entered():
-        while not ends[1].handle_events():
-            assert time.monotonic() < end_s
-            select.select([ends[1]], [], [], 1.0)
+        process.until(ends[1].handle_events, meanwhile=lambda: select.select([ends[1]], [], [], 1.0))
         two.make_link(two.ifname, one)
     until(crosses(one.frames(), two.frames()), *ends)
 
@@ -216,10 +210,9 @@ def test_two_devices_lead_to_one_peer(sites: tuple[Site, Site]) -> None:
 def two_uplinks(sites: tuple[Site, Site]) -> tuple[Site, Site]:
     """Sites with a second cable ``u1``; the first reaches an address of the second over both, and prefers ``u0``."""
     one, two = sites
-    one.ip("link", "add", "u1", "type", "veth", "peer", "name", "u1", "netns", f"/proc/{os.getpid()}/fd/{two.fd}")
+    one.space.connect(two.space, "u1")
     for site, address in ((one, "10.7.0.1"), (two, "10.7.0.2")):
         site.ip("address", "add", f"{address}/24", "dev", "u1")
-        site.ip("link", "set", "u1", "up")
     two.ip("address", "add", "10.5.0.1/32", "dev", "lo")
     one.ip("route", "add", "default", "via", "10.9.0.2", "metric", "100")
     one.ip("route", "add", "default", "via", "10.7.0.2", "metric", "200")
@@ -282,13 +275,11 @@ def test_a_killed_owner_leaves_no_rule_of_its_uplink(two_uplinks: tuple[Site, Si
         f" private_key=bytes(32), listen_port=0, inner={one.inner!r}, mtu=1440, alias={one.alias!r}, uplink='u1');"
         " print('open', flush=True); time.sleep(60)"
     )
-    with one.entered():
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        with subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE, env=environment) as owner:
-            assert owner.stdout is not None
-            assert owner.stdout.readline() == b"open\n"
-            assert "fwmark" in one.ip("rule")
-            owner.kill()
+    with one.entered(), subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE) as owner:
+        assert owner.stdout is not None
+        assert owner.stdout.readline() == b"open\n"
+        assert "fwmark" in one.ip("rule")
+        owner.kill()
     until(lambda: "fwmark" not in one.ip("rule") and not one.has(one.ifname))
 
 
@@ -312,9 +303,7 @@ def test_a_restarted_peer_is_reached_again_at_once(sites: tuple[Site, Site], end
 
 def test_a_stranger_gets_no_answer(sites: tuple[Site, Site], ends: Ends) -> None:
     one, two = sites
-    other = Site(9, one.ifname[1:-1])
-    other.fd, previous = os.dup(two.fd), other.fd
-    os.close(previous)
+    other = Site(9, one.ifname[1:-1], two.space)
     try:
         stranger = other.open(0)
         with two.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -406,7 +395,7 @@ def test_a_path_mtu_that_a_router_reports_is_followed(sites: tuple[Site, Site]) 
     for end in ("far", "beyond"):
         two.ip("link", "set", end, "up")
     two.ip("route", "add", "10.8.0.1", "dev", "far")
-    two.write("ipv4/ip_forward", "1")
+    two.space.set("ipv4/ip_forward", "1")
     far = Endpoint("10.8.0.1", PORT)
     with one.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         assert route_mtu(far) == 1500
@@ -414,111 +403,6 @@ def test_a_path_mtu_that_a_router_reports_is_followed(sites: tuple[Site, Site]) 
         sender.connect((far.address, far.port))
         sender.send(bytes(1_400))
         until(lambda: route_mtu(far) == 1300)
-
-
-class Owner:
-    """The process of ``tunnel_child``."""
-
-    def __init__(self, site: Site, folder: Path) -> None:
-        self.site = site
-        words = [str(folder / "switch.yaml"), site.ifname, site.private_key.hex(), site.inner, site.alias]
-        with site.entered():
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "netns_tests.tunnel_child", *words],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-                cwd=ROOT,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-            )
-        self.started = self.read("confined")
-
-    def read(self, key: str) -> dict[str, object]:
-        """Return the next line with this key."""
-        assert self.process.stdout is not None
-        while True:
-            line = self.process.stdout.readline()
-            assert line, "the child ended"
-            fields: dict[str, object] = json.loads(line)
-            if key in fields or "error" in fields:
-                return fields
-
-    def ask(self, *words: str) -> object:
-        """Return the result of a command."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(words) + "\n")
-        self.process.stdin.flush()
-        return self.read("result")["result"]
-
-    def close(self) -> None:
-        """End it."""
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            assert pipe is not None
-            pipe.close()
-
-
-@pytest.fixture
-def owner(sites: tuple[Site, Site], tmp_path: Path) -> Iterator[Owner]:
-    make_domain(tmp_path / "lab", "lab")
-    make_node(tmp_path / "switch", Role.SWITCH, "lab", tmp_path / "lab")
-    (tmp_path / "switch.yaml").write_text("identity: switch\ndomain: {root: switch/root.crt}\nports: [{iface: u0}]\n")
-    made = Owner(sites[1], tmp_path)
-    yield made
-    made.close()
-
-
-def test_a_confined_switch_still_serves_its_tunnels(sites: tuple[Site, Site], owner: Owner) -> None:
-    one, two = sites
-    assert "Permission denied" in str(owner.started["confined"])
-    first = one.open()
-    one.connect(first, two, is_dialling=False)
-    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
-    owner.ask("link", two.link, two.inner, one.inner)
-    receiving, sending = one.frames(), two.frames()
-    until(crosses(sending, receiving), first)
-    os.kill(process_of(two.ifname), signal.SIGKILL)
-    until(crosses(sending, receiving), first)
-    assert owner.ask("route", one.address, str(PORT)) == 1500
-    owner.ask("mtu", two.link, "1400")
-    with two.entered():
-        device = find_device(two.link)
-        assert device is not None
-        assert device.mtu == 1330
-    owner.ask("retry", one.public_key.hex())
-    owner.ask("unlink", two.link)
-    owner.ask("remove_peer", one.public_key.hex())
-    assert owner.ask("peers") == {}
-    assert not two.has(two.link)
-    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
-    owner.ask("link", two.link, two.inner, one.inner)
-    until(crosses(two.frames(), receiving), first)
-    assert owner.process.stdin is not None
-    owner.process.stdin.close()
-    assert owner.process.wait(PATIENCE_S) == 0
-    assert not two.has(two.ifname)
-    assert not two.has(two.link)
-
-
-@pytest.mark.parametrize("whom", ["the owner", "the keeper", "all at once"])
-def test_a_kill_leaves_no_device_no_process_and_no_socket(sites: tuple[Site, Site], owner: Owner, whom: str) -> None:
-    one, two = sites
-    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
-    owner.ask("link", two.link, two.inner, one.inner)
-    (keeper,) = children(owner.process.pid)
-    (program,) = children(keeper)
-    victims = {"the owner": [owner.process.pid], "the keeper": [keeper]}.get(whom, [owner.process.pid, keeper, program])
-    for pid in victims:
-        os.kill(pid, signal.SIGKILL)
-    begun_s = time.monotonic()
-    until(lambda: not any(map(is_alive, (keeper, program))) and not two.has(two.ifname))
-    assert not two.has(two.link)
-    if whom != "all at once":  # no process is left that could remove it; the next start does
-        until(lambda: not socket_path(two.ifname).exists())
-    assert time.monotonic() - begun_s < 5.0
-    device = two.open()
-    assert device.listen_port == PORT
 
 
 def test_an_mtu_of_a_missing_device_is_refused(sites: tuple[Site, Site]) -> None:
@@ -575,7 +459,6 @@ def test_without_the_right_to_make_devices_the_error_says_what_to_do(sites: tupl
             ["setpriv", "--bounding-set=-net_admin", "--", sys.executable, "-c", words],
             capture_output=True,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
             check=False,
         )
     assert ended.stderr.splitlines()[-1] == (

@@ -13,12 +13,11 @@ from typing import Any, Final
 import pytest
 
 from gdp.host.run_registry import Run, RunRegistry
-from netns_tests.cloud_site import wheelhouse
-from netns_tests.datacenter.debian_root import debian_root, why_not
-from netns_tests.datacenter.machine import BootedMachine
-from netns_tests.datacenter.router import Router
+from lab.cloud_site import wheelhouse
+from lab.datacenter import Router
+from lab.debian import BootedMachine, debian_root, why_not
+from lab.process import until
 from netns_tests.test_service_units import BOOT_S, PREFIX, SCRIPT, START_S, gdp, install, is_booted, shows
-from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can")]
 

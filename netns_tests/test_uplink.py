@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Final
@@ -16,14 +15,16 @@ import pytest
 from pyroute2 import IPRoute
 
 from gdp.crypto.certificates import Role
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
+from lab.machine import LabMachine
 from lab.namespaces import Namespaces
-from lab.process import LabProcess
+from lab.process import LabProcess, calling, new_run
 from lab.topology import Attachment, DomainPlan, Link, Topology
+from netns_tests import uplink_child
 
 pytestmark = pytest.mark.netns
 
@@ -46,22 +47,24 @@ class Field:
     """Running processes: switches and the RIB from the start, participants on request."""
 
     def __init__(self, run: Run, undo: ExitStack) -> None:
-        self._folder = run.directory
-        self._run = run
-        self._undo = undo
         self._spaces = Namespaces(TOPOLOGY, run)
+        self._machines = {
+            name: undo.enter_context(LabMachine(run.directory, self._spaces[name].command([]), run=run))
+            for name in TOPOLOGY.nodes
+        }
         self._starting: list[LabProcess] = []
-        self._credentials = OverlayCredentials(TOPOLOGY, self._folder)
-        for name in TOPOLOGY.nodes:
-            self._start(name, ["gdp.cli.switch", "--config", str(self._credentials.switch(name, "auto"))])
-        self.wait()
+        self._credentials = OverlayCredentials(TOPOLOGY, run.directory)
+        configs = {name: self._credentials.switch(name, "auto") for name in TOPOLOGY.nodes}
+        nodes = [self._machines[name].launch_node("switch", config.stem) for name, config in configs.items()]
+        for node in nodes:
+            self._machines["gateway"].ready(node)
         (rib,) = TOPOLOGY.attached("rib")
-        self._start(rib.switch, ["gdp.cli.rib", "--config", str(self._credentials.rib(rib))])
+        self._machines[rib.switch].start("rib", self._credentials.rib(rib).stem)
 
     def wait(self) -> None:
         """Return when all started participants are up."""
         for process in self._starting:
-            assert b"up" in process.read_line(PATIENCE_S)
+            assert process.read_line(PATIENCE_S) == b"up"
         self._starting.clear()
 
     def member(self, switch: str, right: Right, *load: int) -> LabProcess:
@@ -69,8 +72,10 @@ class Field:
         credentials = self._credentials
         name = credentials.delegate(switch, SERVICE, right).to_text()
         root = credentials.domain("field") / ROOT_CERTIFICATE
-        where = [name, str(credentials.identity(Role.PROXY, switch)), str(root), "member"]
-        return self._start(switch, ["netns_tests.uplink_child", *where, right.value, *map(str, load)])
+        where = (name, credentials.identity(Role.PROXY, switch), root, "member")
+        argv = calling(uplink_child.main, *where, right.value, *load)
+        self._starting.append(self._machines[switch].launch(argv, f"member-{switch}", has_orders=True))
+        return self._starting[-1]
 
     def sent_bytes(self) -> int:
         """Return the traffic of the robot's uplink at its far end; a frame the kernel forwards bypasses our end."""
@@ -82,13 +87,6 @@ class Field:
 
         return self._spaces["gateway"].inside(look)
 
-    def _start(self, switch: str, argv: list[str]) -> LabProcess:
-        words = self._spaces[switch].command([sys.executable, "-m", *argv])
-        process = LabProcess(self._run, f"{argv[0]} {switch}", words, has_orders=True)
-        self._undo.callback(process.kill_group)
-        self._starting.append(process)
-        return process
-
 
 def tell(robot: LabProcess, word: object) -> None:
     """Send the robot a command; return when it is done."""
@@ -98,9 +96,7 @@ def tell(robot: LabProcess, word: object) -> None:
 
 @pytest.fixture
 def field() -> Iterator[Field]:
-    run = RunRegistry().start()
-    with ExitStack() as undo:
-        undo.callback(run.end)
+    with new_run() as run, ExitStack() as undo:
         yield Field(run, undo)
 
 

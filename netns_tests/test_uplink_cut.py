@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
 
 pytestmark = [
     pytest.mark.netns,
@@ -29,8 +27,7 @@ def test_a_cut_of_either_uplink_delays_no_message_over_two_paths_and_loses_none(
     bench = ROOT / "scripts" / "bench" / "uplink_cut.py"
     options = {"rounds": 2, "quiet-s": 3, "settle-s": 5, "limit-ms": BEFORE_DETECTION_MS, "json": record}
     argv = [sys.executable, str(bench), "--allow-load", *(f"--{name}={value}" for name, value in options.items())]
-    environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
-    ran = subprocess.run(argv, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment)
+    ran = subprocess.run(argv, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert ran.returncode == 0, ran.stderr
     cases = json.loads(record.read_text())["rounds"]["tunnels"]
     assert cases["paths: 2"]["late"] == [0, 0], ran.stdout

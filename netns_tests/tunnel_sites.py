@@ -6,20 +6,17 @@ import contextlib
 import os
 import select
 import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
-from pyroute2 import netns
 
 from gdp.control.endpoints import Endpoint
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.vxlan import make_vxlan
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
-from netns_tests.spaces import Space
-from tests import waiting
+from lab import process
+from lab.namespaces import Space
 
 PATIENCE_S = 30.0
 POLL_S = 1.0
@@ -29,39 +26,18 @@ ETHERTYPE = 0x88B5
 
 
 class Site:
-    """A namespace with the end of the cable and a tunnel device of its own."""
+    """A namespace with the end of the cable and a tunnel device of its own; ``space``: an existing namespace."""
 
-    def __init__(self, number: int, tag: str) -> None:
+    def __init__(self, number: int, tag: str, space: Space | None = None) -> None:
         key = X25519PrivateKey.generate()
         self.private_key, self.public_key = key.private_bytes_raw(), key.public_key().public_bytes_raw()
         self.address, self.inner = f"10.9.0.{number}", f"fd00::{number}"
         self.ifname, self.link = f"w{tag}{number}", f"x{tag}{number}"
         self.alias = f"gdp-switch {bytes([number]).hex() * 32}"
         self.endpoint = Endpoint(self.address, PORT)
-        with Space():
-            self.fd = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
         self._stack = contextlib.ExitStack()
-
-    @contextlib.contextmanager
-    def entered(self) -> Iterator[None]:
-        """Work in this namespace."""
-        before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-        netns.setns(self.fd)
-        try:
-            yield
-        finally:
-            netns.setns(before)
-            os.close(before)
-
-    def ip(self, *words: str) -> str:
-        """Run ``ip`` here, and return what it prints."""
-        with self.entered():
-            return subprocess.run(["ip", *words], check=True, capture_output=True, text=True).stdout
-
-    def write(self, setting: str, value: str) -> None:
-        """Change a setting of this namespace's network."""
-        with self.entered():
-            Path("/proc/sys/net", setting).write_text(value)
+        self.space = space or self._stack.enter_context(contextlib.closing(Space()))
+        self.entered, self.ip = self.space.entered, self.space.ip
 
     def open(self, listen_port: int = PORT, ifname: str = "", uplink: str = "") -> WireGuardDevice:
         """Open a WireGuard device."""
@@ -115,7 +91,6 @@ class Site:
     def close(self) -> None:
         """Close the device and leave the namespace to the kernel."""
         self._stack.close()
-        os.close(self.fd)
 
 
 @contextlib.contextmanager
@@ -124,13 +99,11 @@ def two_sites() -> Iterator[tuple[Site, Site]]:
     tag = os.urandom(3).hex()
     one, two = Site(1, tag), Site(2, tag)
     try:
-        peer = f"/proc/{os.getpid()}/fd/{two.fd}"
-        one.ip("link", "add", "u0", "type", "veth", "peer", "name", "u0", "netns", peer)
+        one.space.connect(two.space, "u0")
         for site in (one, two):
             site.ip("link", "set", "lo", "up")
-            site.write("ipv4/conf/u0/promote_secondaries", "1")
+            site.space.set("ipv4/conf/u0/promote_secondaries", "1")
             site.ip("address", "add", f"{site.address}/24", "dev", "u0")
-            site.ip("link", "set", "u0", "up")
         yield one, two
     finally:
         two.close()
@@ -151,7 +124,7 @@ def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = ""
         for device in ready:
             device.handle_events()
 
-    waiting.until(is_true, what or "it did not come about", PATIENCE_S, meanwhile=serve)
+    process.until(is_true, what or "it did not come about", PATIENCE_S, meanwhile=serve)
 
 
 def payload(number: int) -> bytes:
@@ -180,8 +153,3 @@ def crosses(sender: socket.socket, receiver: socket.socket) -> Callable[[], bool
         return bool(numbers(receiver))
 
     return has_crossed
-
-
-def children(pid: int) -> list[int]:
-    """Return the processes that a process started."""
-    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]

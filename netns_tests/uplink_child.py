@@ -1,7 +1,4 @@
-"""Participant of the uplink's test in a child process: a replica that takes requests, or the robot that calls.
-
-python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE serve
-python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE call REQUESTS BYTES
+"""Participant without ROS in a process of its own: a replica that takes requests, or the robot that calls.
 
 The robot reads commands on standard input, each a line of JSON: ``{"word": ...}``. A number: it prints ``met`` when it
 has this many peers. ``go``: it prints ``done`` when all peers have confirmed its requests. ``ask``: the same with
@@ -66,6 +63,7 @@ class Robot:
 
 
 def main(service: str, identity_at: str, root: str, device: str, role: str, *load: str) -> None:
+    """Run the replica (``role`` is ``serve``) or the robot (``call``, then requests and bytes) at a switch's device."""
     identity = load_identity(Path(identity_at), time.time())
     policy = Policy(load_root(Path(root)), [])
     (topic,) = DelegationStore(Path(identity_at) / DELEGATIONS, identity)
@@ -95,7 +93,3 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
         else:
             robot.meet(int(str(word)))
         print("done", flush=True)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

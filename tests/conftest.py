@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 import hypothesis
 
 from gdp.control.boundary import ErrorBoundary
-from tests.script_packages import share_script_packages
+from lab.process import python_path
 
 
 def pytest_configure() -> None:
@@ -19,6 +20,6 @@ def pytest_configure() -> None:
     hypothesis.settings.register_profile("unhurried", deadline=None)
     hypothesis.settings.load_profile("unhurried")
     ErrorBoundary.reraises = True
-    share_script_packages()
+    os.environ["PYTHONPATH"] = python_path()  # of started processes
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -34,13 +34,12 @@ from lab.process import FailedError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
-from netns_tests.datacenter.debian_root import debian_root, why_not
-from netns_tests.datacenter.machine import BootedMachine
-from netns_tests.spaces import Space
+from lab.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
+from lab.debian import BootedMachine, debian_root, why_not
+from lab.namespaces import Space
 
 if TYPE_CHECKING:
-    from netns_tests.datacenter.ec2 import DataCenter
+    from lab.ec2 import DataCenter
 
 REGION: Final = "us-west-1"
 CLUSTER: Final = "echo"
@@ -71,7 +70,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         run = stack.enter_context(new_run(runs))
         stack.enter_context(Space())
         subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-        from netns_tests.datacenter.ec2 import DataCenter, serving_ec2  # moto, an extra
+        from lab.ec2 import DataCenter, serving_ec2  # moto, an extra
 
         logging.getLogger("werkzeug").setLevel(logging.WARNING)  # the simulation logs each request
         site = CloudSite(run, software, {REGION: f"udp://127.0.0.1:{start_echo(0.0)}"})

@@ -1,4 +1,6 @@
-"""Laboratory of tests, benches, experiments and demonstrations: topologies as data, in memory and in namespaces.
+"""Laboratory of tests, benches, experiments and demonstrations: topologies as data, and what realises them.
 
-Programs of the project are forked from a process that has imported them.
+``simulation`` and ``network`` work in memory, ``namespaces`` in the kernel, ``datacenter`` with machines that boot.
+``machine`` writes, starts, awaits and ends nodes; ``process`` has the processes, ``zygote`` forks them from a process
+that has imported the project.
 """

@@ -29,6 +29,9 @@ from lab.topology import Attachment, Topology
 Yaml: TypeAlias = "dict[str, object]"
 Side = Literal["expose", "import"]
 Kind = Literal["topic", "service", "action"]
+NameRights = Mapping[str, Collection[Right]]
+
+_DOMAIN: Final = "lab"
 
 METRICS_PORTS: Final = {"switch": 9_101, "rib": 9_102, "proxy": 9_103}  # on the loopback of each namespace
 
@@ -195,10 +198,9 @@ class OverlayCredentials:
         return self.write(self.file(role, label).name, {**metrics, **content})
 
 
-def grant(
-    owner: Path, node: Path, rights: Mapping[str, Collection[Right]], types: Mapping[str, str] | None = None
-) -> None:
+def grant(owner: Path, node: Path, rights: NameRights, types: Mapping[str, str] | None = None) -> None:
     """Let a node act on names; ``types``: ROS types of names."""
+    (node / DELEGATIONS).mkdir(mode=0o700, exist_ok=True)
     for name, given in rights.items():
         type_name = (types or {}).get(name, "")
         calls = "action" if "/action/" in type_name else "service"
@@ -206,3 +208,21 @@ def grant(
         typed = {"type": type_name} if type_name else {}
         metadata = Metadata({"kind": kind, "name": name, **typed})
         install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))
+
+
+def make_nodes(
+    folder: Path,
+    nodes: Mapping[str, Role],
+    rights: Mapping[str, NameRights] | None = None,
+    types: Mapping[str, str] | None = None,
+) -> None:
+    """Make ``folder/domain`` and ``folder/owner``, and the keys of nodes of that domain, without topology.
+
+    ``nodes``: role by folder; the first folder of the path is the label. ``rights``: by node, as in ``grant``.
+    """
+    make_domain(folder / "domain", _DOMAIN)
+    make_owner(folder / "owner")
+    for path, role in nodes.items():
+        make_node(folder / path, role, path.partition("/")[0], folder / "domain")
+    for path, names in (rights or {}).items():
+        grant(folder / "owner", folder / path, names, types)

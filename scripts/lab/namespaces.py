@@ -1,20 +1,23 @@
-"""Kernel namespaces that realise a topology: one namespace per switch, one veth pair per link, processes inside.
+"""Kernel namespaces, and the realisation of a topology: one namespace per switch, one veth pair per link.
 
 I/O; needs root of the machine or of a user namespace.
-Devices have no addresses and no IPv6: all traffic on them is ours. On every end the device has the name of the
-neighbour that it leads to. Its MAC encodes both switches (``02:67:64:70:AA:BB``, the AA-th towards the BB-th).
+Devices of a topology have no addresses and no IPv6: all traffic on them is ours. On every end the device has the name
+of the neighbour that it leads to. Its MAC encodes both switches (``02:67:64:70:AA:BB``, the AA-th towards the BB-th).
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import select
-from collections.abc import Callable, Sequence
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Final, TypeVar
 
-from pyroute2 import IPRoute
+from pyroute2 import IPRoute, netns
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
@@ -23,8 +26,11 @@ from gdp.ports.rtnetlink import LinkMonitor
 from lab.topology import Link, Topology
 
 _PATIENCE_S: Final = 10.0
+_HERE: Final = "/proc/thread-self/ns/net"
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 T = TypeVar("T")
+_SpaceT = TypeVar("_SpaceT", bound="Space")
 
 
 class Namespace:
@@ -44,6 +50,18 @@ class Namespace:
         """Call ``work`` in a thread inside, and return its result; a socket made there stays there."""
         return netns_files.inside(self.path, work)
 
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """Move this thread, and the processes that it starts, into the namespace; leaving moves it back."""
+        before = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            with self.path.open("rb") as there:
+                netns.setns(there.fileno())
+            yield
+        finally:
+            netns.setns(before)
+            os.close(before)
+
     def command(self, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
         """Return the command line that runs ``argv`` inside, under the same process id.
 
@@ -51,6 +69,74 @@ class Namespace:
         """
         leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
         return ["nsenter", f"--net={self.path}", "--", *leash, *argv]
+
+
+class Space(Namespace):
+    """Network namespace without a file: the kernel removes it with its last user, however this process ends.
+
+    A context manager, which enters it with this thread and closes it at the end. It has no IPv6, so that all frames are
+    ours. Raises ``OSError``: not allowed here.
+    """
+
+    def __init__(self) -> None:
+        def make() -> int:
+            """Move the present thread, which ends soon, into a new namespace."""
+            if _LIBC.unshare(netns.CLONE_NEWNET):
+                raise OSError(number := ctypes.get_errno(), os.strerror(number))
+            Path("/proc/sys/net/ipv6/conf/default/disable_ipv6").write_text("1", encoding="ascii")
+            return os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
+
+        self._descriptor = netns_files.inside(Path(_HERE), make)
+        self.path = Path(f"/proc/{os.getpid()}/fd/{self._descriptor}")
+        self._entries = contextlib.ExitStack()
+
+    def __enter__(self: _SpaceT) -> _SpaceT:
+        self._entries.enter_context(self.entered())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._entries.close()
+        self.close()
+
+    def close(self) -> None:
+        """Leave the namespace to the kernel; its processes and sockets keep it."""
+        os.close(self._descriptor)
+
+    def ip(self, *words: str) -> str:
+        """Run ``ip`` inside, and return what it prints. Raises ``subprocess.CalledProcessError``: it refuses."""
+        with self.entered():
+            return subprocess.run(["ip", *words], check=True, capture_output=True, text=True).stdout
+
+    def set(self, setting: str, value: str) -> None:
+        """Set a value below ``/proc/sys/net`` of the namespace."""
+        with self.entered():
+            Path("/proc/sys/net", setting).write_text(value, encoding="ascii")
+
+    def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
+        """Create a pair of joined devices; return when both are up."""
+        ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
+        self.ip("link", "add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
+        for name in (one, other):
+            self.ip("link", "set", name, "up")
+        self.inside(partial(wait_for_carrier, one, other))
+
+    def connect(self, other: Space, device: str, far: str = "") -> None:
+        """Join this namespace by ``device`` to the device ``far`` of another, by default of the same name."""
+        place = ("netns", str(other.path))
+        self.ip("link", "add", device, "type", "veth", "peer", "name", far or device, *place)
+        other.ip("link", "set", far or device, "up")
+        self.ip("link", "set", device, "up")
+        self.inside(partial(wait_for_carrier, device))
+
+
+@contextlib.contextmanager
+def cable(here: Space) -> Iterator[Space]:
+    """Join a namespace to a new one by ``eth0``; yield the new one, whose loopback is up like that of ``here``."""
+    with contextlib.closing(Space()) as there:
+        for each in (here, there):
+            each.ip("link", "set", "lo", "up")
+        here.connect(there, "eth0")
+        yield there
 
 
 def wait_for_carrier(*devices: str) -> None:

@@ -8,34 +8,58 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
+import sys
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.errors import GdpError
 from gdp.host.processes import Process, end_all
-from gdp.host.run_registry import Run
+from gdp.host.run_registry import Run, RunRegistry
 from gdp.ports.readiness import readable
 
-_SCRIPTS: Final = Path(__file__).resolve().parents[1]
+ROOT: Final = Path(__file__).resolve().parents[2]
+_SCRIPTS: Final = ROOT / "scripts"
 _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0
 _ANSWER_S: Final = 600.0
-_PAUSE_S: Final = 0.05
+_FINISH_S: Final = 60.0
+_PAUSE_S: Final = 0.02
 
 T = TypeVar("T")
 _ProcessT = TypeVar("_ProcessT", bound="LabProcess")
 
 
+def python_path(*first: Path) -> str:
+    """Return the present ``PYTHONPATH`` after these folders, and after it the project and its laboratory."""
+    inherited = os.getenv("PYTHONPATH", "").split(os.pathsep)
+    return os.pathsep.join(dict.fromkeys(filter(None, [*map(str, first), *inherited, str(ROOT), str(_SCRIPTS)])))
+
+
 def python_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """Return the present environment with this extension, in which Python imports the project and its laboratory."""
-    paths = os.getenv("PYTHONPATH"), str(_SCRIPTS.parent), str(_SCRIPTS)
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment}
+    return {**os.environ, "PYTHONPATH": python_path(), **environment}
+
+
+def calling(function: Callable[..., object], *words: object) -> list[str]:
+    """Return the command line of a process that calls a function of a module with these texts."""
+    return [sys.executable, "-m", "lab.call", f"{function.__module__}:{function.__qualname__}", *map(str, words)]
+
+
+@contextmanager
+def new_run() -> Iterator[Run]:
+    """Begin a run; leaving ends it, and removes what it has made."""
+    run = RunRegistry().start()
+    try:
+        yield run
+    finally:
+        run.end()
 
 
 class FailedError(GdpError):
@@ -51,6 +75,7 @@ class LabProcess:
         argv: the command line; inherited by exec, so that the process id stays.
         environment: extends the present one, in which the project can be imported.
         log: file to append to; None: one in the run's directory.
+        folder: where it runs; None: where this process does.
         heard: its standard output is read, and does not go to the log.
         has_orders: it reads commands, and ends by itself when there are no more.
     """
@@ -63,19 +88,22 @@ class LabProcess:
         *,
         environment: Mapping[str, str] | None = None,
         log: Path | None = None,
+        folder: Path | None = None,
         heard: bool = True,
         has_orders: bool = False,
     ) -> None:
         self.label = label
-        folder = Path() if run is None else run.directory
-        self.log = log or folder / f"{label.replace(' ', '-')}.log"
+        home = Path() if run is None else run.directory
+        self.log = log or home / f"{label.replace(' ', '-')}.log"
         self._unread = b""
         with self.log.open("ab") as errors:
+            self._log_from = errors.tell()
             self._process = subprocess.Popen(
                 argv,
                 stdin=subprocess.PIPE if has_orders else subprocess.DEVNULL,
                 stdout=subprocess.PIPE if heard else errors,
                 stderr=errors,
+                cwd=folder,
                 env=python_environment(environment or {}),
                 start_new_session=True,
             )
@@ -121,12 +149,25 @@ class LabProcess:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_CLOSE_S)
 
-    def reap(self, timeout_s: float | None = None) -> None:
-        """Return when the process has ended and its pipes are closed; harmless where they are."""
+    def reap(self, timeout_s: float | None = None) -> str:
+        """Return, when the process has ended, what it printed and nothing has read; harmless where it was called."""
         if self._process.stdout is None or self._process.stdout.closed:
             self._process.wait(timeout_s)
-        else:
-            self._process.communicate(timeout=timeout_s)
+            return ""
+        printed, _ = self._process.communicate(timeout=timeout_s)
+        return (self._unread + printed).decode(errors="replace")
+
+    def output(self, patience_s: float = _FINISH_S) -> str:
+        """Return the rest of what it prints, once it has ended well by itself. Raises ``FailedError``: it failed."""
+        printed = self.reap(patience_s)
+        if self.code:
+            raise self.failed(f"ended with code {self.code} after {printed!r}")
+        return printed
+
+    def finish(self, number: signal.Signals = signal.SIGINT, patience_s: float = _FINISH_S) -> str:
+        """Signal the process, as Ctrl-C does by default, and ``reap`` it."""
+        self.send(number)
+        return self.reap(patience_s)
 
     def read(self, patience_s: float) -> dict[str, object]:
         """Return the next line that it prints, a JSON object.
@@ -174,6 +215,36 @@ class LabProcess:
         line, _, self._unread = self._unread.partition(b"\n")
         return line
 
+    def read_until(self, *signs: str, patience_s: float = _FINISH_S) -> str:
+        """Return the next line that it prints with one of these texts, others are skipped; raises as ``read``."""
+        while True:
+            line = self.read_line(patience_s).decode(errors="replace")
+            if any(sign in line for sign in signs):
+                return line
+
+    @property
+    def logged(self) -> str:
+        """Return its part of the log."""
+        return self.log.read_bytes()[self._log_from :].decode(errors="replace")
+
+    def until_logged(self, pattern: str, times: int = 1, patience_s: float = _FINISH_S) -> str:
+        """Return the line of its log in which a pattern is found for the last of so many times.
+
+        Raises ``FailedError``: it has ended, or not in time.
+        """
+
+        def found() -> str:
+            """Look at the exit code before the log, which is whole then."""
+            has_ended = self.code is not None
+            lines = [line for line in self.logged.splitlines() if re.search(pattern, line)]
+            if len(lines) >= times:
+                return lines[times - 1]
+            if has_ended:
+                raise self.failed(f"ended before it logged {pattern!r}")
+            return ""
+
+        return until(found, lambda: f"{self.label} logs {pattern!r}, but: {self.logged}", patience_s)
+
     def failed(self, how: str) -> FailedError:
         """Return the error for this process's failure, with the last line of its log."""
         return FailedError(f"{self.label} {how}: {''.join(self.last_lines(1))[-_REASON_CHARS:] or 'without a word'}")
@@ -198,17 +269,20 @@ def end_processes(processes: Collection[LabProcess], patience_s: float = 3.0) ->
 
 
 def until(
-    found: Callable[[], T], what: Callable[[], str], patience_s: float, meanwhile: Callable[[], object] | None = None
+    found: Callable[[], T],
+    what: object | Callable[[], object] = "it did not come about",
+    patience_s: float = 60.0,
+    meanwhile: Callable[[], object] | None = None,
 ) -> T:
     """Return what a function finds once that is true; nothing here is notified of it.
 
-    ``what``: says what is missing. ``meanwhile``: is called between two looks, and waits a moment; None: a pause.
-    Raises ``FailedError``: not in time.
+    ``what``: is missing, or a function that says so. ``meanwhile``: is called between two looks, and waits a moment;
+    None: a pause. Raises ``FailedError``: not in time.
     """
     end_s = time.monotonic() + patience_s
     while not (value := found()):
         if time.monotonic() > end_s:
-            raise FailedError(f"{what()}: not within {patience_s:g} s")
+            raise FailedError(f"{what() if callable(what) else what}: not within {patience_s:g} s")
         if meanwhile is None:
             time.sleep(_PAUSE_S)
         else:

@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from gdp.errors import GdpError, LocalError
 from gdp.ports.socket_owners import SocketOwners
+from lab.process import until
 from proxy.cli.door_token import door_token
 from proxy.doors.arrivals import Arrivals
 from proxy.doors.client_queue import ClientQueue
@@ -35,7 +36,6 @@ from proxy.endpoints.door import DoorEndpoint, DoorSettings
 from tests.proxy.doors.rights import Everything, goal_id
 from tests.proxy.doors.test_foxglove_door import free_port
 from tests.proxy.doors.test_parameters import service
-from tests.waiting import until
 
 PATIENCE_S = 20.0
 TOKEN = "t&ken of 24 characters/+"

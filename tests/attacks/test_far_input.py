@@ -309,6 +309,7 @@ def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_ge
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("websockets")
+    from lab.process import until
     from proxy.doors.foxglove_session import FoxgloveSession
     from tests.proxy.doors.test_foxglove_door import (
         advertised,
@@ -319,7 +320,6 @@ def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_ge
         readers,
         subscribe,
     )
-    from tests.waiting import until
 
     encode = FoxgloveSession.encode
     monkeypatch.setattr(

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
+from lab.process import until
 from proxy.cli import replay
 from proxy.config.config import ProxyConfig
 from proxy.recordings.limits import BagLimits
@@ -33,7 +34,6 @@ from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel
 from tests.attacks.test_recordings import BOMB_BYTES, MESSAGES, TOPICS, database, mcap, packed, ros1
 from tests.pages import ROOT
-from tests.waiting import until
 
 TOPIC = Channel("/t", "a/msg/B", 2, hash="", definition="int8 a\n", definition_format="msg")
 ENDS_S = 20.0
@@ -483,16 +483,9 @@ def test_b07_a_decoder_works_no_further_ahead_than_its_pipe_holds(tmp_path: Path
         messages = bag.messages()
         next(messages)
         decoder = child_of(os.getpid())
-        waits(lambda: Path(f"/proc/{decoder}/stat").read_text().rpartition(")")[2].split()[0] == "S")
+        until(lambda: Path(f"/proc/{decoder}/stat").read_text().rpartition(")")[2].split()[0] == "S")
         assert written_by(decoder) < 8 << 20
         assert sum(1 for _ in messages) == 63
-
-
-def waits(holds: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + ENDS_S
-    while not holds():
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
 
 
 def written_by(process: int) -> int:

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from gdp.enrolment import service_units
 from gdp.enrolment.machine_programs import Machine
 from gdp.enrolment.programs import MachineProgram
 from gdp.enrolment.service_units import service_texts
+from lab.process import until
 from tests.fog.bootstrap.desk import made_desk
 from tests.pages import ROOT
 
@@ -255,7 +255,4 @@ def test_a53_the_users_code_ends_with_the_machine_although_it_is_another_user(tm
     assert Path(f"/proc/{node}").stat().st_uid == pwd.getpwnam("daemon").pw_uid
     process.send_signal(signal.SIGKILL)
     process.wait(20)
-    end_s = time.monotonic() + 20
-    while Path(f"/proc/{node}/exe").exists():
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
+    until(lambda: not Path(f"/proc/{node}/exe").exists())

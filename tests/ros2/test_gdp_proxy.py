@@ -14,7 +14,7 @@ from typing import Final
 
 import pytest
 
-from netns_tests.datacenter.debian_root import cache_folder
+from lab.debian import cache_folder
 from tests.pages import ROOT
 
 PACKAGE: Final = ROOT / "ros2" / "gdp_proxy"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from lab.process import python_path
 from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
 
 PLANNING = """
 import json, pathlib, sys
@@ -209,7 +209,7 @@ def test_a_planner_finds_a_path_and_stops_on_command_or_at_a_number_of_checks() 
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'gdp-ros[experiments]'")
     # In a child process: in one process with the libraries of ROS, OMPL's library has been seen to abort on loading.
-    environment = {**os.environ, "PYTHONPATH": f"{PYTHON_PATH}:{ROOT / 'scripts/experiments'}:{ROOT / 'scripts/bench'}"}
+    environment = {**os.environ, "PYTHONPATH": python_path(ROOT / "scripts/experiments", ROOT / "scripts/bench")}
     done = subprocess.run(
         [sys.executable, "-c", PLANNING, str(MESHES)],
         env=environment, capture_output=True, text=True, timeout=200, check=False,

@@ -18,6 +18,7 @@ from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.enrolment_wire import EnrolmentError
 from gdp.trust.join_token import JoinToken
 from gdp.trust.right import Right
+from lab.process import until
 from tests.fog.bootstrap.desk import MAP, PLAN
 from tests.gdp.enrolment.lab import Lab, running_lab
 
@@ -69,10 +70,7 @@ def test_a_joined_machine_gets_its_delegations_by_mail(lab: Lab, members: Domain
     thread = threading.Thread(target=agent.run)
     thread.start()
     try:
-        end_s = time.monotonic() + 20.0
-        while len(list(folder.glob("*.delegation"))) < 2:
-            assert time.monotonic() < end_s
-            time.sleep(0.02)
+        until(lambda: len(list(folder.glob("*.delegation"))) == 2, "both delegations")
     finally:
         agent.stop()
         thread.join()

@@ -13,6 +13,7 @@ import pytest
 from fog.cli.robot_nodes import Started, run
 from fog.cluster import CloudNode, RobotNode
 from gdp.errors import LocalError
+from lab.process import until
 from tests.pages import ROOT
 
 FOREGROUND = """
@@ -52,9 +53,6 @@ def test_interrupted_it_ends_its_nodes(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", FOREGROUND], cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
     )
-    end_s = time.monotonic() + 30
-    while not (tmp_path / "up").exists():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    until((tmp_path / "up").exists)
     process.send_signal(signal.SIGINT)
     assert process.wait(20) == 130

@@ -19,6 +19,7 @@ from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
 from gdp.errors import StoreError
+from lab.process import until
 from tests.fog.supervisor.machines import OFFERS, SPOT
 
 PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (ExportedInterface("topic", "/t", "std_msgs/msg/Empty"),))
@@ -128,11 +129,12 @@ def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
 
 
 def work(each: Supervisor, is_met: Callable[[], object]) -> None:
-    end_s = time.monotonic() + 20.0
-    while not is_met():
-        assert time.monotonic() < end_s
+    def turn() -> None:
+        """Let the supervisor work."""
         each.reconcile()
         each.wait()
+
+    until(is_met, patience_s=20.0, meanwhile=turn)
 
 
 def serving(journal: Journal) -> list[str]:

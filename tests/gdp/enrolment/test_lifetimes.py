@@ -23,10 +23,10 @@ from gdp.sharing.upkeep import ShareUpkeep
 from gdp.stores.files import read_public
 from gdp.stores.keyring import load_delegations, load_identity
 from gdp.trust.adcert import AdCertCache, Chain
+from lab.process import until
 from tests.gdp.enrolment.lab import Lab, running_lab
 from tests.gdp.enrolment.test_members import _state, running
 from tests.gdp.sharing.machines import STRING
-from tests.waiting import until
 
 DAY_S = 86_400.0
 LIFE_S = 4 * DAY_S

@@ -30,8 +30,8 @@ from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.process import until
 from tests.gdp.enrolment.lab import Lab, running_lab
-from tests.waiting import until
 
 PATIENCE_S = 20.0
 

@@ -21,6 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from gdp.errors import LocalError
+from lab.process import until
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
@@ -37,7 +38,6 @@ from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.doors.rights import Everything
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
-from tests.waiting import until
 
 PATIENCE_S = 20.0
 

@@ -12,12 +12,12 @@ import os
 import select
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from lab.process import until
 from proxy.endpoints.core.endpoint import Event, GraphEntity, Role
 
 if TYPE_CHECKING:
@@ -107,11 +107,14 @@ class Ears:
 
     def wait(self, holds: Callable[[list[Event]], bool]) -> list[Event]:
         """Poll events until a condition on them holds."""
-        events, until_s = list[Event](), time.monotonic() + PATIENCE_S
-        while not holds(events):
-            assert time.monotonic() < until_s, (events, self.endpoint.graph())
+        events = list[Event]()
+
+        def poll() -> None:
+            """Wait for events."""
             select.select([self.endpoint.fileno()], [], [], 0.1)
-            events += self.endpoint.poll_events()
+            events.extend(self.endpoint.poll_events())
+
+        until(lambda: holds(events), lambda: (events, self.endpoint.graph()), PATIENCE_S, poll)
         return events
 
     def wait_end(self, role: Role, name: str) -> GraphEntity:

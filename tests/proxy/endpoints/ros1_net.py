@@ -17,6 +17,7 @@ from typing import TypeVar
 import pytest
 
 from gdp.errors import LocalError
+from lab.process import until
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.ros1 import Ros1Endpoint
 from proxy.endpoints.ros1.install import rospy_folder
@@ -100,14 +101,12 @@ class Ear:
         self.events: list[Event] = []
 
     def until(self, found: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
-        until_s = time.monotonic() + patience_s
-        while not found():
-            left_s = until_s - time.monotonic()
-            if left_s <= 0:
-                raise AssertionError(f"it did not come; events: {str(self.events)[-2000:]}, {self.endpoint.graph()}")
-            # A change that is counted but not reported (subscribers) wakes too, but a check now and then costs nothing.
-            select.select([self.endpoint], [], [], min(left_s, 0.5))
+        def poll() -> None:
+            """Wait for events; a change that is counted but not reported (subscribers) wakes too."""
+            select.select([self.endpoint], [], [], 0.5)
             self.events += self.endpoint.poll_events()
+
+        until(found, lambda: f"events: {str(self.events)[-2000:]}, {self.endpoint.graph()}", patience_s, poll)
 
     def of(self, kind: type[_Event], handle: int | None = None) -> list[_Event]:
         return [
@@ -155,13 +154,11 @@ class Net:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        until_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < until_s:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
-                    return
-            time.sleep(0.02)  # a port that opens causes no event
-        raise AssertionError("the master did not come up")
+        until(self._answers, "the master is up", PATIENCE_S)
+
+    def _answers(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
 
     def stop_master(self) -> None:
         if self._master is not None:

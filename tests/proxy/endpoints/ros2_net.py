@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import pytest
 
+from lab.process import until
 from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
@@ -27,7 +28,6 @@ from proxy.endpoints.core.endpoint import (
     proxy_node_name,
 )
 from proxy.endpoints.ros2 import Ros2Endpoint
-from tests.waiting import until
 
 DOMAIN = 100 + os.getpid() % 100
 NODE = proxy_node_name("0123456789abcdef" * 4)
@@ -69,10 +69,7 @@ class Peer:
 
     def waits_for(self, line: str, wanted: object) -> None:
         """Wait until an expression there has a value."""
-        until = time.monotonic() + PATIENCE_S
-        while (answer := self.tell(line)) != wanted:
-            assert time.monotonic() < until, f"{line} is {answer!r}, not {wanted!r}"
-            time.sleep(0.02)
+        until(lambda: self.tell(line) == wanted, lambda: f"{line} is {self.tell(line)!r}, not {wanted!r}", PATIENCE_S)
 
     def end(self, *, kill: bool = False) -> None:
         """Stop it; idempotent."""

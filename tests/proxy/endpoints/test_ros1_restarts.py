@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, cast
 
 import pytest
 
+from lab.process import until
 from proxy.endpoints.core.endpoint import CallFailed, EndpointError, MessageReceived, RequestReceived, ResponseReceived
 from tests.proxy.endpoints.ros1_net import PATIENCE_S, Ear, Net, ros1_net
 from tests.proxy.endpoints.test_ros1 import LISTENER, STRING, TALKER, channel, string
@@ -171,11 +171,8 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
 
 def wait_until_unpublished(net: Net, topic: str) -> None:
     """Return when the master knows no publisher of a topic, which causes no event."""
-    until_s = time.monotonic() + PATIENCE_S
     with xmlrpc.client.ServerProxy(net.uri) as master:
-        while topic in str(cast("list[Any]", master.getSystemState("/test"))[2][0]):
-            assert time.monotonic() < until_s
-            time.sleep(0.02)
+        until(lambda: topic not in str(cast("list[Any]", master.getSystemState("/test"))[2][0]), topic, PATIENCE_S)
 
 
 def test_a_listener_whose_handshake_met_a_publisher_under_replacement_is_connected_later(net: Net) -> None:

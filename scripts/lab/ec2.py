@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from gdp.host.run_registry import Run
-from netns_tests.datacenter.machine import BootedMachine
-from netns_tests.datacenter.metadata_service import InstanceDocument, MetadataService
-from netns_tests.datacenter.router import Admitted, Router
-from tests.waiting import until
+from lab.datacenter import Admitted, InstanceDocument, MetadataService, Router
+from lab.debian import BootedMachine
+from lab.process import until
 
 if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend

@@ -1,7 +1,7 @@
-"""Site of ``fog`` whose machines boot in a data centre: a border, whose proxy is the robot's, and ``fog.yaml``.
+"""Sites of ``fog``: any, and one whose machines boot in a data centre: a border, whose proxy is the robot's.
 
-I/O; everything belongs to one run. The border runs in the namespace of the caller: ``gdp domain create`` makes it, and
-the data centre's machines join it by their tokens, from behind NAT.
+I/O; everything of the latter belongs to one run. The border runs in the namespace of the caller: ``gdp domain create``
+makes it, and the data centre's machines join it by their tokens, from behind NAT.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -28,12 +26,11 @@ from gdp.errors import GdpError
 from gdp.host.run_registry import Run
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
-from netns_tests.datacenter.debian_root import cache_folder
-from netns_tests.datacenter.ec2 import UBUNTU
-from netns_tests.datacenter.router import CALLER
-from tests.pages import ROOT
-from tests.script_packages import PYTHON_PATH
-from tests.waiting import until
+from lab.datacenter import CALLER
+from lab.debian import cache_folder
+from lab.ec2 import UBUNTU
+from lab.machine import GDP, LabMachine
+from lab.process import ROOT, LabProcess, until
 
 _COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
 _STATUS_S: Final = 5.0
@@ -55,7 +52,44 @@ def wheelhouse(folder: Path) -> Path:
     return folder
 
 
-class CloudSite:
+class FogSite:
+    """Command ``fog`` on a machine, with a state folder of its own.
+
+    ``words``: options of every command. ``environment``: extends the present one, for the robot's nodes, too.
+    """
+
+    def __init__(self, host: LabMachine, state: Path, *words: str) -> None:
+        self.host, self.state, self._words = host, state, words
+        discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+        self.environment = host.environment
+        self.environment |= discovery
+
+    def run(self, *words: str) -> str:
+        """Run ``fog`` for this site and return its output."""
+        done = self.host.run(sys.executable, "-m", "fog.cli.app", *words, *self._words, patience_s=_COMMAND_S)
+        assert done.returncode == 0, f"fog {' '.join(words)}: {done.stdout}{done.stderr}{self.log()}"
+        return done.stdout
+
+    def log(self) -> str:
+        """Return the supervisor's log."""
+        path = self.state / "supervisor.log"
+        return path.read_text() if path.exists() else ""
+
+    def machines(self, cluster: str) -> list[Record]:
+        """Return the machines of a cluster that are not gone."""
+        if not (self.state / "journal.sqlite3").exists():
+            return []
+        with closing(Journal(self.state / "journal.sqlite3")) as journal:
+            return journal.machines(cluster, gone=False)
+
+    def start_caller(self, hz: float, *more: str, heard: bool = True) -> LabProcess:
+        """Start the robot's node, which calls ``/echo``; a line of JSON from time to time says what was answered."""
+        words = ["-m", "fog_demo.caller", "--ros-args", "-p", f"rate_hz:={hz}"]
+        options = [word for each in more for word in ("-p", each)]
+        return self.host.launch([sys.executable, *words, *options], "caller", heard=heard)
+
+
+class CloudSite(FogSite):
     """Site in the folder of a run; the caller's namespace has no other switch.
 
     ``latency``: region -> ``HOST:PORT`` that stands for its public endpoint.
@@ -64,9 +98,7 @@ class CloudSite:
     def __init__(self, run: Run, wheel_folder: Path, latency: Mapping[str, str]) -> None:
         self.folder = run.directory
         self.border = self.folder / "border"
-        self.state = self.folder / "state"
-        self._run = run
-        self._border: subprocess.Popen[bytes] | None = None
+        self._border: LabProcess | None = None
         content = {
             "border": "border",
             "state": "state",
@@ -76,35 +108,19 @@ class CloudSite:
             "latency": {"endpoints": dict(latency)},
         }
         (self.folder / "fog.yaml").write_text(json.dumps(content), encoding="utf-8")
-        self.environment = {
-            **os.environ,
-            "ROS_DOMAIN_ID": "172",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "PYTHONPATH": PYTHON_PATH,
-        }
+        host = LabMachine(self.folder, run=run, environment={"ROS_DOMAIN_ID": "172"})
+        super().__init__(host, self.folder / "state", "--site", str(self.folder / "fog.yaml"))
 
     def start_border(self) -> None:
         """Create the domain on this host, and start its border, whose proxy is the robot's."""
-        argv = [sys.executable, "-m", "gdp.cli.gdp", "domain", "create", "cloud", "--public", str(CALLER)]
-        argv += ["--directory", str(self.border), "--no-systemd"]
-        with (self.folder / "border.log").open("wb") as log:
-            self._border = subprocess.Popen(argv, env=self.environment, stdout=log, stderr=log, start_new_session=True)
-        self._run.note_process(self._border.pid)
+        words = ["domain", "create", "cloud", "--public", str(CALLER), "--directory", str(self.border), "--no-systemd"]
+        self._border = self.host.launch([*GDP, *words], "border", heard=False)
         until(self._is_border_up, "the border is up")
 
     def members(self) -> dict[str, str]:
         """Return label -> state of the domain's machines, as ``gdp domain ls`` shows them, removed ones included."""
-        argv = ["domain", "ls", "cloud", "--directory", str(self.border), "--all", "--json"]
-        done = subprocess.run(
-            [sys.executable, "-m", "gdp.cli.gdp", *argv],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=_COMMAND_S,
-            check=True,
-        )
-        return {each["label"]: each["state"] for each in json.loads(done.stdout)}
+        listed = self.host.gdp("domain", "ls", "cloud", "--directory", self.border, "--all", "--json")
+        return {each["label"]: each["state"] for each in json.loads(listed)}
 
     def tunnels(self) -> list[str]:
         """Return the labels of the peers of the border's switch."""
@@ -112,32 +128,9 @@ class CloudSite:
         links = status.result.get("links")
         return [str(each["label"]) for each in links] if isinstance(links, list) else []
 
-    def run(self, *words: str) -> str:
-        """Run ``fog`` for this site and return its output."""
-        argv = [sys.executable, "-m", "fog.cli.app", *words, "--site", str(self.folder / "fog.yaml")]
-        done = subprocess.run(
-            argv,
-            env=self.environment,
-            cwd=self.folder,
-            capture_output=True,
-            text=True,
-            timeout=_COMMAND_S,
-            check=False,
-        )
-        assert done.returncode == 0, f"fog {' '.join(words)}: {done.stdout}{done.stderr}{self.log()}"
-        return done.stdout
-
-    def log(self) -> str:
-        """Return the supervisor's log."""
-        path = self.state / "supervisor.log"
-        return path.read_text() if path.exists() else ""
-
     def serving(self, cluster: str) -> list[Record]:
         """Return the machines that serve, by the overlay."""
-        if not (self.state / "journal.sqlite3").exists():
-            return []
-        with closing(Journal(self.state / "journal.sqlite3")) as journal:
-            return [each for each in journal.machines(cluster, gone=False) if each.is_serving]
+        return [each for each in self.machines(cluster) if each.is_serving]
 
     def events(self, cluster: str) -> list[dict[str, Any]]:
         """Return the events of a cluster, oldest first."""
@@ -145,15 +138,15 @@ class CloudSite:
         return [json.loads(line) for line in lines]
 
     def close(self) -> None:
-        """End the border."""
+        """End the border and the robot's node."""
         if self._border is not None:
-            self._border.send_signal(signal.SIGINT)
-            self._border.wait(timeout=_COMMAND_S)
+            self._border.finish(patience_s=_COMMAND_S)
+        self.host.close()
 
     def _is_border_up(self) -> bool:
         assert self._border is not None
-        log = (self.folder / "border.log").read_text()
-        assert self._border.poll() is None, log
+        log = self._border.logged
+        assert self._border.code is None, log
         with suppress(GdpError):
             nodes = (find_control_socket(self.border / each) for each in ("switch", "rib", "proxy"))
             return "listening on TCP port" in log and all(
