@@ -14,7 +14,8 @@ from lab.machine import LabMachine
 from lab.process import FailedError, calling
 
 _TALKS = "import sys; print('one'); print('two', flush=True); print('logged', file=sys.stderr, flush=True); {}"
-_WAITS = _TALKS.format("import signal; signal.signal(2, lambda *_: sys.exit(print('three'))); signal.pause()")
+_ENDS = "import signal, sys; signal.signal(2, lambda *_: sys.exit(print('three'))); "
+_WAITS = _ENDS + _TALKS.format("signal.pause()")
 
 
 @pytest.fixture
