@@ -86,7 +86,7 @@ class SentFrames:
             self.keep(names)
         if again and len(names) > 1:
             size = sum(map(len, frames[:again]))
-            samples = samples_of(frames[:again])
+            samples = self._samples(frames[:again])
             for name in names:
                 self._paths.path(name, now_s).controller.charge(size, now_s)
                 if name in self._readers:
@@ -109,7 +109,7 @@ class SentFrames:
         for first in range(0, len(frames), _FLIGHT_FRAMES):
             flight = frames[first : first + _FLIGHT_FRAMES]
             size = sum(map(len, flight))
-            samples = samples_of(flight, self._count + 1)
+            samples = self._samples(flight)
             count = self._count = self._count + len(flight)
             for name in names:
                 path, reader = self._paths.path(name, now_s), self._readers.get(name)
@@ -118,6 +118,10 @@ class SentFrames:
                 number = path.sent(size, len(flight), now_s)
                 reader.flights.append(_Flight(count, len(flight), number, is_repair))
                 reader.receipts.sent(samples, is_repair=is_repair)
+
+    def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
+        """Return the samples among frames that leave next; those of striped frames would prove no order."""
+        return samples_of(frames, self._count + 1) if self._counts_losses else ()
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
@@ -191,13 +195,12 @@ class SentFrames:
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
         frames = reader.resolved - before
-        judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost)
-        is_unproven = self._counts_losses and judged > new_lost
+        judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost) if self._counts_losses else 0
+        is_unproven = judged > new_lost
         if is_unproven and held_s is not None:
             held_s = waited_s  # nor is it believed how long it held its report
-        lost = min(judged, frames - 1) if self._counts_losses else 0
         path.handle_held(acknack.held_us / 1e6)
-        path.acknowledged(numbers, max(lost, 0), held_s, now_s)
+        path.acknowledged(numbers, max(min(judged, frames - 1), 0), held_s, now_s)
         return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:

@@ -89,10 +89,6 @@ class Fields(Mapping[str, Value]):
             _refuse(key, "a name")
         return name
 
-    def optional_name(self, key: str) -> Name:
-        """Return a name, or ``ZERO`` for none."""
-        return Name(self.bytes_(key, NAME_BYTES))
-
     def list_(self, key: str, maximum: int) -> list[Value]:
         """Return a list of at most ``maximum`` items of any type."""
         value = self._items.get(key)

@@ -5,6 +5,7 @@ Sans-I/O, by its driver; ``session.py`` and ``aio.py`` add the calls that wait.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
@@ -390,7 +391,7 @@ class BaseSubscription(Opened[_D]):
         return ClosedError(f"the subscription to {self._label} is closed; subscribe again")
 
 
-class BaseServer(Opened[_D], Generic[_D, _H]):
+class BaseServer(Opened[_D], Generic[_D, _H], ABC):
     """Server of one name with ``workers`` that call a handler."""
 
     def __init__(
@@ -406,9 +407,9 @@ class BaseServer(Opened[_D], Generic[_D, _H]):
         self._handler = handler
         self._start(workers)
 
+    @abstractmethod
     def _start(self, workers: int) -> None:
         """Start the workers."""
-        raise NotImplementedError
 
     @property
     def clients(self) -> int:

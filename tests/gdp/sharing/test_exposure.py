@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -18,25 +17,6 @@ from tests.gdp.sharing.machines import DAY_S, PLAN, STRING, Machine, Site, impor
 
 TOPIC = "/robot_description"
 WITHDRAWN = "withdrawn: robot no longer exposes it"
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path)
-    with ExitStack() as stack:
-        for label in ("robot", "server"):
-            site.add(label).start(stack)
-        yield site
-
-
-@pytest.fixture
-def robot(site: Site) -> Machine:
-    return site.machines["robot"]
-
-
-@pytest.fixture
-def server(site: Site) -> Machine:
-    return site.machines["server"]
 
 
 def states(machine: Machine) -> list[str]:

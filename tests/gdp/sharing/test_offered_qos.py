@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -25,24 +24,10 @@ NAME = Name(bytes(range(32)))
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path)
-    with ExitStack() as stack:
-        for label in ("robot", "server"):
-            site.add(label).start(stack)
-        yield site
-
-
-@pytest.fixture
 def robot(site: Site) -> Machine:
     robot = site.machines["robot"]
     robot.graph, robot.qos = [("topic", TOPIC, STRING)], {TOPIC: LATCHED}
     return robot
-
-
-@pytest.fixture
-def server(site: Site) -> Machine:
-    return site.machines["server"]
 
 
 def offered(machine: Machine) -> list[OfferedQos | None]:
