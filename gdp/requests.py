@@ -12,6 +12,7 @@ section 5.5, and RFC 8415, section 15.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
@@ -42,6 +43,14 @@ class Backoff:
         """Return the seconds to wait after so many tries; 0 counts as 1."""
         return min(self.first_s * 2.0 ** min(max(tries - 1, 0) // self.equal, _EXPONENT_MAX), self.most_s)
 
+    def random_pause_s(self, tries: int, chance: float) -> float:
+        """Return the pause of one of many clients, which do not come back together.
+
+        Args:
+            chance: in [0, 1), random; the pause is between half of ``pause_s`` and all of it.
+        """
+        return self.pause_s(tries) * (1 + chance) / 2
+
 
 @dataclass(slots=True)
 class _State:
@@ -67,6 +76,10 @@ class Requests(Generic[K]):
 
     def __contains__(self, key: K) -> bool:
         return key in self._states
+
+    def keys(self) -> Set[K]:
+        """Return the keys of all requests."""
+        return self._states.keys()
 
     def tries(self, key: K) -> int:
         """Return how often a request was sent since it was started or answered."""
@@ -106,7 +119,7 @@ class Requests(Generic[K]):
         self._due.put(key, now_s + backoff.pause_s(state.tries))
 
     def answered(self, key: K, again_s: float = float("inf")) -> None:
-        """Record an answer; the renewal is due at a second. An answer to a renewal that was not sent changes nothing."""
+        """Record an answer; the renewal is due at a second. One that nothing was sent for changes nothing."""
         state = self._states.get(key)
         if state is not None and (state.tries or not state.is_answered):
             state.tries, state.is_answered = 0, True
