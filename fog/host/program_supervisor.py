@@ -16,13 +16,13 @@ from fog.host.bounded_log import BoundedLog
 from fog.host.managed_process import ManagedProcess
 from fog.host.status import ProgramStatus
 from fog.machine import Program
+from gdp.requests import Backoff
 
 __all__ = ["ProgramSupervisor"]
 
 log = logging.getLogger(__name__)
 
-PAUSE_MIN_S: Final = 0.1
-PAUSE_MAX_S: Final = 10.0
+RESTARTS: Final = Backoff(0.1, 10.0)
 _STEADY_S: Final = 30.0  # a program that ran this long is restarted at once
 _END_PATIENCE_S: Final = 2.0
 
@@ -41,18 +41,17 @@ class ProgramSupervisor:
 
     async def run(self) -> str:
         """Run the program until it ends permanently; return the reason. To stop it, cancel this, then call ``end``."""
-        pause_s, restarts = PAUSE_MIN_S, 0
+        failures = restarts = 0
         while True:
             begun_s = asyncio.get_running_loop().time()
             how = await self._live(restarts)
             self._become(ProgramStatus(restarts=restarts))
             if not self.program.restarts:
                 return f"{self.program.name} {how}"
+            failures = 1 if asyncio.get_running_loop().time() - begun_s > _STEADY_S else failures + 1
+            pause_s = RESTARTS.pause_s(failures)
             log.warning("program ended program=%s how=%s pause_s=%.1f", self.program.name, how, pause_s)
-            if asyncio.get_running_loop().time() - begun_s > _STEADY_S:
-                pause_s = PAUSE_MIN_S
             await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, PAUSE_MAX_S)
             restarts += 1
 
     def send_signal(self, number: signal.Signals) -> asyncio.Future[int] | None:

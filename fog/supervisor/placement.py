@@ -13,13 +13,12 @@ from fog.cluster import MachineRequest
 from fog.offer import Offer
 from fog.plan.choice import Choice, choose
 from fog.supervisor.core.record import Outcome, Record
+from gdp.requests import Backoff
 
 __all__ = ["held_until", "place", "stopgap", "wary_until"]
 
-_WARY_S: Final = 60.0  # after a loss; each further loss doubles it
-_WARY_MAX_S: Final = 3_600.0
-_HOLD_S: Final = 1.0  # after a failed request; each further failure doubles it
-_HOLD_MAX_S: Final = 300.0
+_WARINESS: Final = Backoff(60.0, 3_600.0)  # by losses
+_HOLDS: Final = Backoff(1.0, 300.0)  # by failed requests
 _MEMORY_S: Final = 3_600.0  # how long a loss counts
 _PATIENCE: Final = 4  # after this many consecutive failures in any region, the cause is probably not a region
 
@@ -89,13 +88,13 @@ def stopgap(
 def wary_until(records: Iterable[Record], now_s: float) -> float:
     """Return until when a location is avoided because machines were preempted there."""
     lost = _moments(records, Outcome.PREEMPTED, now_s)
-    return lost[-1] + min(_WARY_S * 2 ** (len(lost) - 1), _WARY_MAX_S) if lost else 0.0
+    return lost[-1] + _WARINESS.pause_s(len(lost)) if lost else 0.0
 
 
 def held_until(records: Iterable[Record], now_s: float) -> float:
     """Return until when a location is not retried because it had no capacity."""
     failed = _moments(records, Outcome.FAILED, now_s)
-    return failed[-1] + min(_HOLD_S * 2 ** (len(failed) - 1), _HOLD_MAX_S) if failed else 0.0
+    return failed[-1] + _HOLDS.pause_s(len(failed)) if failed else 0.0
 
 
 def _is_resting(records: Sequence[Record], now_s: float) -> bool:
@@ -104,8 +103,7 @@ def _is_resting(records: Sequence[Record], now_s: float) -> bool:
     failed = [moment for moment in _moments(records, Outcome.FAILED, now_s) if moment > served_s]
     if len(failed) < _PATIENCE:
         return False
-    pause_s: float = min(_HOLD_S * 2 ** len(failed), _HOLD_MAX_S)
-    return now_s < failed[-1] + pause_s
+    return now_s < failed[-1] + _HOLDS.pause_s(len(failed) + 1)
 
 
 def _moments(records: Iterable[Record], ending: Outcome, now_s: float) -> list[float]:

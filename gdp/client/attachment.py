@@ -35,6 +35,7 @@ from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
+from gdp.requests import Backoff
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.domain import Policy
@@ -48,7 +49,6 @@ __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
 _ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
 _RENEWAL_AGAIN: Final = 1 / 12  # of a lease, until a renewal is acknowledged; the pause doubles, up to a third
-_RENEWALS_MAX: Final = 16  # that are counted
 # delay of other advertisements after the node's own; without a RIB they are valid on this switch only
 _OWN_FIRST_S: Final = 0.5
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
@@ -354,9 +354,9 @@ class Attachment:
         """
         if not each.is_acknowledged:
             return _ADVERTISEMENT_AGAIN_S
-        pause_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * self._lease_s) * 2.0**each.renewals
-        each.renewals = min(each.renewals + 1, _RENEWALS_MAX)
-        return min(pause_s, self._lease_s / 3)
+        each.renewals += 1
+        first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * self._lease_s)
+        return Backoff(first_s, self._lease_s / 3).pause_s(each.renewals)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""

@@ -12,12 +12,12 @@ from types import TracebackType
 from typing import ClassVar, Final
 
 from gdp.errors import DropReason, FrameError, RemoteError
+from gdp.requests import Backoff
 
 __all__ = ["ErrorBoundary"]
 
 _FAULTS_BEFORE: Final = 3  # in one name, over one neighbour, until that is quarantined
-_QUARANTINE_S: Final = 10.0
-_QUARANTINE_MAX_S: Final = 300.0
+_QUARANTINES: Final = Backoff(10.0, 300.0)
 _FORGIVEN_S: Final = 600.0  # after the last fault
 _OFFENDERS_MAX: Final = 256
 _PLACES_MAX: Final = 64  # locations in the code that are logged
@@ -85,9 +85,8 @@ class ErrorBoundary:
         if offender is None or now_s - offender.last_s > _FORGIVEN_S:
             offender = _Offender(0, now_s)
         offender.faults, offender.last_s = offender.faults + 1, now_s
-        beyond = offender.faults - _FAULTS_BEFORE
-        if beyond >= 0:
-            offender.until_s = now_s + min(_QUARANTINE_S * 2 ** min(beyond, 8), _QUARANTINE_MAX_S)
+        if offender.faults >= _FAULTS_BEFORE:
+            offender.until_s = now_s + _QUARANTINES.pause_s(offender.faults - _FAULTS_BEFORE + 1)
         self._offenders[origin] = offender
         if len(self._offenders) > _OFFENDERS_MAX:
             del self._offenders[next(iter(self._offenders))]

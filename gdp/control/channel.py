@@ -32,6 +32,7 @@ from gdp.errors import DropReason, FrameError, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
@@ -46,8 +47,8 @@ _HEAD_BYTES: Final = 1 + _ID_BYTES + _NUMBER_BYTES
 _OFFER_BYTES: Final = 1_536  # minimum size of an OPEN: more than any ACCEPT
 _PURPOSES: Final = (b"gdp channel, from asker ", b"gdp channel, to asker ")
 _WINDOW: Final = 4_096  # records that may come out of order
-# between repetitions of an OPEN; after the last one the channel waits for news of the peer
-_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)
+_OFFERS: Final = Backoff(0.1, 0.8)  # of an OPEN
+_OFFER_TRIES: Final = 4  # then the channel waits for news of the peer
 _WAITING_MAX: Final = 256  # statements that wait for a channel
 _WAITING_S: Final = 1.0  # by then the sender repeats a statement itself
 _RENEW_S: Final = 3_600.0
@@ -107,8 +108,6 @@ class _Offer:
     key: ExchangeKey
     wire: bytes
     fingerprint: bytes
-    again_s: float
-    tries: int = 0
 
 
 @dataclass(slots=True)
@@ -145,6 +144,7 @@ class Channels:
         self._random_bytes = random_bytes
         self._accepts = accepts
         self._asked: dict[Name, _Asked] = {}
+        self._offers = Requests[Name]()  # ours, by peer
         self._askers: OrderedDict[Name, _Asker] = OrderedDict()
         self._hints = TokenBucket(_HINTS_PER_S, _HINTS_PER_S)
         self._out: list[Outgoing] = []
@@ -174,11 +174,13 @@ class Channels:
         """Open a new channel before anything else is sent: the peer was restarted, and its keys are lost."""
         asked = self._asked.get(peer)
         if asked is not None:
-            asked.channel = asked.offer = None
+            asked.channel = None
+            self._end_offer(peer, asked)
 
     def forget(self, peer: Name) -> None:
         """Drop all state of a peer."""
         self._asked.pop(peer, None)
+        self._offers.cancel(peer)
         self._askers.pop(peer, None)
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
@@ -205,24 +207,20 @@ class Channels:
 
     def handle_timer(self, now_s: float) -> None:
         """Repeat what was not accepted yet."""
-        for peer, asked in list(self._asked.items()):
-            offer = asked.offer
-            if offer is None or offer.again_s > now_s:
+        for peer in self._offers.poll_due(now_s):
+            asked = self._asked[peer]
+            if asked.offer is not None and self._offers.tries(peer) < _OFFER_TRIES:
+                self._offer(peer, asked.offer, now_s)
                 continue
-            if offer.tries == len(_AGAIN_S):
-                asked.offer = None
-                self.drops[DropReason.NO_CHANNEL] += len(asked.waiting)
-                asked.waiting.clear()
-                if asked.channel is None:
-                    del self._asked[peer]
-                continue
-            self._out.append(Outgoing(peer, offer.wire))
-            offer.again_s = now_s + _AGAIN_S[offer.tries]
-            offer.tries += 1
+            self._end_offer(peer, asked)
+            self.drops[DropReason.NO_CHANNEL] += len(asked.waiting)
+            asked.waiting.clear()
+            if asked.channel is None:
+                del self._asked[peer]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next repetition, or None."""
-        return min((asked.offer.again_s for asked in self._asked.values() if asked.offer is not None), default=None)
+        return self._offers.next_due()
 
     def records_to_send(self) -> list[Outgoing]:
         """Return, once, the records to send."""
@@ -240,9 +238,18 @@ class Channels:
         bare = sign(StatementType.OPEN, body, identity.name, identity.key)
         body["p"] = bytes(max(_OFFER_BYTES - len(bare), 0))
         wire = sign(StatementType.OPEN, body, identity.name, identity.key)
-        asked.offer = _Offer(key, wire, parse(wire).fingerprint, now_s + _AGAIN_S[0], 1)
+        asked.offer = _Offer(key, wire, parse(wire).fingerprint)
         asked.reopened_s = now_s
-        self._out.append(Outgoing(peer, wire))
+        self._offers.start(peer, now_s)
+        self._offer(peer, asked.offer, now_s)
+
+    def _offer(self, peer: Name, offer: _Offer, now_s: float) -> None:
+        self._offers.sent(peer, now_s, _OFFERS)
+        self._out.append(Outgoing(peer, offer.wire))
+
+    def _end_offer(self, peer: Name, asked: _Asked) -> None:
+        asked.offer = None
+        self._offers.cancel(peer)
 
     def _take_accept(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
@@ -253,7 +260,8 @@ class Channels:
         self._verified(statement, now)
         id_ = fields.bytes_("i", _ID_BYTES)
         keys = _keys(offer.key, fields, offer.fingerprint, statement.fingerprint)
-        asked.channel, asked.offer = _Channel(id=id_, out_key=keys[0], in_key=keys[1], begun_s=now.mono_s), None
+        asked.channel = _Channel(id=id_, out_key=keys[0], in_key=keys[1], begun_s=now.mono_s)
+        self._end_offer(statement.signer, asked)
         waiting, asked.waiting = list(asked.waiting), deque(maxlen=_WAITING_MAX)
         for wire, until_s in waiting:
             if until_s > now.mono_s:

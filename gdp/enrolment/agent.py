@@ -36,6 +36,7 @@ from gdp.management.control_client import NotRunningError, ask_node, find_contro
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
 from gdp.nodes.relay import relay_control_path
+from gdp.requests import Backoff
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation
@@ -64,8 +65,7 @@ log = logging.getLogger(__name__)
 
 DELEGATION_KIND: Final = "delegation"  # the body is the content of a delegation's file
 POLL_S: Final = 45.0
-_BACKOFF_MIN_S: Final = 1.0
-_BACKOFF_MAX_S: Final = 60.0
+_BACKOFF: Final = Backoff(1.0, 60.0)
 _REFUSED_S: Final = 300.0  # after a refusal, which rarely changes by itself
 _RENEW_SHARE: Final = 2 / 3
 _RELOAD_S: Final = 5.0
@@ -105,7 +105,7 @@ class Agent:
         self._instance = secrets.token_bytes(INSTANCE_BYTES)
         self._ended = threading.Event()
         self._channel: Channel | None = None
-        self._backoff_s = _BACKOFF_MIN_S
+        self._tries = 0
         self._last_success_unix_s: float | None = None
 
     def stop(self) -> None:
@@ -228,7 +228,7 @@ class Agent:
             delete_mail(self._files.inbox, mail.number)
 
     def _succeeded(self, channel: Channel) -> None:
-        self._backoff_s = _BACKOFF_MIN_S
+        self._tries = 0
         self._last_success_unix_s = self._clock()
         self._write_status("connected", channel.server, "")
 
@@ -240,9 +240,8 @@ class Agent:
         self._ended.wait(pause_s)
 
     def _next_backoff_s(self) -> float:
-        pause_s = self._backoff_s * (0.5 + self._jitter())
-        self._backoff_s = min(2 * self._backoff_s, _BACKOFF_MAX_S)
-        return pause_s
+        self._tries += 1
+        return _BACKOFF.random_pause_s(self._tries, self._jitter())
 
     def _write_status(self, state: str, server: str, error: str) -> None:
         ends = {each.name: _certificate(each).validity.not_after_unix_s for each in self._files.nodes}

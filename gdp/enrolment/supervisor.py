@@ -21,14 +21,14 @@ from typing import Final
 
 from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
+from gdp.requests import Backoff
 from gdp.terminal import echo
 
 __all__ = ["Failures", "supervise"]
 
 log = logging.getLogger(__name__)
 
-_PAUSE_MIN_S: Final = 0.2
-_PAUSE_MAX_S: Final = 15.0
+_RESTARTS: Final = Backoff(0.2, 15.0)
 _STEADY_S: Final = 30.0  # a program that ran this long is restarted after the shortest pause
 _END_S: Final = 8.0
 _LINE_MAX: Final = 1 << 16
@@ -84,7 +84,7 @@ async def _once(work: Callable[[], Awaitable[None]]) -> None:
 
 
 async def _keep_running(program: MachineProgram, first: asyncio.Event, prefix: str, failures: Failures) -> None:
-    pause_s, loop = _PAUSE_MIN_S, asyncio.get_running_loop()
+    failed, loop = 0, asyncio.get_running_loop()
     while True:
         begun_s = loop.time()
         process = await _start(program)
@@ -100,12 +100,11 @@ async def _keep_running(program: MachineProgram, first: asyncio.Event, prefix: s
                 failures.names.add(program.name)
             await asyncio.wait([logging_output], timeout=_END_S)
             raise
-        if loop.time() - begun_s > _STEADY_S:
-            pause_s = _PAUSE_MIN_S
+        failed = 1 if loop.time() - begun_s > _STEADY_S else failed + 1
+        pause_s = _RESTARTS.pause_s(failed)
         failures.names.add(program.name)
         log.warning("program ended program=%s code=%d pause_s=%.1f", program.name, code, pause_s)
         await asyncio.sleep(pause_s)
-        pause_s = min(2 * pause_s, _PAUSE_MAX_S)
 
 
 async def _log_output(process: asyncio.subprocess.Process, prefix: str) -> None:

@@ -29,9 +29,9 @@ from gdp.names import Name
 from gdp.ports.host_addresses import source_address
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import verified_border
-from gdp.relay.backoff import Backoff
 from gdp.relay.choice import RelayChoice
 from gdp.relay.connection import ConnectionCounters, RelayConnection
+from gdp.requests import Backoff
 from gdp.sansio import Timestamps
 
 __all__ = ["BorderDialer"]
@@ -39,6 +39,7 @@ __all__ = ["BorderDialer"]
 log = logging.getLogger(__name__)
 
 _CONNECT_S: Final = 2.0  # for one address; then the next one has its turn
+_REDIALS: Final = Backoff(0.1, 5.0)
 _REFUSED_S: Final = 10.0  # at least, after a refusal
 _CANDIDATES_MAX: Final = 16
 _STANDBY: Final = "on standby: the tunnel over UDP is up, or has a moment to come up"
@@ -66,7 +67,7 @@ class BorderDialer:
         self._border = border
         self._context = context
         self._loop = context.loop
-        self._backoff = Backoff()
+        self._failures = 0  # since a connection stood, or the network changed
         self._candidates: list[_Candidate] = []
         self._next = 0
         self._source: str | None = None  # of the last attempt: the own address towards the border
@@ -202,7 +203,7 @@ class BorderDialer:
         return RelayPort(self._loop, device)
 
     def _dial_now(self) -> None:
-        self._backoff.reset()
+        self._failures = 0
         self._due_s = time.monotonic()
         self._loop.wake_at(self._due_s)
 
@@ -284,7 +285,7 @@ class BorderDialer:
         except LocalError as error:
             link.end(str(error))
             return None
-        self._backoff.reset()
+        self._failures = 0
         self._next = max(self._next - 1, 0)  # the same endpoint first, if the connection is lost
         self._last_refusal = ""
         self.reason = ""
@@ -323,7 +324,8 @@ class BorderDialer:
         self.reason = reason
         if self._is_closed:
             return
-        wait_s = max(self._backoff.failed(random.random()), at_least_s)
+        self._failures += 1
+        wait_s = max(_REDIALS.random_pause_s(self._failures, random.random()), at_least_s)
         self._due_s = time.monotonic() + wait_s
         self._loop.wake_at(self._due_s)
 

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.control.rib_replication import Key
-from gdp.due_queue import DueQueue
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 
 __all__ = ["Passed", "UpstreamAdvertisements"]
 
-RETRY_S: Final = 0.3
-RETRY_MAX_S: Final = 5.0
+_REPEATS: Final = Backoff(0.3, 5.0)
 SILENT_MIN_S: Final = 0.12  # a RIB above that leaves a probe unanswered for so long, or three round trips more ...
 SILENT_MAX_S: Final = 1.0  # ... but no longer than this, is replaced by the next one
 PROBE_S: Final = 1.0  # with several RIBs above, the one in use receives a query or a probe at least this often
@@ -40,12 +39,6 @@ class Passed:
     until_s: float
 
 
-@dataclass(slots=True)
-class _Waiting:
-    passed: Passed
-    pause_s: float = RETRY_S
-
-
 class UpstreamAdvertisements:
     """The tier above as one RIB sees it.
 
@@ -56,8 +49,8 @@ class UpstreamAdvertisements:
     def __init__(self, ribs: tuple[Name, ...]) -> None:
         self._ribs = ribs
         self._at = 0
-        self._waiting: dict[Key, _Waiting] = {}
-        self._due = DueQueue[Key](is_sorted=True)
+        self._waiting: dict[Key, Passed] = {}
+        self._requests = Requests[Key](is_sorted=True)
         self._asked_s: float | None = None  # since when a message is unanswered
         self._unheard_s: float | None = None  # when the first message left since one of them was heard
         self._heard_s = float("-inf")
@@ -82,13 +75,13 @@ class UpstreamAdvertisements:
         """Send an advertisement upstream until it is acknowledged; it replaces the same advertiser's pending one."""
         if passed.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
             self._drop(next(iter(self._waiting)))
-        self._waiting[passed.key] = _Waiting(passed)
-        self._due.put(passed.key, now_s)
+        self._waiting[passed.key] = passed
+        self._requests.start(passed.key, now_s)
 
     def handle_ack(self, key: Key, sequence: int) -> None:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
-        if waiting is not None and sequence >= waiting.passed.sequence:
+        if waiting is not None and sequence >= waiting.sequence:
             self._remove(key)
 
     def refused(self, key: Key) -> None:
@@ -124,7 +117,7 @@ class UpstreamAdvertisements:
             return was_silent
         if self._asked_s is not None:
             if self._is_gone(now_s):
-                self._all_due(now_s)
+                self._requests.start_all(now_s)
             self._round_trip_s += (now_s - self._asked_s - self._round_trip_s) / 8
         self._asked_s, self._heard_s = None, now_s
         return was_silent
@@ -149,15 +142,14 @@ class UpstreamAdvertisements:
         """Return the advertisements to send to ``rib`` now; those with ended leases are dropped, and counted."""
         found: list[Passed] = []
         most = 1 if self._is_gone(now_s) else SEND_MAX
-        while len(found) < SEND_MAX and (keys := self._due.poll_due(now_s, 1)):
+        while len(found) < SEND_MAX and (keys := self._requests.poll_due(now_s, 1)):
             waiting = self._waiting[keys[0]]
-            if waiting.passed.until_s <= now_s:
+            if waiting.until_s <= now_s:
                 self._drop(keys[0])
                 continue
-            self._due.put(keys[0], now_s + waiting.pause_s)
-            waiting.pause_s = min(2 * waiting.pause_s, RETRY_MAX_S)
+            self._requests.sent(keys[0], now_s, _REPEATS)
             if len(found) < most:
-                found.append(waiting.passed)
+                found.append(waiting)
         if found:
             self.record_asked(now_s)
             if self._asked_s is None:
@@ -166,7 +158,7 @@ class UpstreamAdvertisements:
 
     def next_due(self) -> float | None:
         """Return a monotonic second that is no later than the next timer, or None."""
-        due_s = self._due.next_due()
+        due_s = self._requests.next_due()
         times = [] if due_s is None else [due_s]
         if len(self._ribs) > 1:
             times.append(self._heard_s + PROBE_S if self._asked_s is None else self._asked_s + self._silent_s())
@@ -176,7 +168,7 @@ class UpstreamAdvertisements:
     def _use(self, at: int, now_s: float) -> None:
         self._at, self._asked_s, self._probed_s = at, None, None
         self._return_at_s = now_s + RETURN_S if at else float("inf")
-        self._all_due(now_s)
+        self._requests.start_all(now_s)
 
     def _silent_s(self) -> float:
         return min(SILENT_MIN_S + 3 * self._round_trip_s, SILENT_MAX_S)
@@ -184,15 +176,10 @@ class UpstreamAdvertisements:
     def _is_gone(self, now_s: float) -> bool:
         return self._asked_s is not None and now_s - self._asked_s >= GONE_S
 
-    def _all_due(self, now_s: float) -> None:
-        for key, waiting in self._waiting.items():
-            waiting.pause_s = RETRY_S
-            self._due.put(key, now_s)
-
     def _drop(self, key: Key) -> None:
         self._remove(key)
         self.given_up += 1
 
     def _remove(self, key: Key) -> None:
         self._waiting.pop(key, None)
-        self._due.discard(key)
+        self._requests.cancel(key)

@@ -34,6 +34,7 @@ from typing import Final, NamedTuple
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.limits import DIRECT_TUNNELS_MAX
 from gdp.names import Name
+from gdp.requests import Backoff
 from gdp.token_bucket import TokenBuckets
 
 __all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Silence", "Slot", "slots_between"]
@@ -41,8 +42,7 @@ __all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Silence", "Slot
 SLOT_S: Final = 1.0  # each pair is tried for this time
 _PAIRS_MAX: Final = 4  # of one type
 _ROUNDS_AT_ONCE: Final = 3  # before the first pause: the first packet of one end opens its NAT for the other's second
-_PAUSE_FIRST_S: Final = 2.0  # it doubles with each round
-_PAUSE_MAX_S: Final = 60.0
+_PAUSES: Final = Backoff(2.0, 60.0)  # by rounds
 _JITTER: Final = 0.25  # of a pause, up or down
 _SILENT_FROM: Final = 3  # the fourth pause, and later ones, are silent
 _SILENCE_S: Final = 32.0  # longer than nf_conntrack_udp_timeout, 30 s
@@ -371,7 +371,7 @@ class DirectTunnels:
         if doublings < 0:
             return 0.0
         draw = int.from_bytes(self._hash(peer, round_.to_bytes(4, "big"))[:4], "big") / (1 << 32)
-        pause_s = min(_PAUSE_FIRST_S * 2.0 ** min(doublings, 16), _PAUSE_MAX_S)
+        pause_s = _PAUSES.pause_s(doublings + 1)
         pause_s *= 1 - _JITTER + 2 * _JITTER * draw
         return max(pause_s, _SILENCE_S * (1 + _JITTER * draw)) if doublings >= _SILENT_FROM else pause_s
 

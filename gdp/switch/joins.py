@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gdp.control.join import Join, Route
 from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
@@ -15,12 +15,13 @@ from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S
 from gdp.names import ZERO, Name
+from gdp.requests import Backoff
 from gdp.switch.outbox import Outbox
 from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey, Trees
 
 __all__ = ["JoinSender", "ReceivedJoins"]
 
-_PAUSE_S, _PAUSE_MOST_S = 0.004, 0.064  # 0.2 Mbit/s is a full frame in 0.06 s
+_SPACED: Final = Backoff(0.008, 0.064)  # 0.2 Mbit/s is a full frame in 0.06 s
 
 
 class _SpacedFrame(NamedTuple):
@@ -85,7 +86,7 @@ class JoinSender:
         if not tree.unknown:
             self._outbox.say_at(*at, Kind.JOIN, wire)
             return
-        pause_s = min(_PAUSE_S * 2**tree.unknown, _PAUSE_MOST_S)
+        pause_s = _SPACED.pause_s(tree.unknown)
         frames = self._outbox.frames_of(at[0], Kind.JOIN, wire)
         spaced = self._spaced.setdefault(at, deque())
         spaced.extend(_SpacedFrame(tree.identity, self._sequence, frame, pause_s) for frame in frames)

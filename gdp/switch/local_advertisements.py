@@ -13,6 +13,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import ATTACHED_MAX
 from gdp.message.shares import Shares
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import Right
 
@@ -33,8 +34,6 @@ class LocalAdvertisement:
     port: int
     mac: bytes
     expires_s: float
-    relay_at_s: float
-    tries: int = 0
     is_slow: bool = False  # it was last relayed over a slow link
     is_settled: bool = False  # the RIB has sent an AdvertiseAck
 
@@ -45,7 +44,7 @@ class LocalAdvertisements:
     def __init__(self) -> None:
         self._by_name: dict[Name, dict[Name, LocalAdvertisement]] = {}
         self._shares = Shares(ATTACHED_MAX)
-        self._relays = DueQueue[_Key]()
+        self._relays = Requests[_Key]()
         self._ends = DueQueue[_Key]()
 
     def __len__(self) -> int:
@@ -77,14 +76,14 @@ class LocalAdvertisements:
         if self.get(advertisement.name, advertisement.node) is None and not self._shares.reserve(advertisement.node):
             raise StatementError(DropReason.QUOTA, "advertisements of one node")
         attachment = LocalAdvertisement(
-            advertisement=advertisement, port=port, mac=mac, expires_s=now_s + advertisement.lease_s, relay_at_s=now_s
+            advertisement=advertisement, port=port, mac=mac, expires_s=now_s + advertisement.lease_s
         )
+        key, relay_at_s = (advertisement.name, advertisement.node), now_s
         before = self.get(advertisement.name, advertisement.node)
         if before is not None and before.is_slow and not before.is_settled and (before.port, before.mac) == (port, mac):
-            attachment.relay_at_s, attachment.is_slow = max(before.relay_at_s, now_s), True
+            relay_at_s, attachment.is_slow = max(self._relays.due_s(key), now_s), True
         self._by_name.setdefault(advertisement.name, {})[advertisement.node] = attachment
-        key = advertisement.name, advertisement.node
-        self._relays.put(key, attachment.relay_at_s)
+        self._relays.start(key, relay_at_s)
         self._ends.put(key, attachment.expires_s)
         return attachment
 
@@ -92,7 +91,7 @@ class LocalAdvertisements:
         """Remove an advertisement and return it, or None."""
         advertisements = self._by_name.get(name, {})
         gone = advertisements.pop(advertiser, None)
-        self._relays.discard((name, advertiser))
+        self._relays.cancel((name, advertiser))
         self._ends.discard((name, advertiser))
         if gone is not None:
             self._shares.release(advertiser)
@@ -118,14 +117,14 @@ class LocalAdvertisements:
         if attachment is None or (taken is not None and taken < attachment.advertisement.sequence):
             return None
         attachment.is_settled = True
-        self._relays.discard((name, advertiser))
+        self._relays.cancel((name, advertiser))
         return attachment
 
     def relay_all(self, now_s: float) -> None:
         """Make every advertisement due to be relayed: there is a new RIB."""
         for attachment in self.all():
-            attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
-            self._relays.put((attachment.advertisement.name, attachment.advertisement.node), now_s)
+            attachment.is_settled = False
+            self._relays.start((attachment.advertisement.name, attachment.advertisement.node), now_s)
 
     def is_relay_due(self, now_s: float) -> bool:
         """Return whether an advertisement is to be relayed now."""
@@ -139,12 +138,14 @@ class LocalAdvertisements:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
         interval_s = min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
-        due = [self._by_name[name][advertiser] for name, advertiser in self._relays.poll_due(now_s)]
-        for each in due:
-            each.tries += 1
-            each.relay_at_s, each.is_slow = now_s + interval_s, interval_s > RELAY_AGAIN_S
-            if each.tries < RELAY_TRIES:
-                self._relays.put((each.advertisement.name, each.advertisement.node), each.relay_at_s)
+        due = []
+        for name, advertiser in self._relays.poll_due(now_s):
+            each = self._by_name[name][advertiser]
+            each.is_slow = interval_s > RELAY_AGAIN_S
+            self._relays.sent((name, advertiser), now_s, Backoff(interval_s, interval_s))
+            if self._relays.tries((name, advertiser)) == RELAY_TRIES:
+                self._relays.cancel((name, advertiser))
+            due.append(each)
         return due
 
     def expire(self, now_s: float) -> list[LocalAdvertisement]:

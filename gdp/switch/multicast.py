@@ -51,6 +51,7 @@ from gdp.limits import (
 )
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
+from gdp.requests import Backoff
 from gdp.switch.backups import Backups
 from gdp.switch.joins import JoinSender, ReceivedJoins
 from gdp.switch.local_advertisements import LocalAdvertisements
@@ -66,11 +67,11 @@ from gdp.trust.right import HEARS, Right
 
 __all__ = ["MulticastTrees"]
 
-_JOIN_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)  # a new join is renewed after so long, then every JOIN_REFRESH_S
+_NEW_JOINS: Final = Backoff(0.1, JOIN_REFRESH_S)
+_NEW_JOINS_MAX: Final = 4  # renewals of a new join, then one every JOIN_REFRESH_S
 _SETTLED_JOINS: Final = 2  # renewals after which a tree has settled
 _TICK_EARLY: Final = 0.25  # of an interval: the first renewal at a tick comes at least 0.75 intervals after the last
 _OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
-_UNKNOWN_MAX: Final = 8  # replies about one tree after which their pause grows no further
 _ACTIVE_S: Final = 1.0  # for which a backup replaces a branch that was lost
 
 
@@ -305,8 +306,8 @@ class MulticastTrees:
         """Send whole joins of which a neighbour does not know the numbers; of many, the others come later."""
         at = neighbour.port, neighbour.mac
         for count, tree in enumerate(self._joins.find_unknown(at, reply.numbers)):
-            pause_s = min(_JOIN_AGAIN_S[0] * 2**tree.unknown, JOIN_REFRESH_S)
-            tree.unknown = min(tree.unknown + 1, _UNKNOWN_MAX)
+            tree.unknown += 1
+            pause_s = _NEW_JOINS.pause_s(tree.unknown)
             if count < JOINS_AGAIN_MAX:
                 del tree.sent[at]
                 if tree.upstream == at:
@@ -630,9 +631,9 @@ class MulticastTrees:
         if upstream is None or not tree.is_wanted_below:
             return
         has_settled = tree.joins >= _SETTLED_JOINS
-        if tree.joins < len(_JOIN_AGAIN_S):
-            tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
+        if tree.joins < _NEW_JOINS_MAX:
             tree.joins += 1
+            tree.renew_at_s = now_s + _NEW_JOINS.pause_s(tree.joins)
         elif self._outbox.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
             tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
         is_proof_due = not renews or now_s >= tree.prove_at_s

@@ -4,8 +4,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A query is repeated until a response comes. A name that attached readers want, or that frames are sent to, is watched:
 its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. A link that loses
-frames loses both this renewal and the RIB's updates, so the renewal is repeated, too. Queries for new names pass the
-query window (``query_window.py``).
+frames loses both this renewal and the RIB's updates, so the renewal is repeated, too (``gdp/requests.py``). Queries for
+new names pass the query window (``query_window.py``).
 
 An answer may not help the frames that wait: the node was attached here and is silent, which the RIB does not know yet.
 They ask again. So a query follows the one before after ``RETRY_S`` at the soonest, answered or not. A RIB that does not
@@ -20,31 +20,27 @@ from typing import Final
 
 from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 from gdp.switch.query_window import QueryWindow
 
 __all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX", "NameQueries"]
 
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
-_RENEWAL_TRIES_MAX: Final = 4  # the pause doubles after each; then the next renewal
+_QUERIES: Final = Backoff(RETRY_S, 2.0, equal=TRIES_MAX)
 QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
 BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
 USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
-_SCAN_S: Final = 0.01  # between two scans for queries that are due again
 _NEVER_S: Final = float("inf")
 
 
 @dataclass(slots=True, kw_only=True)
 class _Query:
-    due_s: float  # ``_NEVER_S`` while it waits for the window
     since_s: float
     owner: bytes = b""  # the neighbour whose share it uses
     sent_s: float = -_NEVER_S
-    tries: int = 0
     is_watch: bool = False  # an attached reader needs all advertisers of the name
     used_until_s: float = 0.0  # frames are sent to the name
-    is_answered: bool = False
-    renewals: int = 0  # of the watch, sent since the last response
     passed_over: set[Name] = field(default_factory=set)  # RIBs that do not know the name
 
 
@@ -58,13 +54,13 @@ class NameQueries:
 
     def __init__(self, watch_s: float = ADVERTISEMENT_LEASE_S) -> None:
         self.watch_s = watch_s
-        self._watch_again_s = watch_s / 4
         self._use_watch_s = 2 * watch_s
-        self._use_again_s = watch_s / 2
+        self._watch_renewals = Backoff(RETRY_S, watch_s / 4)
+        self._use_renewals = Backoff(RETRY_S, watch_s / 2)
         self._queries: dict[Name, _Query] = {}
+        self._requests = Requests[Name]()
         self._window = QueryWindow()
         self._watches = 0
-        self._due_s = _NEVER_S  # no query is due before
 
     def __len__(self) -> int:
         return len(self._queries)
@@ -83,28 +79,24 @@ class NameQueries:
         query = self._queries.get(name)
         if query is None:
             if len(self._queries) - self._watches < QUERIES_MAX:
-                self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s, owner=owner)
+                self._add(name, _Query(since_s=now_s, owner=owner), _NEVER_S)
                 self._window.put(owner, name)
-        elif query.is_answered:
-            query.is_answered, query.tries, query.renewals = False, 0, 0
-            query.due_s = max(now_s, query.sent_s + RETRY_S)
-            self._due_s = min(self._due_s, query.due_s)
+        elif not self._requests.is_open(name):
+            self._requests.start(name, max(now_s, query.sent_s + RETRY_S))
 
     def is_open(self, name: Name) -> bool:
         """Return whether a query for a name has no response yet."""
-        query = self._queries.get(name)
-        return query is not None and not query.is_answered
+        return self._requests.is_open(name)
 
     def watch(self, name: Name, now_s: float) -> None:
         """Query a name at once and watch it for attached readers, who proved their right: no bound applies."""
         query = self._queries.get(name)
         if query is None:
-            query = self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s)
+            query = self._add(name, _Query(since_s=now_s), now_s)
         if not query.is_watch:
             self._window.cancel(query.owner, name)
             query.is_watch = True
-            query.due_s = now_s
-            self._due_s = min(self._due_s, now_s)
+            self._requests.hasten(name, now_s)
             self._watches += 1
 
     def unwatch(self, name: Name) -> None:
@@ -127,8 +119,7 @@ class NameQueries:
         if query is None:
             if len(self._queries) - self._watches >= USED_NAMES_MAX:
                 return
-            query = self._queries[name] = _Query(due_s=now_s, since_s=now_s)
-            self._due_s = min(self._due_s, now_s)
+            query = self._add(name, _Query(since_s=now_s), now_s)
         query.used_until_s = now_s + self._use_watch_s
 
     def receive_answer(self, name: Name, now_s: float) -> None:
@@ -137,13 +128,11 @@ class NameQueries:
         if query is None:
             return
         query.passed_over.clear()
-        if not query.is_watch and query.used_until_s <= now_s:
+        if not self._is_needed(query, now_s):
             self._remove(name)
             return
         self._window.answered(name)
-        if not query.is_answered or query.renewals:  # another update renews no watch
-            query.is_answered, query.renewals = True, 0
-            query.due_s = now_s + self._renewal_s(query)
+        self._requests.answered(name, now_s + self._renewals(query).most_s)
 
     def receive_unknown(self, name: Name, rib: Name, now_s: float, others: AbstractSet[Name]) -> None:
         """Send the query for a name that a RIB does not know to another one, if one is left; else at its next time."""
@@ -152,9 +141,8 @@ class NameQueries:
             return
         query.passed_over.add(rib)
         if not others <= query.passed_over:
-            query.due_s = now_s
-            self._due_s = min(self._due_s, now_s)
-        elif query.is_watch or query.used_until_s > now_s:
+            self._requests.hasten(name, now_s)
+        elif self._is_needed(query, now_s):
             self.receive_answer(name, now_s)
         else:
             query.passed_over.clear()
@@ -166,18 +154,20 @@ class NameQueries:
 
     def repeat_all(self, now_s: float) -> None:
         """Send every open query and every watch again at once: there is a new RIB."""
-        for query in self._queries.values():
-            query.tries = query.renewals = 0
-            if query.due_s != _NEVER_S:
-                query.due_s = now_s
-        self._due_s = min(self._due_s, now_s)
+        self._requests.start_all(now_s)
 
     def poll_due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[Name]]:
         """Return at most ``BATCH_MAX`` queries to send now, as (name, seconds to watch it), and the failed names."""
         queries: list[tuple[Name, float]] = []
         failed: list[Name] = []
-        if now_s >= self._due_s:
-            self._poll_repeated(now_s, queries, failed)
+        for name in self._requests.poll_due(now_s, BATCH_MAX):
+            query, is_open = self._queries[name], self._requests.is_open(name)
+            if self._is_needed(query, now_s) or (is_open and self._requests.tries(name) < TRIES_MAX):
+                queries.append((name, self._sent(name, query, now_s)))
+                continue
+            self._remove(name)
+            if is_open:
+                failed.append(name)
         while len(queries) < BATCH_MAX and self._window.is_ready:
             name = self._window.pop()
             query = self._queries[name]
@@ -186,56 +176,33 @@ class NameQueries:
                 failed.append(name)
                 continue
             self._window.sent(name)
-            queries.append((name, self._sent(query, now_s)))
-            self._due_s = min(self._due_s, query.due_s)
+            queries.append((name, self._sent(name, query, now_s)))
         return queries, failed
 
     def next_due(self) -> float | None:
         """Return a monotonic second that is no later than the next query, or None."""
-        if self._window.is_ready:
-            return float("-inf")
-        return self._due_s if self._queries and self._due_s != _NEVER_S else None
+        return float("-inf") if self._window.is_ready else self._requests.next_due()
 
-    def _poll_repeated(self, now_s: float, queries: list[tuple[Name, float]], failed: list[Name]) -> None:
-        """Add the queries and watches that were sent before and are due again."""
-        next_s = _NEVER_S
-        for name, query in list(self._queries.items()):
-            if query.due_s <= now_s:
-                is_needed = query.is_watch or query.used_until_s > now_s
-                if not is_needed and (query.is_answered or query.tries >= TRIES_MAX):
-                    self._remove(name)
-                    if not query.is_answered:
-                        failed.append(name)
-                    continue
-                if len(queries) >= BATCH_MAX:
-                    self._due_s = now_s
-                    return
-                queries.append((name, self._sent(query, now_s)))
-            next_s = min(next_s, query.due_s)
-        self._due_s = max(next_s, now_s + _SCAN_S)
-
-    def _sent(self, query: _Query, now_s: float) -> float:
+    def _sent(self, name: Name, query: _Query, now_s: float) -> float:
         """Record one try of a query; return for how many seconds the RIB shall watch its name."""
-        query.tries, query.sent_s = query.tries + 1, now_s
-        if query.is_answered:
-            query.due_s = now_s + self._repeat_s(query)
-        else:
-            query.due_s = now_s + RETRY_S * min(2 ** (query.tries // TRIES_MAX), 8)
+        query.sent_s = now_s
+        self._requests.sent(name, now_s, _QUERIES if self._requests.is_open(name) else self._renewals(query))
         return self.watch_s if query.is_watch else self._use_watch_s if query.used_until_s > now_s else 0.0
 
-    def _repeat_s(self, query: _Query) -> float:
-        """Count a renewal; return the seconds until it is repeated, unless its response comes."""
-        renewal_s = self._renewal_s(query)
-        again_s = RETRY_S * 2.0**query.renewals
-        query.renewals += 1
-        if query.renewals < _RENEWAL_TRIES_MAX and again_s < renewal_s:
-            return again_s
-        query.renewals = 0
-        return renewal_s
+    def _renewals(self, query: _Query) -> Backoff:
+        """Return the pauses of a watch: those of its repetitions, up to the time after which it is renewed."""
+        return self._watch_renewals if query.is_watch else self._use_renewals
 
-    def _renewal_s(self, query: _Query) -> float:
-        return self._watch_again_s if query.is_watch else self._use_again_s
+    @staticmethod
+    def _is_needed(query: _Query, now_s: float) -> bool:
+        return query.is_watch or query.used_until_s > now_s
+
+    def _add(self, name: Name, query: _Query, at_s: float) -> _Query:
+        self._queries[name] = query
+        self._requests.start(name, at_s)
+        return query
 
     def _remove(self, name: Name) -> None:
         self._window.cancel(self._queries.pop(name).owner, name)
         self._window.answered(name)
+        self._requests.cancel(name)

@@ -9,28 +9,22 @@ growing delays: a connection that can never exist costs little.
 from __future__ import annotations
 
 from collections.abc import Hashable, Set
-from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
+
+from gdp.requests import Backoff, Requests
 
 __all__ = ["MissingConnections"]
 
-_FIRST_S: Final = 1.5  # rospy drops a failed connection after 1 s
-_LONGEST_S: Final = 60.0
+_REMINDERS: Final = Backoff(1.5, 60.0)  # rospy drops a failed connection after 1 s
 
 _Connection = TypeVar("_Connection", bound=Hashable)
-
-
-@dataclass(slots=True)
-class _Reminder:
-    due_s: float
-    delay_s: float
 
 
 class MissingConnections(Generic[_Connection]):
     """Missing connections, each with the time of its next reminder."""
 
     def __init__(self) -> None:
-        self._reminders: dict[_Connection, _Reminder] = {}
+        self._reminders = Requests[_Connection]()
 
     def due(self, missing: Set[_Connection], now_s: float) -> list[_Connection]:
         """Return the connections to announce again.
@@ -39,12 +33,12 @@ class MissingConnections(Generic[_Connection]):
             missing: all connections that are missing now.
             now_s: monotonic seconds.
         """
-        self._reminders = {each: kept for each, kept in self._reminders.items() if each in missing}
+        for each in self._reminders.keys() - missing:
+            self._reminders.cancel(each)
         for each in missing - self._reminders.keys():
-            self._reminders[each] = _Reminder(now_s + _FIRST_S, _FIRST_S)
-        found = [each for each, reminder in self._reminders.items() if now_s >= reminder.due_s]
+            self._reminders.start(each, now_s)
+            self._reminders.sent(each, now_s, _REMINDERS)  # the master has announced it
+        found = self._reminders.poll_due(now_s)
         for each in found:
-            reminder = self._reminders[each]
-            reminder.delay_s = min(2 * reminder.delay_s, _LONGEST_S)
-            reminder.due_s = now_s + reminder.delay_s
+            self._reminders.sent(each, now_s, _REMINDERS)
         return found

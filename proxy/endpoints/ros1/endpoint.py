@@ -22,6 +22,7 @@ from typing import Final
 import cbor2
 
 from gdp.errors import LocalError, RemoteError
+from gdp.requests import Backoff
 from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
@@ -45,7 +46,7 @@ __all__ = ["Ros1Endpoint"]
 _ANSWER_S: Final = 1.0
 _START_S: Final = 4.0  # a process that has just been started answers later
 _FAREWELL_S: Final = 2.0
-_DELAY_MAX_S: Final = 5.0
+_RESTARTS: Final = Backoff(0.25, 5.0)
 _SOUND_S: Final = 10.0  # a process that ran this long did not fail at its start
 _ROOT: Final = Path(__file__).resolve().parents[3]
 
@@ -257,7 +258,7 @@ class Ros1Endpoint:
                 self._fail(handle, call, self._trouble)
         self._is_graph_old = True
         self._failures = 0 if time.monotonic() - self._started_s > _SOUND_S else self._failures + 1
-        self._start(min(0.25 * 2 ** (self._failures - 1), _DELAY_MAX_S) if self._failures else 0.0)
+        self._start(_RESTARTS.pause_s(self._failures) if self._failures else 0.0)
 
     def _watch_space(self) -> None:
         self._epoll.modify(self._link, select.EPOLLIN | select.EPOLLOUT)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import itertools
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.relay.backoff import Backoff
 from gdp.relay.choice import RelayChoice
 
 
@@ -66,20 +64,3 @@ def test_the_answer_changes_at_most_once_in_the_damping_time(steps: list[tuple[f
     for (started_s, relays), (stopped_s, _) in itertools.pairwise(changes):
         if relays:
             assert stopped_s - started_s >= choice.stable_s - 1e-6
-
-
-def test_waiting_times_double_up_to_the_longest() -> None:
-    backoff = Backoff(first_s=0.1, longest_s=0.4)
-    assert [backoff.failed(0.0) for _ in range(4)] == pytest.approx([0.05, 0.1, 0.2, 0.2])
-
-
-def test_the_jitter_adds_up_to_half_of_the_step() -> None:
-    assert Backoff(first_s=0.1).failed(0.999_999) == pytest.approx(0.1, rel=1e-3)
-
-
-def test_a_success_begins_the_waiting_times_again() -> None:
-    backoff = Backoff(first_s=0.1, longest_s=5.0)
-    for _ in range(5):
-        backoff.failed(0.0)
-    backoff.reset()
-    assert backoff.failed(0.0) == pytest.approx(0.05)

@@ -164,11 +164,11 @@ def test_a_renewal_of_a_watch_is_repeated_until_a_response_comes() -> None:
     polled(queries, 0.0)
     queries.receive_answer(TOPIC, 0.0)
     renewed_s = ADVERTISEMENT_LEASE_S / 4
-    again_s = [renewed_s, renewed_s + RETRY_S, renewed_s + 3 * RETRY_S, renewed_s + 7 * RETRY_S]
-    for due_s in again_s:
+    due_s = renewed_s
+    for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S, 8 * RETRY_S, 16 * RETRY_S, renewed_s, renewed_s):
         assert not polled(queries, due_s - 0.02)
         assert polled(queries, due_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
-    assert not polled(queries, again_s[-1] + renewed_s - 0.02)
-    assert polled(queries, again_s[-1] + renewed_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
-    queries.receive_answer(TOPIC, again_s[-1] + renewed_s)
-    assert not polled(queries, again_s[-1] + 2 * renewed_s - 0.02)
+        due_s += pause_s
+    queries.receive_answer(TOPIC, due_s)
+    assert not polled(queries, due_s + renewed_s - 0.02)
+    assert polled(queries, due_s + renewed_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
