@@ -420,7 +420,7 @@ class Participant:
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
-        self.attachment.hello_protocol.count_arrivals(frames_from)
+        self.attachment.hello_protocol.liveness.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""

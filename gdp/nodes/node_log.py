@@ -88,7 +88,7 @@ class NodeLog:
             log.error(
                 "another node with this identity asked for its place at switch %s and was refused", conflict.short
             )
-        reporter = self._hello_protocol.clash_reporter
+        reporter = self._hello_protocol.conflicts.clash_reporter
         if reporter is not None and reporter != self._known_clash:
             self._known_clash = reporter
             log.error("another node with this identity is alive, says switch %s; the older one stays", reporter.short)

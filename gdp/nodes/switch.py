@@ -328,7 +328,7 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         ports=lambda: port_rows(plane.ports),
         health=node_log.health,
         two_paths=lambda: two_paths,
-        clashes=lambda: switch.hello_protocol.clashes,
+        clashes=lambda: switch.hello_protocol.conflicts.clashes,
     )
     log_decisions(runtime, plane.ports, sources.drops, switch.table)
     return sources

@@ -299,7 +299,7 @@ class Flooding:
             if key in self._answers or len(self._answers) < _INCARNATIONS_MAX:
                 self._answers[key] = self._answers.get(key, 0) + 1
             if self._answers.get(key, 0) > _ANSWERS:
-                self._hello_protocol.record_clash(self._identity.name, now_s, is_proven=True)
+                self._hello_protocol.conflicts.record_clash(self._identity.name, now_s, is_proven=True)
                 self.is_displaced = self.is_displaced or state.incarnation_id < self._incarnation_id
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:

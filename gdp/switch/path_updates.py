@@ -110,4 +110,4 @@ class PathUpdates:
         for name in self._paths.refused_elsewhere():
             self._hello_protocol.tell_conflicts(name, now_s)
             if name == self._me:
-                self._hello_protocol.record_clash(name, now_s)
+                self._hello_protocol.conflicts.record_clash(name, now_s)

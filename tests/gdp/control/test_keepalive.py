@@ -186,7 +186,7 @@ class Frames:
 def test_while_other_frames_come_a_neighbour_may_be_silent_for_three_seconds_more() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, float("inf")))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(QUEUED_S)
     assert pair.is_up("a")
@@ -198,7 +198,7 @@ def test_while_other_frames_come_a_neighbour_may_be_silent_for_three_seconds_mor
 def test_a_neighbour_whose_frames_stop_is_lost_a_detection_time_later() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, cut_s + 1))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, cut_s + 1))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(2)
     assert pair.gone_s["a"] - cut_s == pytest.approx(1 + DETECT_S, abs=0.1)
@@ -207,7 +207,7 @@ def test_a_neighbour_whose_frames_stop_is_lost_a_detection_time_later() -> None:
 def test_frames_of_before_the_silence_give_no_time() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, cut_s))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, cut_s))
     pair.passes = lambda _sender, _frame: False
     pair.run(0.3)
     assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
@@ -219,7 +219,7 @@ def test_where_several_nodes_are_on_a_port_its_frames_give_no_time() -> None:
         for frame in transmit.frames:
             pair.hear("a", frame)
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, float("inf")))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(0.3)
     assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S

@@ -114,7 +114,7 @@ def one_uplink() -> Mesh:
         [(("robot", 0), ("border", 0)), (("robot", 1), ("server", 0))],
     )
     for port in (0, 1):
-        mesh.nodes["robot"].set_uplink(port, 0)
+        mesh.nodes["robot"].liveness.set_uplink(port, 0)
     mesh.run(3.0)
     return mesh
 
@@ -200,7 +200,7 @@ def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay()
         ],
     )
     for port, uplink in ((0, 0), (1, 1), (2, 0), (3, 0)):
-        mesh.nodes["robot"].set_uplink(port, uplink)
+        mesh.nodes["robot"].liveness.set_uplink(port, uplink)
     mesh.run(3.0)
     mesh.fail(("robot", 0))
     mesh.fail(("robot", 2))
@@ -214,11 +214,11 @@ def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay()
 
 def test_a_neighbour_that_polls_is_reported_once(one_uplink: Mesh) -> None:
     border = one_uplink.nodes["border"]
-    border.poll_polled()
+    border.liveness.poll_polled()
     one_uplink.fail(("robot", 1))  # the robot polls its border, too, which may see it elsewhere now
-    one_uplink.run(0.3, until=lambda: bool(border._polled))
-    assert border.poll_polled() == {0}
-    assert border.poll_polled() == frozenset()
+    one_uplink.run(0.3, until=lambda: bool(border.liveness._polled))
+    assert border.liveness.poll_polled() == {0}
+    assert border.liveness.poll_polled() == frozenset()
 
 
 def test_a_slow_link_has_more_time_to_answer() -> None:

@@ -51,7 +51,7 @@ class Robot:
         runtime.add_port.side_effect = itertools.count()
         settings = NodeSettings(incarnation=0, first_sequence=0, random_bytes=Nonces(1))
         switch = SwitchCore(ROBOT, POLICY, Table(), settings)
-        monkeypatch.setattr(switch.hello_protocol, "set_uplink", lambda *_: None)
+        monkeypatch.setattr(switch.hello_protocol.liveness, "set_uplink", lambda *_: None)
         monkeypatch.setattr(
             switch.hello_protocol, "neighbour", lambda _, name: MagicMock() if name in self.up else None
         )
