@@ -424,7 +424,7 @@ class Participant:
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        return self.attachment.hello_protocol.poll_addresses()
+        return self.attachment.hello_protocol.neighbours.poll_addresses()
 
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send; call again until it returns none.

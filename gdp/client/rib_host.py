@@ -104,7 +104,7 @@ class RibHost:
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        return self.attachment.hello_protocol.poll_addresses()
+        return self.attachment.hello_protocol.neighbours.poll_addresses()
 
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""

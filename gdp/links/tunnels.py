@@ -166,7 +166,7 @@ class Tunnels:
     def is_up(self, tunnel: TunnelId) -> bool:
         """Return whether the peer is a neighbour over a tunnel."""
         found = self._tunnels.get(tunnel)
-        return found is not None and self._switch.hello_protocol.neighbour(found.port, tunnel.peer) is not None
+        return found is not None and self._switch.hello_protocol.neighbours.get(found.port, tunnel.peer) is not None
 
     def has_route(self, uplink: int) -> Callable[[Endpoint], bool]:
         """Return the function that says whether an uplink has a route to an endpoint."""
@@ -340,7 +340,7 @@ class Tunnels:
         """Return whether WireGuard may soon know more: a handshake was requested, or a peer has just come up."""
         protocol = self._switch.hello_protocol
         return any(
-            protocol.observed_at(found.port, tunnel.peer) is None
+            protocol.neighbours.observed_at(found.port, tunnel.peer) is None
             if self.is_up(tunnel)
             else now_s < found.dialled_s + _HANDSHAKE_S
             for tunnel, found in self._tunnels.items()

@@ -249,7 +249,7 @@ def _control_handlers(
         more: dict[str, object] = {
             "data_plane": chosen.name,
             "ports": len(chosen.plane.ports),
-            "neighbours": len(list(switch.hello_protocol.all_up())),
+            "neighbours": len(list(switch.hello_protocol.neighbours.all_up())),
             "link_quality": [link_status(row) for row in rows],
         }
         if links is not None:

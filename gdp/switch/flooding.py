@@ -224,7 +224,11 @@ class Flooding:
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
-        up = [each for each in self._hello_protocol.all_up() if not self._is_leaf or each.domain == self._domain]
+        up = [
+            each
+            for each in self._hello_protocol.neighbours.all_up()
+            if not self._is_leaf or each.domain == self._domain
+        ]
         switches = [each for each in up if each.role.is_switch]
         links = tuple(
             sorted(
@@ -311,7 +315,7 @@ class Flooding:
             self._originate(now_s)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
-        for neighbour in self._hello_protocol.all_up():
+        for neighbour in self._hello_protocol.neighbours.all_up():
             is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
             is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
             if neighbour.role.is_switch and is_in_scope and not is_sender:

@@ -103,7 +103,7 @@ class PathUpdates:
     def _find_conflicts(self, now_s: float) -> None:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
-        for neighbour in self._hello_protocol.all_up():
+        for neighbour in self._hello_protocol.neighbours.all_up():
             elsewhere = self._paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
             if elsewhere is not None and elsewhere < neighbour.incarnation_id:
                 self._hello_protocol.schedule_removal(neighbour, now_s)

@@ -31,7 +31,7 @@ def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
     world.network.run(3)
     assert nuc1.hello_protocol.liveness._lateness_s == 0
     assert {world.members[ROBOT].name, world.switches["nuc2"].name} <= {
-        each.name for each in nuc1.hello_protocol.all_up()
+        each.name for each in nuc1.hello_protocol.neighbours.all_up()
     }
     still_flows(flow)
     flow.outlive()

@@ -169,7 +169,7 @@ def test_two_switches_with_one_identity_that_meet_when_a_link_comes_back_leave_t
     world.network.run(3)
     converter = add_converter_switch(world, "nuc2", "nuc5")
     world.network.run(3)
-    assert converter.hello_protocol.all_up()
+    assert converter.hello_protocol.neighbours.all_up()
     older = world.switches["nuc2"]
     world.network.set_link(world.cables[frozenset(("nuc3", "nuc4"))], up=True)
     assert world.network.run(5, lambda: converter.is_displaced)

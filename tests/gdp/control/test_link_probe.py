@@ -185,7 +185,7 @@ def test_an_address_that_a_border_sees_changed_has_the_other_tunnels_probed(one_
     begun_s = one_uplink.now_s
     border.set_observed(0, ROBOT.name, Endpoint("192.0.2.9", 50_000))
     one_uplink.run(0.5)
-    assert robot.observed_addresses()[0, BORDER.name].address == "192.0.2.9"
+    assert robot.neighbours.observed_addresses()[0, BORDER.name].address == "192.0.2.9"
     assert one_uplink.gone["robot", 1] - begun_s < 2 * EARLY_S
 
 

@@ -51,7 +51,7 @@ class Lab:
         self.ends[number], self.keys[number], self.has_session[number] = self._started(number), NO_KEY, False
 
     def is_up(self, number: int) -> bool:
-        return self.ends[number].neighbour(0, ENDS[1 - number].name) is not None
+        return self.ends[number].neighbours.get(0, ENDS[1 - number].name) is not None
 
     @property
     def is_working(self) -> bool:

@@ -53,7 +53,7 @@ class Robot:
         switch = SwitchCore(ROBOT, POLICY, Table(), settings)
         monkeypatch.setattr(switch.hello_protocol.liveness, "set_uplink", lambda *_: None)
         monkeypatch.setattr(
-            switch.hello_protocol, "neighbour", lambda _, name: MagicMock() if name in self.up else None
+            switch.hello_protocol.neighbours, "get", lambda _, name: MagicMock() if name in self.up else None
         )
         self.links = TunnelLinks(
             config=LinksConfig(peers=folder, direct=False),
