@@ -242,7 +242,7 @@ class Attachment:
             return None
         switch = self._switch
         if header.kind == Kind.HELLO:
-            wire = self.hello_protocol.join(arrival, header, now.mono_s)
+            wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
         elif switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
             raise FrameError(DropReason.UNKNOWN_SENDER, "not our switch")
         else:
@@ -370,7 +370,7 @@ class Attachment:
 
     def _choose_switch(self, now_s: float) -> None:
         """Attach to the switch over the cheapest link; a new or restarted one receives every advertisement."""
-        switches = [each for each in self.hello_protocol.all_up() if each.role.is_switch]
+        switches = [each for each in self.hello_protocol.neighbours.all_up() if each.role.is_switch]
         best = min(switches, key=lambda each: (each.cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
         if not is_same:

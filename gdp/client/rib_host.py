@@ -100,11 +100,11 @@ class RibHost:
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
-        self.attachment.hello_protocol.count_arrivals(frames_from)
+        self.attachment.hello_protocol.liveness.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        return self.attachment.hello_protocol.poll_addresses()
+        return self.attachment.hello_protocol.neighbours.poll_addresses()
 
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""

@@ -17,6 +17,8 @@ from gdp.names import Name
 __all__ = ["IdentityConflicts"]
 
 _REPORT_INTERVAL_S: Final = 3.0
+_CLASH_S: Final = 3.0  # another node must have our identity for this time
+_CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _K = TypeVar("_K")
 _V = TypeVar("_V")
 _CONFLICTS_MAX: Final = 64  # sessions, and identities; the one named first is evicted
@@ -40,6 +42,8 @@ class IdentityConflicts:
     Attributes:
         refusals: hellos that were refused because an older node has their identity.
         changes: how often an identity became refused, or was cleared because the same node was accepted.
+        clashes: how often we received notice of another node with our own identity.
+        clash_reporter: the node that reported it last.
     """
 
     def __init__(self) -> None:
@@ -47,6 +51,9 @@ class IdentityConflicts:
         self._refused: dict[Name, _Refused] = {}
         self.refusals = 0
         self.changes = 0
+        self.clashes = 0
+        self.clash_reporter: Name | None = None
+        self._clash_since_s = self._clash_s = float("-inf")
 
     def record_refusal(self, name: Name, incarnation_id: bytes, now_s: float) -> None:
         """Note that a hello was refused."""
@@ -84,6 +91,19 @@ class IdentityConflicts:
             return []
         self._refused = {name: each for name, each in self._refused.items() if each.until_s > now_s}
         return sorted(self._refused)
+
+    def record_clash(self, reporter: Name, now_s: float, *, is_proven: bool = False) -> None:
+        """Note that another node has our own identity.
+
+        Args:
+            is_proven: it counts at once; else when it lasts, because an earlier incarnation of ours may linger.
+        """
+        if now_s > self._clash_s + _CLASH_PAUSE_S:
+            self._clash_since_s = now_s
+        self._clash_s = now_s
+        if is_proven or now_s >= self._clash_since_s + _CLASH_S:
+            self.clashes += 1
+            self.clash_reporter = reporter
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second at which ``refused`` changes by itself, or None."""

@@ -7,82 +7,61 @@ A hello is signed by a member of a trusted domain and carries its certificate. I
 nonce of our port's present session and its sequence number exceeds all received in its own session. So a recorded hello
 brings no neighbour up: the last sequence number is remembered for ended sessions, too.
 
-``admission.py`` decides which signatures are verified, and how often. A node that has not echoed our nonce is a
-candidate. Candidates have entries of their own, apart from those of neighbours; where none is free, the oldest
-candidate is evicted. Candidates are answered with no more bytes than they have sent.
+``hello_reception.py`` verifies hellos. A node that has not echoed our nonce is a candidate. Candidates have entries of
+their own, apart from those of neighbours; where none is free, the oldest candidate is evicted. Candidates are answered
+with no more bytes than they have sent.
 
 Hellos also state the MTU of each end: a link is as wide as its narrowest end. When an end changes, both know at once.
 
-Between neighbours that are up, keepalives (``keepalive.py``) replace most hellos: a silent cut is detected after the
-negotiated detection time, or earlier if another link shows that only this one fails (``link_probe.py``). Time in which
-this node itself was not scheduled does not count as a neighbour's silence.
+Between neighbours that are up, keepalives (``keepalive.py``) replace most hellos. ``liveness.py`` decides when a
+silent neighbour is lost.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from itertools import islice
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import Final
 
 from gdp.control.admission import (
-    NEIGHBOUR_HELLOS,
     Admission,
-    Cookies,
-    cookie_payload,
     read_cookie,
     seal_cookie,
 )
 from gdp.control.endpoints import Endpoint
-from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import (
     DIGEST_BYTES,
-    HELLO_MAX_BYTES,
     NONCE_BYTES,
     RTCERTS_MAX,
     Hello,
     Timing,
 )
 from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
+from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
-from gdp.control.keepalive import KeepaliveSession, Slowness
-from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
-from gdp.control.preshared_key import NO_KEY, PresharedKeyAgreement
+from gdp.control.keepalive import KeepaliveSession
+from gdp.control.liveness import LivenessMonitor
+from gdp.control.neighbour import Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.neighbour_table import Change, NeighbourTable
+from gdp.control.preshared_key import PresharedKeys
 from gdp.control.settings import NodeSettings
-from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType
+from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import COST_AUTO, HELLO_IDLE, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
-from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
-from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["Change", "HelloProtocol"]
+__all__ = ["HelloProtocol"]
 
-NEIGHBOURS_MAX: Final = 64  # on one port
-CANDIDATES_MAX: Final = 32  # on one port, that have not echoed our nonce; the one silent for longest is evicted
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
-_PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
-_NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})
-_RTCERTS_REMEMBERED: Final = 256
-_HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
 _RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalives come
-_LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
-_CLASH_S: Final = 3.0  # another node must have our identity for this time
-_CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
-_OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
-_UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
-
-# A neighbour after the change, and its state before; the same state if only the link to it changed, MTU or cost.
-Change = tuple[Neighbour, NeighbourState]
 
 
 class HelloProtocol:
@@ -95,9 +74,11 @@ class HelloProtocol:
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
-        conflicts: nodes that share an identity with another one, at our ports.
-        clashes: how often we received notice of another node with our own identity.
-        clash_reporter: the neighbour that reported it last.
+        conflicts: nodes that share an identity with another one, at our ports; and notices that another has our own.
+        liveness: which neighbours are silent.
+        neighbours: those of all ports.
+        preshared_keys: of tunnels to neighbours.
+        reception: of hellos, whose frames it joins.
     """
 
     def __init__(
@@ -117,80 +98,31 @@ class HelloProtocol:
         self._fragmenter = fragmenter
         self._random_bytes = settings.random_bytes
         self._hello_s = settings.hello_s
-        self._dead_s = settings.dead_s
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
-        self._uplinks: dict[int, int] = {}  # of ports whose links share one
-        self._agreements: dict[int, PresharedKeyAgreement] = {}  # by the port of a tunnel
-        self._refused: Counter[DropReason] = Counter()  # messages of an agreement
-        self._failed_s: dict[int, float] = {}  # by uplink: when a link over it failed alone
-        self._is_probing = False  # some neighbour is
-        self._polled: set[int] = set()  # ports at which a neighbour has polled us
         self._incarnation = settings.incarnation
         self._due_s = float("inf")  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
-        self._lateness_s = 0.0  # how long, in all, this node was called later than it had requested
-        self._slowness = Slowness()
         self._digest_for = digest_for
         self._incarnation_id = settings.incarnation_id
         self._incarnation_elsewhere = incarnation_elsewhere
-        self._is_only_way = is_only_way
         self._rtcert_for = rtcert_for
-        self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
-        self._frames_from: Callable[[int], int] = lambda _: 0
         self.conflicts = IdentityConflicts()
-        self._cookies = Cookies(settings.random_bytes)
-        self._replies: list[OutgoingFrames] = []
-        self._reply_at_s = float("inf")
-        self._has_moved = False  # there is a new address
-        self._recosted: list[Neighbour] = []  # not polled yet
-        self._reported_addresses: dict[int, frozenset[bytes]] = {}
-        self._reassembler = ControlReassembler()  # of neighbours' hellos
-        self._strangers_reassembler = ControlReassembler()
-        self.clashes = 0
-        self.clash_reporter: Name | None = None
-        self._clash_since_s = self._clash_s = float("-inf")
-        self.ports: dict[int, HelloPort] = {}
-
-    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
-        """Learn how to count the frames that have come from a port; frames without keepalives show a full queue."""
-        self._frames_from = frames_from
+        self.neighbours = NeighbourTable()
+        self.ports = self.neighbours.ports
+        self.reception = HelloReception(identity, policy, fragmenter, settings, self.ports)
+        self.liveness = LivenessMonitor(self.ports, settings, is_only_way)
+        self.preshared_keys = PresharedKeys(identity.name, settings.random_bytes)
 
     def set_timing(self, index: int, timing: Timing) -> None:
         """Request another keepalive timing on one port, from its next session on."""
         self._timings[index] = timing
         self._next_s = None
 
-    def set_uplink(self, index: int, uplink: int) -> None:
-        """State which uplink carries the links of a port: ports of one uplink have an address in common."""
-        self._uplinks[index] = uplink
-
-    def agree_on_key(self, index: int, peer: Name) -> None:
-        """Agree with a peer on the preshared key of a tunnel, whose port this is, whenever it is up."""
-        self._agreements[index] = PresharedKeyAgreement(self._identity.name, peer, self._random_bytes)
-
-    def preshared_key(self, index: int) -> bytes:
-        """Return the preshared key of a tunnel; ``NO_KEY`` unless its peer is up and has it, too."""
-        agreement = self._agreements.get(index)
-        return NO_KEY if agreement is None else agreement.key
-
     def probe_uplink(self, uplink: int, now_s: float, *, is_restarted: bool = True) -> None:
-        """Poll all neighbours over an uplink whose address has changed; those that others outlive are lost soon.
-
-        Args:
-            is_restarted: polls that were sent before came from the former address.
-        """
-        for index, port in self.ports.items():
-            if self._uplinks.get(index) == uplink:
-                for neighbour in port.neighbours.values():
-                    if neighbour.keepalives is not None and neighbour.keepalives.is_alive:
-                        neighbour.keepalives.begin_probe(now_s, is_restarted=is_restarted)
-                        self._next_s, self._is_probing = None, True
-
-    def poll_polled(self) -> frozenset[int]:
-        """Return, once, the ports at which a neighbour has polled us: it may have another address now."""
-        polled, self._polled = frozenset(self._polled), set()
-        return polled
+        """Poll all neighbours over an uplink whose address has changed, as ``LivenessMonitor.probe_uplink``."""
+        self.liveness.probe_uplink(uplink, now_s, is_restarted=is_restarted)
+        self._next_s = None
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
         """Begin to send hellos on a port, or update the MTU or cost (``COST_AUTO``: measured) of one that is up.
@@ -201,7 +133,7 @@ class HelloProtocol:
         port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
         if port is None or not port.is_up or port.mac != mac:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
-            nonce, key = self._session()
+            nonce, key = _new_session(self._random_bytes)
             self.ports[index] = HelloPort(
                 owner=self._identity.name,
                 index=index,
@@ -225,19 +157,13 @@ class HelloProtocol:
             neighbour.mtu = min(port.said_mtus[neighbour.name], own_mtu)
         return [(each, each.state) for each in port.neighbours.values() if each.state is NeighbourState.UP]
 
-    def neighbour(self, port: int, name: Name) -> Neighbour | None:
-        """Return the neighbour of that name that is up on a port, or None."""
-        on = self.ports.get(port)
-        found = on.neighbours.get(name) if on is not None else None
-        return found if found is not None and found.state is NeighbourState.UP else None
-
     def set_observed(self, index: int, name: Name, endpoint: Endpoint | None) -> None:
         """Report to a neighbour on a tunnel's port the endpoint at which this end sees it; None: it is unknown.
 
         A change is sent at once. A node that is no neighbour there is ignored.
         """
         port = self.ports.get(index)
-        if port is None or self.neighbour(index, name) is None or port.observed.get(name) == endpoint:
+        if port is None or self.neighbours.get(index, name) is None or port.observed.get(name) == endpoint:
             return
         port.observed.pop(name, None)
         if endpoint is not None:
@@ -245,63 +171,10 @@ class HelloProtocol:
         self._next_s = None
         port.hurry(port.said_s + ANSWER_S)
 
-    def observed_at(self, index: int, name: Name) -> Endpoint | None:
-        """Return the endpoint that this end reports to a neighbour on a tunnel's port, or None."""
-        port = self.ports.get(index)
-        return None if port is None else port.observed.get(name)
-
-    def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
-        """Return our own endpoints as neighbours that are up see them, by port and neighbour."""
-        return {(n.port, n.name): n.observed for n in self.all_up() if n.observed is not None}
-
-    def poll_addresses(self) -> Mapping[int, frozenset[bytes]]:
-        """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        if not self._has_moved:
-            return _NOTHING
-        self._has_moved = False
-        changed = {}
-        for index, port in self.ports.items():
-            macs = frozenset(port.addresses)
-            if macs != self._reported_addresses.get(index, frozenset()):
-                changed[index] = self._reported_addresses[index] = macs
-        return changed
-
-    def poll_costs(self) -> list[Change]:
-        """Return, once, the neighbours that are up and to which the measured cost has changed."""
-        if not self._recosted:
-            return []
-        recosted, self._recosted = self._recosted, []
-        return [(each, each.state) for each in recosted if each.state is NeighbourState.UP]
-
-    def all_up(self) -> list[Neighbour]:
-        """Return every neighbour that is up."""
-        return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]
-
     @property
     def drops(self) -> Counter[DropReason]:
         """Return the unfinished hellos and the messages about preshared keys that were given up, by reason."""
-        return self._reassembler.drops + self._strangers_reassembler.drops + self._refused
-
-    @property
-    def held_bytes(self) -> int:
-        """Return how much memory unfinished hellos of strangers hold."""
-        return self._strangers_reassembler.held_bytes
-
-    def join(self, arrival: ReceivedFrame, header: Header, now_s: float) -> bytes | None:
-        """Add a frame of a hello; return the statement when it is complete.
-
-        Raises:
-            FrameError: BAD_PARTS, MEMORY_FULL and the like; RATE_LIMITED, its address has used up its share.
-        """
-        port = self.ports.get(arrival.port)
-        if header.parts > _PARTS_MAX:
-            raise FrameError(DropReason.BAD_PARTS, f"a hello in {header.parts} parts")
-        if port is None or not port.is_up:
-            return None
-        if port.is_neighbour_at(arrival.mac):
-            return self._reassembler.add(header, arrival.frame, now_s, arrival.via)
-        port.admission.check_quota(arrival.mac, now_s)
-        return self._strangers_reassembler.add(header, arrival.frame, now_s, arrival.via)
+        return self.reception.drops + self.preshared_keys.refused
 
     def receive_cookie(self, arrival: ReceivedFrame, header: Header) -> None:
         """Process a cookie of a neighbour that was heard, at its address, in answer to a hello of this session.
@@ -327,14 +200,14 @@ class HelloProtocol:
         port = self.ports.get(arrival.port)
         if port is None or not port.is_up:
             return None
-        hello, member = self._verified(port, arrival, statement, now)
-        proof = self._proof_of_place(hello, member)
+        hello, member, proof = self.reception.verified(port, arrival, statement, now)
+        self._next_s = None
         received_bytes = _received_bytes(arrival, statement)
         self._refuse_conflict(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
         self.conflicts.accept(member.name, hello.incarnation_id)
         is_two_way = port.echo in hello.heard
         known = port.neighbours.get(member.name)
-        self._free_space(port, known, is_two_way=is_two_way)
+        self.neighbours.free_space(port, known, is_two_way=is_two_way)
         if known is None:
             known = port.neighbours[member.name] = Neighbour(
                 name=member.name,
@@ -371,7 +244,7 @@ class HelloProtocol:
         known.mac, known.mtu, known.nonce, known.candidate = arrival.mac, mtu, hello.nonce, b""
         known.is_proven = is_two_way or (known.is_proven and not is_new_session)
         if known.is_proven:
-            self._has_moved = port.note_address(arrival.mac) or self._has_moved
+            self.neighbours.note_address(port, arrival.mac)
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.incarnation_id = member, now.mono_s, hello.incarnation_id
@@ -380,10 +253,10 @@ class HelloProtocol:
         self._note_observed(port, known, hello, now.mono_s)
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
-        self._alive(known, now.mono_s)
+        self.liveness.note_alive(known, now.mono_s)
         if is_two_way and known.keepalives is None:
             self._begin_keepalives(port, known, hello, now.mono_s)
-        change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
+        change = self.neighbours.step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
         self._agree(port, known, hello, now.mono_s)
         if change is None and is_new_session and is_two_way:
             return known, NeighbourState.GONE  # it restarted, and has lost the state that we sent it
@@ -391,95 +264,6 @@ class HelloProtocol:
         if change is None and (is_resized or is_placed) and known.state is NeighbourState.UP:
             return known, known.state
         return change
-
-    def _verified(
-        self, port: HelloPort, arrival: ReceivedFrame, statement: Statement, now: Timestamps
-    ) -> tuple[Hello, Membership]:
-        """Return a verified hello and its membership, cheap checks first.
-
-        Raises:
-            StatementError: the hello is invalid, or no more are verified now.
-        """
-        if len(statement.wire) > HELLO_MAX_BYTES:
-            raise StatementError(DropReason.TOO_BIG, "hello")
-        hello = Hello.from_fields(statement.expect(StatementType.HELLO))
-        if statement.signer == self._identity.name:
-            raise StatementError(DropReason.NOT_FOR_US, "our own hello came back")
-        if hello.sequence <= port.last_of(statement.signer, hello.nonce):
-            port.admission.refused(now.mono_s)
-            raise StatementError(DropReason.REPLAYED, "hello")
-        self._admit(port, arrival, statement.signer, hello, now.mono_s)
-        self._next_s = None
-        try:
-            member = self._policy.verify_membership(hello.membership, now.unix_s)
-        except StatementError as error:
-            port.strangers.record(hello.membership, error.reason, now.mono_s)
-            raise
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
-        statement.verify(member.key)
-        roles = member.role, self._identity.role
-        if Role.LEAF in roles and all(each.is_switch for each in roles) and member.domain != self._identity.root.domain:
-            port.strangers.record(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
-            raise StatementError(DropReason.THROUGH_LEAF, "a leaf joins switches of its own domain only")
-        return hello, member
-
-    def _admit(self, port: HelloPort, arrival: ReceivedFrame, signer: Name, hello: Hello, now_s: float) -> None:
-        """Decide by cheap checks whether a hello's signature is verified.
-
-        Raises:
-            StatementError: RATE_LIMITED; COOKIE_REQUIRED, and a cookie is queued.
-        """
-        known = port.neighbours.get(signer)
-        member = known.member if known is not None else None
-        seen = arrival.mac, hello.membership
-        if known is not None and member is not None and known.is_proven and (known.mac, member.wire) == seen:
-            known.hellos = known.hellos or TokenBucket(*NEIGHBOUR_HELLOS)
-            port.admission.admit_neighbour(known.hellos, now_s)
-            return
-        try:
-            port.admission.admit_stranger(
-                arrival.mac, now_s, lambda: self._cookies.proves(hello, port.nonce, arrival.mac, now_s)
-            )
-        except StatementError as error:
-            if error.reason is DropReason.COOKIE_REQUIRED and port.admission.may_send_cookie(now_s):
-                cookie = self._cookies.make(port.nonce, arrival.mac, now_s)
-                payload = cookie_payload(port.nonce, hello.nonce, cookie)
-                frames = self._fragmenter.split(Kind.COOKIE, payload, MTU_MIN_BYTES)
-                self._replies.append(OutgoingFrames(port.index, arrival.mac, frames))
-                self._next_s, self._reply_at_s = None, min(self._reply_at_s, now_s)
-            raise
-
-    @staticmethod
-    def _free_space(port: HelloPort, known: Neighbour | None, *, is_two_way: bool) -> None:
-        """Ensure that an entry is free: neighbours keep theirs, the oldest candidate is evicted for the next one.
-
-        Raises:
-            StatementError: QUOTA, there are too many neighbours.
-        """
-        if known is not None and (known.is_proven or not is_two_way):
-            return
-        candidates = port.candidates()
-        if is_two_way:
-            if len(port.neighbours) - len(candidates) >= NEIGHBOURS_MAX:
-                raise StatementError(DropReason.QUOTA, "neighbours on one port")
-        elif len(candidates) >= CANDIDATES_MAX:
-            oldest = min(candidates, key=lambda each: each.heard_s)
-            del port.neighbours[oldest.name], port.said_mtus[oldest.name]
-
-    def _proof_of_place(self, hello: Hello, member: Membership) -> tuple[bytes, bytes] | None:
-        """Return what proves to others that a RIB is attached to this switch, or None.
-
-        Raises:
-            StatementError: its hello carries an RtCert that it did not sign.
-        """
-        if member.role is not Role.RIB:
-            return None
-        for wire in hello.rtcerts:
-            rtcert = self._rtcerts.verified(wire, member.name, member.key)
-            if rtcert.switch == self._identity.name:
-                return hello.membership, wire
-        return None
 
     def _refuse_conflict(
         self, port: HelloPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
@@ -498,7 +282,7 @@ class HelloProtocol:
             if (other := each.neighbours.get(name)) is not None
             and other.is_proven
             and other.incarnation_id != hello.incarnation_id
-            and now_s < self._gone_at_s(other)
+            and now_s < self.liveness.gone_at_s(other)
         ]
         mac, received_bytes = arrived
         if any((other.port, other.mac) == (port.index, mac) for other in others):
@@ -553,48 +337,27 @@ class HelloProtocol:
             self._next_s = None
             self.ports[port].hurry(now_s)
 
-    def record_clash(self, reporter: Name, now_s: float, *, is_proven: bool = False) -> None:
-        """Note that another node has our own identity.
-
-        Args:
-            is_proven: it counts at once; else when it lasts, because an earlier incarnation of ours may linger.
-        """
-        if now_s > self._clash_s + _CLASH_PAUSE_S:
-            self._clash_since_s = now_s
-        self._clash_s = now_s
-        if is_proven or now_s >= self._clash_since_s + _CLASH_S:
-            self.clashes += 1
-            self.clash_reporter = reporter
-
     def _note_clash(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         """Note what a neighbour's hello states about our identity."""
         neighbour.refuses_us = port.echo in hello.conflicts and port.echo not in hello.heard
         if port.echo in hello.conflicts:
-            self.record_clash(neighbour.name, now_s)
+            self.conflicts.record_clash(neighbour.name, now_s)
 
     def _note_observed(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         """Note where a neighbour sees this end; another endpoint than before means that a NAT on the way has moved."""
         before = neighbour.observed
         neighbour.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
-        uplink = self._uplinks.get(port.index)
+        uplink = self.liveness.uplink_of(port.index)
         if uplink is not None and None not in (before, neighbour.observed) and before != neighbour.observed:
             self.probe_uplink(uplink, now_s, is_restarted=False)
 
     def _agree(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         """Let the agreement on a tunnel's preshared key go on; it begins again when its peer is not up."""
-        agreement = self._agreements.get(port.index)
-        if agreement is None or agreement.peer != neighbour.name:
-            return
         if neighbour.state is not NeighbourState.UP:
-            agreement.reset()
+            self.preshared_keys.reset(port.index, neighbour.name)
             return
         own, far = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
-        try:
-            has_news = agreement.receive(hello.preshared, own, far)
-        except StatementError as error:
-            self._refused[error.reason] += 1
-            return
-        if has_news:
+        if self.preshared_keys.receive(port.index, neighbour.name, hello.preshared, own, far):
             port.hurry(max(now_s, port.said_s + ANSWER_S))
 
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
@@ -613,13 +376,12 @@ class HelloProtocol:
             known.checked_s = now.mono_s
         known.digest = known.keepalives.open(header, arrival.frame, now.mono_s, arrival.waited_s)
         if known.keepalives.has_new_cost and port is not None and port.cost == COST_AUTO:
-            known.cost = port.cost_to(known.name)
-            self._recosted.append(known)
+            self.neighbours.note_cost(known)
         if known.keepalives.is_final_due:
-            self._polled.add(arrival.port)
-        if known.keepalives.is_final_due or self._is_probing:
+            self.liveness.note_polled(arrival.port)
+        if known.keepalives.is_final_due or self.liveness.is_probing:
             self._next_s = None  # any other change only delays timers
-        self._alive(known, now.mono_s - arrival.waited_s)
+        self.liveness.note_alive(known, now.mono_s - arrival.waited_s)
         return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
@@ -630,7 +392,7 @@ class HelloProtocol:
             return []
         port.is_up = up
         if up:
-            port.nonce, port.exchange_key = self._session()
+            port.nonce, port.exchange_key = _new_session(self._random_bytes)
             port.ended.clear()
             port.joins.clear()
             port.answer_at_s, port.credit_bytes = float("inf"), 0
@@ -641,25 +403,21 @@ class HelloProtocol:
     def remove_port(self, index: int) -> None:
         """Forget a port that is down; does nothing if no port has this index."""
         self._next_s = None
-        self.ports.pop(index, None)
+        self.neighbours.remove_port(index)
         self._timings.pop(index, None)
-        self._uplinks.pop(index, None)
-        self._agreements.pop(index, None)
-        self._reported_addresses.pop(index, None)
+        self.liveness.remove_port(index)
+        self.preshared_keys.remove(index)
 
     def drop_silent(self, now_s: float) -> list[Change]:
         """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
-        if float("-inf") < self._due_s < now_s - _LATE_S:  # a neighbour to remove is due at once: that is no lateness
-            self._lateness_s += now_s - self._due_s
-            self._slowness.late(now_s - self._due_s, now_s)
+        self.liveness.note_call(self._due_s, now_s)
         self._due_s, self._next_s = float("inf"), None
-        self._reassembler.drop_expired(now_s)
-        self._strangers_reassembler.drop_expired(now_s)
+        self.reception.drop_expired(now_s)
         changes: list[Change] = []
         for port in self.ports.values():
-            silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
+            silent = self.liveness.silent(port, now_s)
             if silent:
-                self._note_failed(port, silent, now_s)
+                self.liveness.note_failed(port, silent, now_s)
                 if any(each.is_proven for each in silent):
                     port.hurry(now_s)  # a neighbour that still receives us learns at once that we do not receive it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
@@ -668,8 +426,8 @@ class HelloProtocol:
     def hellos_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return the hellos, keepalives and cookies that are due."""
         self._next_s = None
-        out, self._replies, self._reply_at_s = self._replies, [], float("inf")
-        self._request_polls(now_s)
+        out = self.reception.replies_to_send()
+        self.liveness.request_polls(now_s)
         for port in self.ports.values():
             if not port.is_up:
                 continue
@@ -687,14 +445,13 @@ class HelloProtocol:
                 if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
                     if is_suspect:
                         session.note_poll(now_s)
-                    if session.is_silent(neighbour.heard_s, now_s) and self._is_needed(neighbour):
-                        session.note_arrivals(self._frames_from(port.index), now_s)
+                    self.liveness.note_silence(neighbour, session, now_s)
                     port.keepalive_sequence += 1
                     timing = self._timings.get(port.index, self._timing)
                     frame = session.seal(
                         (self._identity.name, self._incarnation),
                         port.keepalive_sequence,
-                        self._slowness.multiplier(timing, self._dead_s, now_s),
+                        self.liveness.multiplier(timing, now_s),
                         self._digest_for(port),
                         now_s,
                         poll=is_suspect or session.is_poll_due,
@@ -702,100 +459,19 @@ class HelloProtocol:
                     out.append(OutgoingFrames(port.index, neighbour.mac, [frame]))
         return out
 
-    def _is_needed(self, neighbour: Neighbour) -> bool:
-        """Return whether a neighbour is the only one on its port, and no other way leads to it."""
-        if len(self.ports[neighbour.port].neighbours) > 1:  # whose frames come is not known
-            return False
-        others = [each for each in self.all_up() if each.port != neighbour.port]
-        if self._is_only_way is None:
-            return not others
-        return all(each.name != neighbour.name for each in others) and self._is_only_way(neighbour.name)
-
-    def _request_polls(self, now_s: float) -> None:
-        """Poll the links that can show that only the link of a silent neighbour fails."""
-        for port in self.ports.values():
-            for neighbour in port.neighbours.values() if port.is_up else ():
-                session = neighbour.keepalives
-                if session is None or session.suspect_at_s(neighbour.heard_s) > now_s:
-                    continue
-                self._is_probing = True
-                since_s = now_s if session.probe is None else session.probe.since_s
-                for other in islice(self._others(neighbour, of_uplink=True), _OTHERS_MAX):
-                    if other.quality.confirmed_s < since_s:
-                        other.is_poll_due, other.send_at_s = True, now_s
-
-    def _others(self, neighbour: Neighbour, *, of_uplink: bool) -> Iterator[KeepaliveSession]:
-        """Return the sessions on other ports with the same neighbour, then, if asked, with others over its uplink."""
-        uplink = self._uplinks.get(neighbour.port)
-        ports = [each for index, each in self.ports.items() if index != neighbour.port]
-        found = [port.neighbours[neighbour.name] for port in ports if neighbour.name in port.neighbours]
-        if of_uplink and uplink is not None:
-            on_uplink = (port for port in ports if self._uplinks.get(port.index) == uplink)
-            found += (each for port in on_uplink for each in port.neighbours.values() if each.name != neighbour.name)
-        return (each.keepalives for each in found if each.keepalives is not None and each.keepalives.is_alive)
-
     def get_timer(self) -> float | None:
         """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
         if self._next_s is None:
             self._next_s = self._find_next()
-        self._due_s = self._next_s
+        self._due_s = min(self._next_s, self.reception.reply_at_s)
         return None if self._due_s == float("inf") else self._due_s
 
     def _find_next(self) -> float:
-        due_s, self._is_probing = self._reply_at_s, False
+        due_s = self.liveness.find_next()
         for port in self.ports.values():
             if port.is_up:
                 due_s = min(due_s, port.hello_at_s, port.answer_at_s)
-            for neighbour in port.neighbours.values():
-                session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
-                self._is_probing = self._is_probing or (session is not None and session.probe is not None)
-                if session is not None and port.is_up:
-                    at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
-                due_s = min(due_s, at_s)
         return due_s
-
-    def _gone_at_s(self, neighbour: Neighbour) -> float:
-        """Return when a neighbour is lost if it stays silent; the node's own lateness does not count as silence."""
-        if neighbour.let_go_s is not None:
-            return neighbour.let_go_s
-        late_s = self._lateness_s - neighbour.lateness_s
-        session = neighbour.keepalives
-        if session is None or not session.is_alive:
-            return neighbour.heard_s + self._dead_s + late_s
-        flooded_until_s = self.ports[neighbour.port].admission.flooded_until_s  # its hellos may be among those refused
-        hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
-        return min(session.silent_at_s(neighbour.heard_s), hellos_end_s, self._failed_at_s(neighbour, session)) + late_s
-
-    def _note_failed(self, port: HelloPort, lost: list[Neighbour], now_s: float) -> None:
-        """Note that an uplink has failed, if it no longer reaches a node that another link reaches."""
-        for neighbour in lost:
-            session = neighbour.keepalives
-            if session is None or session.probe is None or session.probe.is_moved or port.index not in self._uplinks:
-                continue
-            if now_s >= self._failed_at_s(neighbour, session):
-                self._failed_s[self._uplinks[port.index]] = now_s
-                self._next_s = None
-
-    def _failed_at_s(self, neighbour: Neighbour, session: KeepaliveSession) -> float:
-        """Return when a probe ends the neighbour: never unless another link has answered since it began."""
-        probe = session.probe
-        if probe is None:
-            return float("inf")
-        for other in self._others(neighbour, of_uplink=probe.is_moved):
-            probe.note_other(other.quality.confirmed_s)
-        uplink = self._uplinks.get(neighbour.port)
-        if not probe.is_moved and uplink is not None:
-            failed_s = self._failed_s.get(uplink, float("-inf"))
-            if failed_s >= probe.since_s - _UPLINK_FAILS_S:
-                probe.note_other(probe.since_s)
-        return probe.fails_at_s(session.quality)
-
-    def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
-        neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
-
-    def _session(self) -> tuple[bytes, ExchangeKey]:
-        """Return nonce and key of a new session of a port."""
-        return self._random_bytes(NONCE_BYTES), ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
 
     def _begin_keepalives(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         timing = self._timings.get(port.index, self._timing)
@@ -837,7 +513,6 @@ class HelloProtocol:
         port.said_s, port.answer_at_s = now_s, float("inf")
         heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
-        agreement = self._agreements.get(port.index)
         hello = Hello(
             nonce=port.nonce,
             sequence=port.sequence,
@@ -860,7 +535,7 @@ class HelloProtocol:
                 for each in port.neighbours.values()
                 if each.name in port.observed and each.is_proven
             ),
-            preshared=b"" if agreement is None else agreement.message,
+            preshared=self.preshared_keys.message(port.index),
         )
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
@@ -874,19 +549,13 @@ class HelloProtocol:
 
     def _lose(self, port: HelloPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:
-            del port.neighbours[neighbour.name], port.said_mtus[neighbour.name]
-            port.observed.pop(neighbour.name, None)
-            agreement = self._agreements.get(port.index)
-            if agreement is not None and agreement.peer == neighbour.name:
-                agreement.reset()
-            port.end(neighbour)
-        return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
+            self.preshared_keys.reset(port.index, neighbour.name)
+        return self.neighbours.remove(port, lost, event)
 
-    @staticmethod
-    def _step(neighbour: Neighbour, event: NeighbourEvent) -> Change | None:
-        before = neighbour.state
-        neighbour.state = TRANSITIONS[before, event]
-        return None if neighbour.state is before else (neighbour, before)
+
+def _new_session(random_bytes: Callable[[int], bytes]) -> tuple[bytes, ExchangeKey]:
+    """Return nonce and key of a new session of a port."""
+    return random_bytes(NONCE_BYTES), ExchangeKey.from_random(random_bytes(EXCHANGE_KEY_BYTES))
 
 
 def _received_bytes(arrival: ReceivedFrame, statement: Statement) -> int:

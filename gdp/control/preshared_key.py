@@ -16,6 +16,7 @@ so no key that a node keeps opens a recorded one.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -23,9 +24,10 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.kem import KEM_PUBLIC_BYTES, SEALING_BYTES, KemPrivateKey, KemPublicKey
+from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["NO_KEY", "SIZES", "PresharedKeyAgreement"]
+__all__ = ["NO_KEY", "SIZES", "PresharedKeyAgreement", "PresharedKeys"]
 
 _KEY_BYTES: Final = 32
 _TAG_BYTES: Final = 16
@@ -111,3 +113,57 @@ class PresharedKeyAgreement:
     @property
     def _info(self) -> bytes:
         return _INFO + b"".join(self._ends)
+
+
+class PresharedKeys:
+    """Preshared keys of one node's tunnels, by port.
+
+    Attributes:
+        refused: messages of an agreement, by reason.
+    """
+
+    def __init__(self, me: Name, random_bytes: Callable[[int], bytes]) -> None:
+        self._me = me
+        self._random_bytes = random_bytes
+        self._agreements: dict[int, PresharedKeyAgreement] = {}
+        self.refused: Counter[DropReason] = Counter()
+
+    def agree(self, port: int, peer: Name) -> None:
+        """Agree with a peer on the key of a tunnel, whose port this is, whenever it is up."""
+        self._agreements[port] = PresharedKeyAgreement(self._me, peer, self._random_bytes)
+
+    def key(self, port: int) -> bytes:
+        """Return the key of a tunnel; ``NO_KEY`` unless its peer is up and has it, too."""
+        agreement = self._agreements.get(port)
+        return NO_KEY if agreement is None else agreement.key
+
+    def message(self, port: int) -> bytes:
+        """Return what hellos on a port say; empty: nothing."""
+        agreement = self._agreements.get(port)
+        return b"" if agreement is None else agreement.message
+
+    def receive(self, port: int, peer: Name, message: bytes, own: bytes, far: bytes) -> bool:
+        """Process what a hello of a neighbour that is up says; return whether ours says something else now.
+
+        Args:
+            own: session and name of this end.
+            far: those of the other end.
+        """
+        agreement = self._agreements.get(port)
+        if agreement is None or agreement.peer != peer:
+            return False
+        try:
+            return agreement.receive(message, own, far)
+        except StatementError as error:
+            self.refused[error.reason] += 1
+            return False
+
+    def reset(self, port: int, peer: Name) -> None:
+        """Begin an agreement again: its peer is not up any more. Nothing happens where this is not its peer."""
+        agreement = self._agreements.get(port)
+        if agreement is not None and agreement.peer == peer:
+            agreement.reset()
+
+    def remove(self, port: int) -> None:
+        """Forget the key of a port."""
+        self._agreements.pop(port, None)

@@ -114,7 +114,7 @@ class TunnelLinks:
 
     def _row(self, tunnel: TunnelId, found: Tunnel, labels: Mapping[Name, str], now: Timestamps) -> dict[str, object]:
         age_s = round(now.unix_s - found.handshake_unix_s, 1) if found.handshake_unix_s else None
-        neighbour = self._switch.hello_protocol.neighbour(found.port, tunnel.peer)
+        neighbour = self._switch.hello_protocol.neighbours.get(found.port, tunnel.peer)
         member = None if neighbour is None else neighbour.member
         return {
             "peer": tunnel.peer.to_text(),

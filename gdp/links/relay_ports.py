@@ -62,7 +62,7 @@ class RelayPorts:
 
     def status(self) -> list[dict[str, object]]:
         """Return the JSON fields of each port, with the neighbour that is up there."""
-        neighbours = {each.port: each for each in self._switch.hello_protocol.all_up()}
+        neighbours = {each.port: each for each in self._switch.hello_protocol.neighbours.all_up()}
         rows: list[dict[str, object]] = []
         for ifname, port in self._ports.items():
             found = neighbours.get(port)

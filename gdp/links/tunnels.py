@@ -166,7 +166,7 @@ class Tunnels:
     def is_up(self, tunnel: TunnelId) -> bool:
         """Return whether the peer is a neighbour over a tunnel."""
         found = self._tunnels.get(tunnel)
-        return found is not None and self._switch.hello_protocol.neighbour(found.port, tunnel.peer) is not None
+        return found is not None and self._switch.hello_protocol.neighbours.get(found.port, tunnel.peer) is not None
 
     def has_route(self, uplink: int) -> Callable[[Endpoint], bool]:
         """Return the function that says whether an uplink has a route to an endpoint."""
@@ -203,8 +203,8 @@ class Tunnels:
             log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
             self._remove(tunnel.uplink, ifname, key)
             return False
-        self._switch.hello_protocol.set_uplink(port, tunnel.uplink)
-        self._switch.hello_protocol.agree_on_key(port, tunnel.peer)
+        self._switch.hello_protocol.liveness.set_uplink(port, tunnel.uplink)
+        self._switch.hello_protocol.preshared_keys.agree(port, tunnel.peer)
         self._tunnels[tunnel] = Tunnel(
             ifname=ifname,
             inner=inner,
@@ -332,7 +332,7 @@ class Tunnels:
                 self.close(tunnel, time.monotonic())
 
     def _set_preshared(self, device: WireGuardDevice, found: Tunnel) -> None:
-        key = self._switch.hello_protocol.preshared_key(found.port)
+        key = self._switch.hello_protocol.preshared_keys.key(found.port)
         if device.set_preshared_key(found.key, key):
             found.preshared_unix_s = float("inf") if key == NO_KEY else time.time()
 
@@ -340,7 +340,7 @@ class Tunnels:
         """Return whether WireGuard may soon know more: a handshake was requested, or a peer has just come up."""
         protocol = self._switch.hello_protocol
         return any(
-            protocol.observed_at(found.port, tunnel.peer) is None
+            protocol.neighbours.observed_at(found.port, tunnel.peer) is None
             if self.is_up(tunnel)
             else now_s < found.dialled_s + _HANDSHAKE_S
             for tunnel, found in self._tunnels.items()
@@ -349,7 +349,7 @@ class Tunnels:
 
     def _look_at_polled(self) -> None:
         """Look at once where a peer is that has polled this switch: it learns so that its address has changed."""
-        ports = self._switch.hello_protocol.poll_polled()
+        ports = self._switch.hello_protocol.liveness.poll_polled()
         if not ports:
             return
         now_s = time.monotonic()

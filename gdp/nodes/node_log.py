@@ -88,7 +88,7 @@ class NodeLog:
             log.error(
                 "another node with this identity asked for its place at switch %s and was refused", conflict.short
             )
-        reporter = self._hello_protocol.clash_reporter
+        reporter = self._hello_protocol.conflicts.clash_reporter
         if reporter is not None and reporter != self._known_clash:
             self._known_clash = reporter
             log.error("another node with this identity is alive, says switch %s; the older one stays", reporter.short)
@@ -119,7 +119,7 @@ class NodeLog:
         return {reason.value: int(reason in lasting) for reason in WaitReason}
 
     def _look_at_neighbours(self) -> None:
-        now = {(each.port, each.name): each for each in self._hello_protocol.all_up()}
+        now = {(each.port, each.name): each for each in self._hello_protocol.neighbours.all_up()}
         for (port, name), each in now.items():
             if (port, name) not in self._neighbours:
                 ifname, domain = self._ifname(port), self._domain(each.domain)

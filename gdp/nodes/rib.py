@@ -172,5 +172,5 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -
         links=lambda: links.rows,
         ports=lambda: port_rows(plane.ports),
         health=node_log.health,
-        clashes=lambda: rib.identities.clashes + host.attachment.hello_protocol.clashes,
+        clashes=lambda: rib.identities.clashes + host.attachment.hello_protocol.conflicts.clashes,
     )

@@ -249,7 +249,7 @@ def _control_handlers(
         more: dict[str, object] = {
             "data_plane": chosen.name,
             "ports": len(chosen.plane.ports),
-            "neighbours": len(list(switch.hello_protocol.all_up())),
+            "neighbours": len(list(switch.hello_protocol.neighbours.all_up())),
             "link_quality": [link_status(row) for row in rows],
         }
         if links is not None:
@@ -328,7 +328,7 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         ports=lambda: port_rows(plane.ports),
         health=node_log.health,
         two_paths=lambda: two_paths,
-        clashes=lambda: switch.hello_protocol.clashes,
+        clashes=lambda: switch.hello_protocol.conflicts.clashes,
     )
     log_decisions(runtime, plane.ports, sources.drops, switch.table)
     return sources

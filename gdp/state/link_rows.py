@@ -30,7 +30,7 @@ class LinkRows:
     def refresh(self, _now: Timestamps) -> None:
         """Read the measurements of all neighbours that are up."""
         rows = []
-        for neighbour in self._hello_protocol.all_up():
+        for neighbour in self._hello_protocol.neighbours.all_up():
             quality = self._hello_protocol.ports[neighbour.port].quality_of(neighbour.name)
             port = self._ports.get(neighbour.port)
             rows.append(

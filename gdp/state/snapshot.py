@@ -80,7 +80,7 @@ def switch_snapshot(switch: SwitchCore, rows: Sequence[LinkRow], ports: PortCoun
         rows: quality of the links, as last measured.
         ports: bytes that crossed each device since it exists.
     """
-    up = switch.hello_protocol.all_up()
+    up = switch.hello_protocol.neighbours.all_up()
     at = {(each.port, each.mac): short_id(each.name) for each in up}
     quality = {(row.port, row.neighbour): row for row in rows}
     devices = {row.neighbour: row.port for row in rows}

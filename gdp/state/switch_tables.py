@@ -137,7 +137,7 @@ class SwitchTables:
         return rows
 
     def _neighbour_label(self, name: Name) -> str:
-        found = (each for each in self._switch.hello_protocol.all_up() if each.name == name)
+        found = (each for each in self._switch.hello_protocol.neighbours.all_up() if each.name == name)
         return next((each.member.label for each in found if each.member is not None), name.short)
 
     def _at(self, at: Downstream) -> str:

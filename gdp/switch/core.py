@@ -26,7 +26,8 @@ from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import LinkState, Scope
 from gdp.control.neighbour import Neighbour, NeighbourState
-from gdp.control.neighbour_discovery import Change, HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.neighbour_table import Change
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
@@ -224,8 +225,10 @@ class SwitchCore:
             rib="" if self.rib is None else self.rib.to_text(),
             is_rib_silent=self.resolver.cache.serves_stale,
             waits=waits,
-            neighbours=tuple(each.name.to_text() for each in self.hello_protocol.all_up()),
-            proxies=tuple(each.name.to_text() for each in self.hello_protocol.all_up() if each.role is Role.PROXY),
+            neighbours=tuple(each.name.to_text() for each in self.hello_protocol.neighbours.all_up()),
+            proxies=tuple(
+                each.name.to_text() for each in self.hello_protocol.neighbours.all_up() if each.role is Role.PROXY
+            ),
             reaches=reached_switches(self._paths, self._policy, self.name),
             attached=tuple(
                 f"{each.advertisement.node.to_text()} {each.advertisement.right.value}"
@@ -281,7 +284,7 @@ class SwitchCore:
             except Exception as error:  # one frame must not stop the switch
                 self.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
-        if recosted := self.hello_protocol.poll_costs():
+        if recosted := self.hello_protocol.neighbours.poll_costs():
             has_others = True
             for change in recosted:
                 self._neighbour_changed(change, now.mono_s)
@@ -359,11 +362,11 @@ class SwitchCore:
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
-        self.hello_protocol.count_arrivals(frames_from)
+        self.hello_protocol.liveness.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
-        return self.hello_protocol.poll_addresses()
+        return self.hello_protocol.neighbours.poll_addresses()
 
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send: none while an older switch has this identity."""
@@ -446,7 +449,7 @@ class SwitchCore:
 
     def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
         """Return our own endpoints as neighbours over tunnels see them, by port and neighbour."""
-        return self.hello_protocol.observed_addresses()
+        return self.hello_protocol.neighbours.observed_addresses()
 
     def poll_tunnel_actions(self, now: Timestamps) -> list[Action]:
         """Return, once, what to do about direct tunnels; to be called about ten times a second.
@@ -456,7 +459,7 @@ class SwitchCore:
         own = self._endpoints.own
         if own is None:
             return []
-        up = self.hello_protocol.all_up()
+        up = self.hello_protocol.neighbours.all_up()
         linked = {each.name for each in up if each.port not in self._tunnel_ports} | self._tunnel_peers
         wanted = self._tunnels.peers(self._paths.members(), linked)
         due_s = self._endpoints.get_timer()
@@ -486,7 +489,7 @@ class SwitchCore:
                 self.hello_protocol.receive_cookie(arrival, header)
                 return
             if header.kind == Kind.HELLO:
-                wire = self.hello_protocol.join(arrival, header, now.mono_s)
+                wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
             else:
                 self._sender(arrival)  # unknown senders get no state
                 wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
@@ -516,7 +519,7 @@ class SwitchCore:
             change = self.hello_protocol.receive(arrival, statement, now)
             if change is not None:
                 self._neighbour_changed(change, now.mono_s)
-            known = self.hello_protocol.neighbour(arrival.port, statement.signer)
+            known = self.hello_protocol.neighbours.get(arrival.port, statement.signer)
             if known is not None and known.role.is_switch and not self._flooding.is_in_step(known):
                 self._flooding.sync(known, now.mono_s)
             return

@@ -224,7 +224,11 @@ class Flooding:
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
-        up = [each for each in self._hello_protocol.all_up() if not self._is_leaf or each.domain == self._domain]
+        up = [
+            each
+            for each in self._hello_protocol.neighbours.all_up()
+            if not self._is_leaf or each.domain == self._domain
+        ]
         switches = [each for each in up if each.role.is_switch]
         links = tuple(
             sorted(
@@ -299,7 +303,7 @@ class Flooding:
             if key in self._answers or len(self._answers) < _INCARNATIONS_MAX:
                 self._answers[key] = self._answers.get(key, 0) + 1
             if self._answers.get(key, 0) > _ANSWERS:
-                self._hello_protocol.record_clash(self._identity.name, now_s, is_proven=True)
+                self._hello_protocol.conflicts.record_clash(self._identity.name, now_s, is_proven=True)
                 self.is_displaced = self.is_displaced or state.incarnation_id < self._incarnation_id
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
@@ -311,7 +315,7 @@ class Flooding:
             self._originate(now_s)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
-        for neighbour in self._hello_protocol.all_up():
+        for neighbour in self._hello_protocol.neighbours.all_up():
             is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
             is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
             if neighbour.role.is_switch and is_in_scope and not is_sender:

@@ -52,26 +52,28 @@ class Outbox:
     def neighbour(self, name: Name) -> Neighbour | None:
         """Return the neighbour of this name over the cheapest link, or None."""
         found = [
-            n for port in self._hello_protocol.ports if (n := self._hello_protocol.neighbour(port, name)) is not None
+            n
+            for port in self._hello_protocol.ports
+            if (n := self._hello_protocol.neighbours.get(port, name)) is not None
         ]
         return min(found, key=lambda n: (n.cost, n.port), default=None)
 
     def neighbour_over(self, name: Name, key: int) -> Neighbour | None:
         """Return the neighbour of this name over the link with this key (``link_key``), or None."""
         for index, port in self._hello_protocol.ports.items():
-            found = self._hello_protocol.neighbour(index, name)
+            found = self._hello_protocol.neighbours.get(index, name)
             if found is not None and port.link_key(found) == key:
                 return found
         return None
 
     def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
         """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
-        neighbour = self._hello_protocol.neighbour(port, name)
+        neighbour = self._hello_protocol.neighbours.get(port, name)
         return None if neighbour is None else (self._hello_protocol.ports[port].nonce, neighbour.echo)
 
     def loss_between(self, port: int, name: Name) -> float:
         """Return the larger loss of keepalives to and from a neighbour, 0 to 1; 0 also if it is not up."""
-        neighbour = self._hello_protocol.neighbour(port, name)
+        neighbour = self._hello_protocol.neighbours.get(port, name)
         session = None if neighbour is None else neighbour.keepalives
         return 0.0 if session is None else max(session.quality.loss_in, session.quality.loss_out)
 
@@ -90,7 +92,7 @@ class Outbox:
         hop = self.hop(neighbour)
         others = [port for port in self._hello_protocol.ports if port != hop[0]]
         for name in (neighbour.name, alternate or neighbour.name):
-            found = [n for port in others if (n := self._hello_protocol.neighbour(port, name)) is not None]
+            found = [n for port in others if (n := self._hello_protocol.neighbours.get(port, name)) is not None]
             if found:
                 return *hop, *self.hop(min(found, key=lambda n: (n.cost, n.port)))
         return hop

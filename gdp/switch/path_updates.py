@@ -103,11 +103,11 @@ class PathUpdates:
     def _find_conflicts(self, now_s: float) -> None:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
-        for neighbour in self._hello_protocol.all_up():
+        for neighbour in self._hello_protocol.neighbours.all_up():
             elsewhere = self._paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
             if elsewhere is not None and elsewhere < neighbour.incarnation_id:
                 self._hello_protocol.schedule_removal(neighbour, now_s)
         for name in self._paths.refused_elsewhere():
             self._hello_protocol.tell_conflicts(name, now_s)
             if name == self._me:
-                self._hello_protocol.record_clash(name, now_s)
+                self._hello_protocol.conflicts.record_clash(name, now_s)

@@ -75,7 +75,7 @@ class PresenceAnswers:
         held = self._attached.get(node, node)
         if held is None or held.advertisement.incarnation != question.presence.incarnation:
             return False
-        neighbour = self._hello_protocol.neighbour(held.port, node)
+        neighbour = self._hello_protocol.neighbours.get(held.port, node)
         if neighbour is None:
             return False
         return True if neighbour.heard_s > question.asked_s else None

@@ -128,7 +128,7 @@ class RevocationHandler:
     def _spread(
         self, revocation: Revocation, statement: Statement, origin: Neighbour | None, now: Timestamps
     ) -> list[Name]:
-        for other in self._hello_protocol.all_up():
+        for other in self._hello_protocol.neighbours.all_up():
             if origin is None or (other.port, other.name) != (origin.port, origin.name):
                 self._outbox.send_to_neighbour(other, Kind.REVOKE, statement.wire)
         return self._apply(revocation, now)

@@ -231,7 +231,7 @@ class ProxyNode:
             ports=lambda: port_rows(self.plane.ports),
             topics=lambda: list(self.topic_counts()),
             health=self.node_log.health,
-            clashes=lambda: member.attachment.clashes + member.attachment.hello_protocol.clashes,
+            clashes=lambda: member.attachment.clashes + member.attachment.hello_protocol.conflicts.clashes,
         )
 
 

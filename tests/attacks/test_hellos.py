@@ -6,7 +6,7 @@ import hashlib
 
 import pytest
 
-from gdp.control import admission, neighbour_discovery
+from gdp.control import admission, neighbour_table
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import NO_KEEPALIVES, Hello, Timing, echo_of
 from gdp.control.neighbour import NeighbourState
@@ -65,7 +65,7 @@ class Link:
             if header.kind == Kind.KEEPALIVE:
                 end.receive_keepalive(arrival, header, at(self.now_s))
                 return
-            wire = end.join(arrival, header, self.now_s)
+            wire = end.reception.join(arrival, header, self.now_s)
             if wire is not None:
                 end.receive(arrival, parse(wire), at(self.now_s))
         except RemoteError as error:
@@ -95,7 +95,7 @@ class Link:
         return len(frame)
 
     def up(self, end: int = 0) -> set[bytes]:
-        return {bytes(each.name) for each in self.ends[end].all_up()}
+        return {bytes(each.name) for each in self.ends[end].neighbours.all_up()}
 
 
 @pytest.fixture
@@ -225,7 +225,7 @@ def test_a20_who_is_new_waits_no_longer_than_before() -> None:
 
 
 def test_a21_recorded_hellos_displace_no_neighbour_from_the_list_of_heard_nonces() -> None:
-    members = [node(f"n{number}", Role.PROXY) for number in range(neighbour_discovery.NEIGHBOURS_MAX)]
+    members = [node(f"n{number}", Role.PROXY) for number in range(neighbour_table.NEIGHBOURS_MAX)]
     link = Link(new_hello_protocol(A, 1))
     port = link.ends[0].ports[0]
     nonces = {number: b"up" + number.to_bytes(6, "big") for number in range(len(members))}
@@ -256,7 +256,7 @@ def test_a22_a_newcomer_is_accepted_while_recorded_hellos_are_played() -> None:
         link.run(STEP_S)
     assert bytes(other._identity.name) in link.up()
     assert bytes(B.name) in link.up()
-    assert len(link.ends[0].ports[0].candidates()) <= neighbour_discovery.CANDIDATES_MAX
+    assert len(link.ends[0].ports[0].candidates()) <= neighbour_table.CANDIDATES_MAX
 
 
 def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour_go() -> None:

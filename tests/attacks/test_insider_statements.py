@@ -29,9 +29,9 @@ def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
     frame = control(Kind.HELLO, hello.to_wire(insider.name, insider.key), source=insider.name)
     world.network.inject("nuc1", port, frame)
     world.network.run(3)
-    assert nuc1.hello_protocol._lateness_s == 0
+    assert nuc1.hello_protocol.liveness._lateness_s == 0
     assert {world.members[ROBOT].name, world.switches["nuc2"].name} <= {
-        each.name for each in nuc1.hello_protocol.all_up()
+        each.name for each in nuc1.hello_protocol.neighbours.all_up()
     }
     still_flows(flow)
     flow.outlive()

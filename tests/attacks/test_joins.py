@@ -24,7 +24,7 @@ def aside(world: Simulation, flow: Flow) -> tuple[SwitchCore, Tree, Neighbour, I
         each for each in world.switches.values() if any(a.advertisement.node == reader for a in each.attached.all())
     )
     (tree,) = home.multicast.trees.of_topic(flow.topic.name)
-    switches = [each for each in home.hello_protocol.all_up() if each.role is Role.SWITCH]
+    switches = [each for each in home.hello_protocol.neighbours.all_up() if each.role is Role.SWITCH]
     (liar,) = (each for each in switches if each.name != tree.upstream_name)
     (identity,) = (each for each in world.identities.values() if each.name == liar.name)
     return home, tree, liar, identity

@@ -165,7 +165,7 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     world.network.run(2)
     left, leaf = world.switches["left"], world.identities["leaf"]
     (tree,) = left.multicast.trees.of_topic(flow.topic.name)
-    neighbour = left.hello_protocol.neighbour(1, leaf.name)
+    neighbour = left.hello_protocol.neighbours.get(1, leaf.name)
     assert neighbour is not None
     join = Join(
         topic=tree.topic,
@@ -195,7 +195,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     world = detour(far=True)
     flow = flowing(world, source=TALKER, readers=(LISTENER, ROBOT))
     right, leaf = world.switches["right"], world.identities["leaf"]
-    assert right.hello_protocol.neighbour(1, leaf.name) is None
+    assert right.hello_protocol.neighbours.get(1, leaf.name) is None
     assert right.drops()[DropReason.THROUGH_LEAF] > 0
     waits = right.waits((), world.network.now.mono_s)
     assert [wait.refused for wait in waits if wait.reason is WaitReason.STRANGER] == [DropReason.THROUGH_LEAF]

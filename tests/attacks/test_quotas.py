@@ -235,7 +235,9 @@ def test_a65_one_neighbours_branches_leave_capacity_for_the_others(monkeypatch: 
     multicast = world.switches["nuc1"].multicast
     own = world.switches["nuc1"].name
     domain = world.authorities["school"].root.domain
-    greedy, modest = (each for each in world.switches["nuc1"].hello_protocol.all_up() if each.role is Role.SWITCH)
+    greedy, modest = (
+        each for each in world.switches["nuc1"].hello_protocol.neighbours.all_up() if each.role is Role.SWITCH
+    )
     through = frozenset(world.policy("school").transit)
     for number in range(1, LIMIT // 2 + 1):
         topic = Name(number.to_bytes(32, "big"))

@@ -61,7 +61,7 @@ def say(world: Simulation, wire: bytes, label: str, to: str, kind: Kind = Kind.R
 def port_of(world: Simulation, label: str) -> int:
     name = world.members[label].name
     switch = world.switches[label.split("/", maxsplit=1)[0]]
-    return next(each.port for each in switch.hello_protocol.all_up() if each.name == name)
+    return next(each.port for each in switch.hello_protocol.neighbours.all_up() if each.name == name)
 
 
 def with_thief(flow_of: Simulation | None = None) -> tuple[Simulation, Flow]:
@@ -125,7 +125,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     again.restore(world.network.now)
     again.close()
     world.network.run(5)
-    assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
+    assert flow.member.name not in {each.name for each in restarted.hello_protocol.neighbours.all_up()}
     assert restarted.drops()[DropReason.REVOKED] > 0
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
     flow.outlive(negative=True)
@@ -144,7 +144,7 @@ def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_
     world.network.run(2)
     restarted = world.restart_switch("nuc1")
     world.network.run(5)
-    assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
+    assert flow.member.name not in {each.name for each in restarted.hello_protocol.neighbours.all_up()}
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
     flow.outlive(negative=True)
 
@@ -168,7 +168,9 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
 
         monkeypatch.setattr(switch._verifier, what, counted)
     now = world.network.now
-    neighbour = next(each for each in switch.hello_protocol.all_up() if each.name == world.members[THIEF].name)
+    neighbour = next(
+        each for each in switch.hello_protocol.neighbours.all_up() if each.name == world.members[THIEF].name
+    )
     verified = [0]
     monkeypatch.setattr(Revocation, "verify", lambda *_: verified.__setitem__(0, verified[0] + 1))
     junk = [parse(junk_of(MINE, number, until(world))) for number in range(400)]

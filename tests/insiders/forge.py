@@ -686,7 +686,11 @@ class Forge:
         hello_protocol = getattr(machine, "hello_protocol", None) or getattr(
             getattr(machine, "attachment", None), "hello_protocol", None
         )
-        sessions = [each.keepalives for each in hello_protocol.all_up() if each.keepalives] if hello_protocol else []
+        sessions = (
+            [each.keepalives for each in hello_protocol.neighbours.all_up() if each.keepalives]
+            if hello_protocol
+            else []
+        )
         if not sessions:
             return []
         number = rng.choice((*_INTEGERS, next(self._counters)))

@@ -135,9 +135,9 @@ def test_a_flood_of_beginnings_is_bounded_and_given_back() -> None:
     world = flow.world
     frames = (control(Kind.HELLO, bytes(1_000), number=n, parts=3, source=n.to_bytes(32, "big")) for n in range(3_000))
     attack(flow, frames, ("nuc1",))
-    assert 0 < world.switches["nuc1"].hello_protocol.held_bytes <= CONTROL_JOIN_BYTES
+    assert 0 < world.switches["nuc1"].hello_protocol.reception.held_bytes <= CONTROL_JOIN_BYTES
     world.network.run(CONTROL_PATIENCE_S + 1)
-    assert world.switches["nuc1"].hello_protocol.held_bytes == 0
+    assert world.switches["nuc1"].hello_protocol.reception.held_bytes == 0
     flow.outlive()
 
 
@@ -265,13 +265,13 @@ def test_a_statement_altered_anywhere_is_not_believed(kind: Kind) -> None:
     world.network.run(31)
     sample = recorded(tap, kind)[-1]
     state = world.switches["nuc1"]
-    neighbours = [(n.name, n.mac) for n in state.hello_protocol.all_up()]
+    neighbours = [(n.name, n.mac) for n in state.hello_protocol.neighbours.all_up()]
     trees = [(tree.key, sorted(tree.branches)) for tree in state.multicast.trees.all()]
     for at in regions(sample):
         altered = bytearray(sample)
         altered[at] ^= 0x41
         world.network.inject("nuc1", 0, bytes(altered), mac_of(world, "nuc1"))
-    assert [(n.name, n.mac) for n in state.hello_protocol.all_up()] == neighbours
+    assert [(n.name, n.mac) for n in state.hello_protocol.neighbours.all_up()] == neighbours
     assert [(tree.key, sorted(tree.branches)) for tree in state.multicast.trees.all()] == trees
     assert sum(state.drops().values()) > 0
     still_flows(flow)
@@ -303,7 +303,7 @@ def test_a_join_without_evidence_installs_nothing() -> None:
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     secret = Name(b"t" * 32)
-    session, neighbour = nuc1.hello_protocol.ports[0].echo, nuc1.hello_protocol.neighbour(0, nuc2.name)
+    session, neighbour = nuc1.hello_protocol.ports[0].echo, nuc1.hello_protocol.neighbours.get(0, nuc2.name)
     assert neighbour is not None
     domains = frozenset(nuc1._policy.transit)
     join = Join(
@@ -332,7 +332,7 @@ def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     evidence = nuc1.multicast.trees.of_topic(flow.topic.name)[0].evidence
     secret, session = Name(b"t" * 32), nuc1.hello_protocol.ports[0].echo
-    neighbour = nuc1.hello_protocol.neighbour(0, nuc2.name)
+    neighbour = nuc1.hello_protocol.neighbours.get(0, nuc2.name)
     assert neighbour is not None
     domains = frozenset(nuc1._policy.transit)
     join = Join(

@@ -124,8 +124,8 @@ def test_at_one_switch_the_older_of_two_nodes_keeps_its_location_and_both_are_in
     assert not converter.attachment.is_attached
     flow.outlive()
     older = world.members[ROBOT].attachment
-    assert older.hello_protocol.clash_reporter == world.switches["nuc1"].name
-    assert converter.attachment.hello_protocol.clashes > 0
+    assert older.hello_protocol.conflicts.clash_reporter == world.switches["nuc1"].name
+    assert converter.attachment.hello_protocol.conflicts.clashes > 0
     world.network.stop(ROBOT)
     assert world.network.run(DEAD_S + 2, lambda: converter.attachment.is_attached)
 
@@ -136,7 +136,7 @@ def test_the_older_of_two_ribs_serves_and_both_are_informed() -> None:
     older = world.ribs["school"]
     converter = add_converter_rib(world, "school", "nuc1")
     assert world.network.run(3, lambda: waits_in_use(converter, world.network.now.mono_s))
-    assert world.network.run(8, lambda: older.attachment.hello_protocol.clashes > 0)
+    assert world.network.run(8, lambda: older.attachment.hello_protocol.conflicts.clashes > 0)
     flow.outlive()
     assert converter.attachment.switch is None
     assert older.attachment.switch is not None
@@ -155,11 +155,11 @@ def test_the_older_of_two_switches_keeps_its_location_and_both_are_informed(at: 
     assert world.network.run(
         5, lambda: converter.is_displaced or WaitReason.IN_USE in {w.reason for w in converter.waits((), 0.0)}
     )
-    assert world.network.run(5, lambda: older.hello_protocol.clashes > 0)
+    assert world.network.run(5, lambda: older.hello_protocol.conflicts.clashes > 0)
     there.outlive()
     back.outlive()
     assert not older.is_displaced
-    assert converter.hello_protocol.clashes > 0
+    assert converter.hello_protocol.conflicts.clashes > 0
 
 
 def test_two_switches_with_one_identity_that_meet_when_a_link_comes_back_leave_the_older_one() -> None:
@@ -169,12 +169,12 @@ def test_two_switches_with_one_identity_that_meet_when_a_link_comes_back_leave_t
     world.network.run(3)
     converter = add_converter_switch(world, "nuc2", "nuc5")
     world.network.run(3)
-    assert converter.hello_protocol.all_up()
+    assert converter.hello_protocol.neighbours.all_up()
     older = world.switches["nuc2"]
     world.network.set_link(world.cables[frozenset(("nuc3", "nuc4"))], up=True)
     assert world.network.run(5, lambda: converter.is_displaced)
     assert not older.is_displaced
-    assert older.hello_protocol.clashes > 0
+    assert older.hello_protocol.conflicts.clashes > 0
     flowing(world).outlive()
 
 
@@ -184,7 +184,7 @@ def test_a_restarted_switch_conflicts_with_no_node() -> None:
     world.restart_switch("nuc2")
     world.network.run(3)
     flow.outlive()
-    assert world.switches["nuc2"].hello_protocol.clashes == 0
+    assert world.switches["nuc2"].hello_protocol.conflicts.clashes == 0
     assert all(switch.hello_protocol.conflicts.refusals == 0 for switch in world.switches.values())
 
 
@@ -197,7 +197,7 @@ def test_a_switch_whose_death_not_all_neighbours_have_noticed_conflicts_with_no_
     world.restart_switch("nuc2")
     world.network.run(3)
     flow.outlive()
-    assert world.switches["nuc2"].hello_protocol.clashes == 0
+    assert world.switches["nuc2"].hello_protocol.conflicts.clashes == 0
 
 
 def test_the_older_of_two_nodes_keeps_serving_when_the_other_one_is_in_another_domain() -> None:

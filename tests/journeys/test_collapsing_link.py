@@ -78,8 +78,8 @@ class Collapse:
             for each in self.world.members[READER].poll_messages():
                 number = int.from_bytes(each.delivered.message[:4], "big")
                 self.came_s[names[each.topic]][number] = network.now.mono_s - self.begun_s
-            up = [each.name for each in self.world.switches["s1"].hello_protocol.all_up()]
-            far = [each.name for each in self.world.switches["s0"].hello_protocol.all_up()]
+            up = [each.name for each in self.world.switches["s1"].hello_protocol.neighbours.all_up()]
+            far = [each.name for each in self.world.switches["s0"].hello_protocol.neighbours.all_up()]
             assert self.world.switches["s0"].name in up, f"s1 lost s0 at {network.now.mono_s - self.begun_s:.2f} s"
             assert self.world.switches["s1"].name in far, f"s0 lost s1 at {network.now.mono_s - self.begun_s:.2f} s"
 

@@ -195,7 +195,7 @@ def test_a_revoked_switch_loses_its_record_and_its_tunnels_within_a_second(inter
 
 def is_direct(internet: Internet) -> bool:
     """Return whether the switches behind NATs are neighbours."""
-    ends = (internet.switches[at].hello_protocol.all_up() for at in ("home", "cloud"))
+    ends = (internet.switches[at].hello_protocol.neighbours.all_up() for at in ("home", "cloud"))
     return all({each.name for each in up} & {internet.name("home"), internet.name("cloud")} for up in ends)
 
 

@@ -192,7 +192,9 @@ def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
     world = ring(keepalive_ms=None)
     world.network.stop("nuc3")
     world.network.run(DEAD_S + 0.5)
-    assert all(n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].hello_protocol.all_up())
+    assert all(
+        n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].hello_protocol.neighbours.all_up()
+    )
 
 
 def test_best_effort_over_loss_goes_on_without_what_is_lost() -> None:

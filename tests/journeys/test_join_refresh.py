@@ -53,7 +53,7 @@ def two_switches(topics: int = 1) -> tuple[Simulation, list[Flow]]:
 def neighbour(world: Simulation, at: str, label: str) -> tuple[Neighbour, Identity]:
     """Return a switch as another one knows it, and its identity."""
     name = world.switches[label].name
-    (found,) = (each for each in world.switches[at].hello_protocol.all_up() if each.name == name)
+    (found,) = (each for each in world.switches[at].hello_protocol.neighbours.all_up() if each.name == name)
     (identity,) = (each for each in world.identities.values() if each.name == name)
     return found, identity
 

@@ -78,7 +78,7 @@ def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
     world = Simulation(topology=ring5(), trusts=WITHOUT_BACKBONE)
     world.network.run(3)
     border = world.switches["nuc2"]
-    assert {n.name for n in border.hello_protocol.all_up()} == {
+    assert {n.name for n in border.hello_protocol.neighbours.all_up()} == {
         world.identities[label].name for label in ("nuc1", "nuc2/rib")
     }
     assert border.drops()[DropReason.WRONG_DOMAIN] > 0

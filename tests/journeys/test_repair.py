@@ -44,7 +44,7 @@ def sim_link(world: Simulation, one: str, two: str) -> SimLink:
 def neighbours(world: Simulation, switch: str) -> set[str]:
     """Return the neighbours of a switch that are up."""
     label_of = {each.name: label for label, each in world.switches.items()}
-    return {label_of[each.name] for each in world.switches[switch].hello_protocol.all_up()}
+    return {label_of[each.name] for each in world.switches[switch].hello_protocol.neighbours.all_up()}
 
 
 def is_whole(world: Simulation) -> bool:

@@ -156,7 +156,7 @@ def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
     world.network.send_pending("nuc4")
     world.network.run(1.5)  # a hello, and the silence that follows it
     assert world.ribs["backbone"].rib.names == 1
-    assert flow.member.name not in {each.name for each in world.switches["nuc1"].hello_protocol.all_up()}
+    assert flow.member.name not in {each.name for each in world.switches["nuc1"].hello_protocol.neighbours.all_up()}
     flow.outlive(negative=True)
 
 

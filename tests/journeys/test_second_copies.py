@@ -214,7 +214,7 @@ def test_a_second_copy_to_an_unknown_name_is_dropped_and_no_rib_is_asked() -> No
     made = pair()
     world, robot = made.at.world, made.flow.member
     switch = world.switches["s0"]
-    (link,) = [each for each in switch.hello_protocol.all_up() if each.name == robot.name]
+    (link,) = [each for each in switch.hello_protocol.neighbours.all_up() if each.name == robot.name]
     header = Header(Kind.DATA, 0, SECOND_PATH | 64, 0, 0, 1, 0, 1, 1, b"\x55" * 32, robot.name)
     switch.frames_to_send(0.0)
     before = Counter(switch.drops())

@@ -279,7 +279,7 @@ def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
     middle = at.world.switches["s1"]
     sender, robot = (at.world.switches[label].name for label in ("s2", "s0"))
     seen = at.trees(flow.topic.name, 1)["s2"]
-    neighbour = next(each for each in middle.hello_protocol.all_up() if each.name == sender)
+    neighbour = next(each for each in middle.hello_protocol.neighbours.all_up() if each.name == sender)
     route = {"a route that returns": middle.name, "a route through the sender": sender}.get(wrong, robot)
     join = Join(
         topic=flow.topic.name,

@@ -250,7 +250,8 @@ class Tunnelled:
         """Return whether two machines are neighbours."""
         ends = ((one, other), (other, one))
         return all(
-            self.world.identities[far].name in {each.name for each in self.world.switches[near].hello_protocol.all_up()}
+            self.world.identities[far].name
+            in {each.name for each in self.world.switches[near].hello_protocol.neighbours.all_up()}
             for near, far in ends
         )
 

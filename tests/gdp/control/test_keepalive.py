@@ -89,7 +89,7 @@ class Pair:
                             self.hear(other, frame)
 
     def is_up(self, name: str) -> bool:
-        return bool(self.ends[name].all_up())
+        return bool(self.ends[name].neighbours.all_up())
 
     def count(self, kind: Kind) -> int:
         return sum(decode(frame).kind == kind for _, frame in self.frames)
@@ -137,7 +137,7 @@ def test_the_slower_of_what_one_sends_and_the_other_takes_wins(one: Timing, two:
 
 def test_the_senders_multiplier_decides_how_long_silence_may_last() -> None:
     pair = up(Pair(two=Timing(100, 100, 5)))
-    (neighbour,) = pair.ends["a"].all_up()
+    (neighbour,) = pair.ends["a"].neighbours.all_up()
     assert neighbour.keepalives is not None
     assert neighbour.keepalives.detect_s == pytest.approx(0.5)
 
@@ -186,7 +186,7 @@ class Frames:
 def test_while_other_frames_come_a_neighbour_may_be_silent_for_three_seconds_more() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, float("inf")))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(QUEUED_S)
     assert pair.is_up("a")
@@ -198,7 +198,7 @@ def test_while_other_frames_come_a_neighbour_may_be_silent_for_three_seconds_mor
 def test_a_neighbour_whose_frames_stop_is_lost_a_detection_time_later() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, cut_s + 1))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, cut_s + 1))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(2)
     assert pair.gone_s["a"] - cut_s == pytest.approx(1 + DETECT_S, abs=0.1)
@@ -207,7 +207,7 @@ def test_a_neighbour_whose_frames_stop_is_lost_a_detection_time_later() -> None:
 def test_frames_of_before_the_silence_give_no_time() -> None:
     pair = up(Pair())
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, cut_s))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, cut_s))
     pair.passes = lambda _sender, _frame: False
     pair.run(0.3)
     assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
@@ -219,7 +219,7 @@ def test_where_several_nodes_are_on_a_port_its_frames_give_no_time() -> None:
         for frame in transmit.frames:
             pair.hear("a", frame)
     cut_s = pair.now_s
-    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.ends["a"].liveness.count_arrivals(Frames(pair, float("inf")))
     pair.passes = lambda sender, _frame: sender == "a"
     pair.run(0.3)
     assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
@@ -378,12 +378,12 @@ def test_a_neighbour_that_is_up_by_hellos_alone_is_given_their_time() -> None:
     pair.passes = lambda _sender, frame: decode(frame).kind == Kind.HELLO
     pair.run(5.0)
     assert pair.gone_s == {}
-    assert [n.state for n in pair.ends["a"].all_up()] == [NeighbourState.UP]
+    assert [n.state for n in pair.ends["a"].neighbours.all_up()] == [NeighbourState.UP]
 
 
 def quality(pair: Pair, name: str) -> LinkQuality:
     end = pair.ends[name]
-    (neighbour,) = end.all_up()
+    (neighbour,) = end.neighbours.all_up()
     return end.ports[0].quality_of(neighbour.name)
 
 
@@ -441,8 +441,8 @@ def test_a_fixed_cost_is_not_changed_by_what_is_measured() -> None:
     pair = up(Pair())
     pair.run(1.0)
     end = pair.ends["a"]
-    assert [each.cost for each in end.all_up()] == [10]
-    assert end.poll_costs() == []
+    assert [each.cost for each in end.neighbours.all_up()] == [10]
+    assert end.neighbours.poll_costs() == []
 
 
 def test_an_automatic_cost_is_reported_once_and_follows_the_measurement() -> None:
@@ -450,11 +450,11 @@ def test_an_automatic_cost_is_reported_once_and_follows_the_measurement() -> Non
     end = pair.ends["a"]
     end.add_port(0, end.ports[0].mac, 1_500, COST_AUTO, pair.now_s)
     end.ports[0].qualities.clear()
-    for each in end.all_up():
+    for each in end.neighbours.all_up():
         each.keepalives = None
     pair.run(5.0)
-    assert [(each.cost, before) for each, before in end.poll_costs()] == [(10, NeighbourState.UP)]
-    assert end.poll_costs() == []
+    assert [(each.cost, before) for each, before in end.neighbours.poll_costs()] == [(10, NeighbourState.UP)]
+    assert end.neighbours.poll_costs() == []
 
 
 def test_a_link_that_comes_back_keeps_its_cost() -> None:
@@ -468,4 +468,4 @@ def test_a_link_that_comes_back_keeps_its_cost() -> None:
     pair.passes = lambda _sender, _frame: True
     pair.run(0.5)
     assert quality(pair, "a") is measured
-    assert [each.cost for each in end.all_up()] == [measured.cost.advertised]
+    assert [each.cost for each in end.neighbours.all_up()] == [measured.cost.advertised]

@@ -114,7 +114,7 @@ def one_uplink() -> Mesh:
         [(("robot", 0), ("border", 0)), (("robot", 1), ("server", 0))],
     )
     for port in (0, 1):
-        mesh.nodes["robot"].set_uplink(port, 0)
+        mesh.nodes["robot"].liveness.set_uplink(port, 0)
     mesh.run(3.0)
     return mesh
 
@@ -185,7 +185,7 @@ def test_an_address_that_a_border_sees_changed_has_the_other_tunnels_probed(one_
     begun_s = one_uplink.now_s
     border.set_observed(0, ROBOT.name, Endpoint("192.0.2.9", 50_000))
     one_uplink.run(0.5)
-    assert robot.observed_addresses()[0, BORDER.name].address == "192.0.2.9"
+    assert robot.neighbours.observed_addresses()[0, BORDER.name].address == "192.0.2.9"
     assert one_uplink.gone["robot", 1] - begun_s < 2 * EARLY_S
 
 
@@ -200,7 +200,7 @@ def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay()
         ],
     )
     for port, uplink in ((0, 0), (1, 1), (2, 0), (3, 0)):
-        mesh.nodes["robot"].set_uplink(port, uplink)
+        mesh.nodes["robot"].liveness.set_uplink(port, uplink)
     mesh.run(3.0)
     mesh.fail(("robot", 0))
     mesh.fail(("robot", 2))
@@ -214,11 +214,11 @@ def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay()
 
 def test_a_neighbour_that_polls_is_reported_once(one_uplink: Mesh) -> None:
     border = one_uplink.nodes["border"]
-    border.poll_polled()
+    border.liveness.poll_polled()
     one_uplink.fail(("robot", 1))  # the robot polls its border, too, which may see it elsewhere now
-    one_uplink.run(0.3, until=lambda: bool(border._polled))
-    assert border.poll_polled() == {0}
-    assert border.poll_polled() == frozenset()
+    one_uplink.run(0.3, until=lambda: bool(border.liveness._polled))
+    assert border.liveness.poll_polled() == {0}
+    assert border.liveness.poll_polled() == frozenset()
 
 
 def test_a_slow_link_has_more_time_to_answer() -> None:

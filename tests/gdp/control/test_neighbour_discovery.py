@@ -10,7 +10,8 @@ from gdp.control.hello import ECHO_BYTES, Hello
 from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
-from gdp.control.neighbour_discovery import NEIGHBOURS_MAX, PADDED_BYTES, Change, HelloProtocol
+from gdp.control.neighbour_discovery import PADDED_BYTES, HelloProtocol
+from gdp.control.neighbour_table import NEIGHBOURS_MAX, Change
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
@@ -94,8 +95,8 @@ def test_silence_and_a_lost_link_end_every_state(event: NeighbourEvent) -> None:
 
 def test_two_that_hear_each_other_are_neighbours() -> None:
     one, two, _ = pair()
-    assert [n.name for n in one.all_up()] == [B.name]
-    assert [n.name for n in two.all_up()] == [A.name]
+    assert [n.name for n in one.neighbours.all_up()] == [B.name]
+    assert [n.name for n in two.neighbours.all_up()] == [A.name]
 
 
 def test_who_is_heard_but_does_not_hear_is_no_neighbour() -> None:
@@ -103,7 +104,7 @@ def test_who_is_heard_but_does_not_hear_is_no_neighbour() -> None:
     for step in range(4):
         for hello in hellos(two, step * HELLO_S):
             hear(one, hello, step * HELLO_S)
-    assert one.all_up() == []
+    assert one.neighbours.all_up() == []
 
 
 def test_a_hello_played_back_at_once_is_refused() -> None:
@@ -114,25 +115,25 @@ def test_a_hello_played_back_at_once_is_refused() -> None:
 def test_a_recorded_hello_revives_no_neighbour_after_its_silence() -> None:
     one, _, said = pair()
     one.drop_silent(5.0)
-    assert one.all_up() == []
+    assert one.neighbours.all_up() == []
     assert {refusal(one, hello, 5.1) for hello in said} == {DropReason.REPLAYED}
-    assert one.all_up() == []
+    assert one.neighbours.all_up() == []
 
 
 def test_a_recorded_hello_of_an_older_session_neither_raises_nor_fells_nor_moves_anybody() -> None:
     one, _, said = pair()
     again = hello_protocol(B, 3)
     greet(one, again, 2.0)
-    before = [(n.nonce, n.mac) for n in one.all_up()]
+    before = [(n.nonce, n.mac) for n in one.neighbours.all_up()]
     for hello in said:
         assert refusal(one, hello, 3.1) is DropReason.REPLAYED
-    assert [(n.nonce, n.mac) for n in one.all_up()] == before != []
+    assert [(n.nonce, n.mac) for n in one.neighbours.all_up()] == before != []
 
 
 def test_a_recorded_hello_of_a_session_of_long_ago_ends_no_adjacency() -> None:
     one, _, _ = pair()
     assert hear(one, forged(), 1.0) is None
-    assert [n.name for n in one.all_up()] == [B.name]
+    assert [n.name for n in one.neighbours.all_up()] == [B.name]
 
 
 def test_a_neighbour_is_back_after_a_silence_without_a_new_session() -> None:
@@ -140,7 +141,7 @@ def test_a_neighbour_is_back_after_a_silence_without_a_new_session() -> None:
     one.drop_silent(5.0)
     two.drop_silent(5.0)
     greet(one, two, 5.0)
-    assert [n.name for n in one.all_up()] == [B.name]
+    assert [n.name for n in one.neighbours.all_up()] == [B.name]
 
 
 def test_a_restart_in_an_instant_is_noticed() -> None:
@@ -157,7 +158,7 @@ def test_a_restart_in_an_instant_is_noticed() -> None:
 
 def test_a_neighbour_that_falls_silent_is_let_go() -> None:
     one, _, _ = pair()
-    heard_s = one.all_up()[0].heard_s
+    heard_s = one.neighbours.all_up()[0].heard_s
     assert one.drop_silent(heard_s + DEAD_S - 0.01) == []
     assert [(n.name, before) for n, before in one.drop_silent(heard_s + DEAD_S)] == [(B.name, UP)]
 
@@ -174,13 +175,13 @@ def test_after_a_lost_link_no_hello_of_before_counts() -> None:
     one.port_changed(0, True, 1.1)
     for hello in said:
         hear(one, hello, 1.2)
-    assert one.all_up() == []
+    assert one.neighbours.all_up() == []
 
 
 def test_a_member_of_a_trusted_domain_is_heard() -> None:
     one, two = hello_protocol(A, 1), hello_protocol(node("c", domain=CLOUD), 2, Policy(CLOUD.root, [SCHOOL.root]))
     greet(one, two, 0.0)
-    assert [n.domain for n in one.all_up()] == [CLOUD.root.domain]
+    assert [n.domain for n in one.neighbours.all_up()] == [CLOUD.root.domain]
 
 
 def test_a_strangers_domain_is_refused() -> None:
@@ -196,7 +197,7 @@ def test_a_neighbour_whose_certificate_runs_out_falls_silent() -> None:
     one = hello_protocol(A, 1)
     short = node("short", validity=Validity(YEAR.not_before_unix_s, UNIX_S + 10))
     hear(one, forged(short, heard=(one.ports[0].echo,)), 0.0)
-    assert len(one.all_up()) == 1
+    assert len(one.neighbours.all_up()) == 1
     late = forged(short, sequence=2)
     with pytest.raises(StatementError) as caught:
         one.receive(hello_in(late), parse(late), at(0.5, UNIX_S + 4_000))
@@ -237,7 +238,7 @@ def test_a_neighbours_mtu_is_the_smaller_of_both_ends() -> None:
     one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     two.ports[0].own_mtu = 1_000
     greet(one, two, 0.0)
-    assert [n.mtu for n in one.all_up()] == [1_000]
+    assert [n.mtu for n in one.neighbours.all_up()] == [1_000]
 
 
 def resize(one: HelloProtocol, mtu: int, now_s: float, cost: int = 10) -> list[Change]:
@@ -270,7 +271,7 @@ def test_a_link_grows_when_both_ends_have_whichever_is_first(first: int) -> None
     for end in (ends[first], ends[1 - first]):
         resize(end, 9_000, 1.0)
         greet(one, two, 1.0, rounds=1)
-        seen.append([n.mtu for each in ends for n in each.all_up()])
+        seen.append([n.mtu for each in ends for n in each.neighbours.all_up()])
     assert seen == [[1_500, 1_500], [9_000, 9_000]]
 
 
@@ -314,7 +315,7 @@ def test_another_address_removes_the_neighbours_and_starts_again() -> None:
     nonce = one.ports[0].nonce
     changes = one.add_port(0, b"\x02new\x00\x00", 1_500, 10, 2.0)
     assert [(n.name, n.state, before) for n, before in changes] == [(B.name, NeighbourState.GONE, UP)]
-    assert one.all_up() == []
+    assert one.neighbours.all_up() == []
     assert one.ports[0].nonce != nonce
 
 

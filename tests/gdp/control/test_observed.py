@@ -48,8 +48,8 @@ def test_a_neighbour_learns_where_the_other_end_sees_it() -> None:
     one, two = tunnel.ends
     one.set_observed(0, B.name, SEEN)
     tunnel.run(0.2)
-    assert two.observed_addresses() == {(0, A.name): SEEN}
-    assert one.observed_addresses() == {}
+    assert two.neighbours.observed_addresses() == {(0, A.name): SEEN}
+    assert one.neighbours.observed_addresses() == {}
 
 
 def test_a_changed_address_arrives_at_once_and_a_lost_one_is_unlearnt() -> None:
@@ -59,10 +59,10 @@ def test_a_changed_address_arrives_at_once_and_a_lost_one_is_unlearnt() -> None:
     tunnel.run(5)
     one.set_observed(0, B.name, MOVED)
     tunnel.run(0.15)
-    assert two.observed_addresses() == {(0, A.name): MOVED}
+    assert two.neighbours.observed_addresses() == {(0, A.name): MOVED}
     one.set_observed(0, B.name, None)
     tunnel.run(0.15)
-    assert two.observed_addresses() == {}
+    assert two.neighbours.observed_addresses() == {}
 
 
 def test_each_neighbour_of_a_port_learns_its_own_address() -> None:
@@ -71,8 +71,8 @@ def test_each_neighbour_of_a_port_learns_its_own_address() -> None:
     one.set_observed(0, B.name, SEEN)
     one.set_observed(0, C.name, MOVED)
     tunnel.run(0.5)
-    assert two.observed_addresses() == {(0, A.name): SEEN}
-    assert three.observed_addresses() == {(0, A.name): MOVED}
+    assert two.neighbours.observed_addresses() == {(0, A.name): SEEN}
+    assert three.neighbours.observed_addresses() == {(0, A.name): MOVED}
 
 
 def test_nothing_is_observed_of_a_node_that_is_no_neighbour() -> None:
@@ -80,7 +80,7 @@ def test_nothing_is_observed_of_a_node_that_is_no_neighbour() -> None:
     tunnel.ends[0].set_observed(0, C.name, SEEN)
     tunnel.ends[0].set_observed(7, B.name, SEEN)
     tunnel.run(1)
-    assert tunnel.ends[1].observed_addresses() == {}
+    assert tunnel.ends[1].neighbours.observed_addresses() == {}
 
 
 def test_an_address_observed_by_a_lost_neighbour_is_forgotten_at_both_ends() -> None:
@@ -89,9 +89,9 @@ def test_an_address_observed_by_a_lost_neighbour_is_forgotten_at_both_ends() -> 
     one.set_observed(0, B.name, SEEN)
     tunnel.run(1)
     tunnel.run(2 * DEAD_S, silent=one)
-    assert two.observed_addresses() == {}
+    assert two.neighbours.observed_addresses() == {}
     tunnel.run(2)
-    assert one.neighbour(0, B.name) is not None
+    assert one.neighbours.get(0, B.name) is not None
 
 
 def test_an_address_observed_by_a_node_that_is_not_proven_present_is_not_believed() -> None:
@@ -108,7 +108,7 @@ def test_an_address_observed_by_a_node_that_is_not_proven_present_is_not_believe
     wire = hello.to_wire(A.name, A.key)
     two.receive(hello_in(wire), parse(wire), at(0.0))
     assert two.ports[0].neighbours[A.name].state is NeighbourState.HEARD
-    assert two.observed_addresses() == {}
+    assert two.neighbours.observed_addresses() == {}
 
 
 def test_an_address_observed_in_another_session_is_not_believed() -> None:
@@ -126,7 +126,7 @@ def test_an_address_observed_in_another_session_is_not_believed() -> None:
     wire = hello.to_wire(A.name, A.key)
     two.receive(hello_in(wire), parse(wire), at(0.0))
     assert port.neighbours[A.name].state is NeighbourState.UP
-    assert two.observed_addresses() == {}
+    assert two.neighbours.observed_addresses() == {}
 
 
 @pytest.mark.parametrize(

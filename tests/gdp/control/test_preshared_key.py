@@ -43,7 +43,7 @@ class Lab:
         made = hello_protocol(ENDS[number], 10 * self.salt + number)
         made.ports[0].mac = bytes([2, number, 0, 0, 0, 0])
         made.ports[0].hello_at_s = self.now_s
-        made.agree_on_key(0, ENDS[1 - number].name)
+        made.preshared_keys.agree(0, ENDS[1 - number].name)
         return made
 
     def restart(self, number: int) -> None:
@@ -51,7 +51,7 @@ class Lab:
         self.ends[number], self.keys[number], self.has_session[number] = self._started(number), NO_KEY, False
 
     def is_up(self, number: int) -> bool:
-        return self.ends[number].neighbour(0, ENDS[1 - number].name) is not None
+        return self.ends[number].neighbours.get(0, ENDS[1 - number].name) is not None
 
     @property
     def is_working(self) -> bool:
@@ -63,7 +63,7 @@ class Lab:
             self.now_s += STEP_S
             for number, end in enumerate(self.ends):
                 end.drop_silent(self.now_s)
-                self.keys[number] = end.preshared_key(0)
+                self.keys[number] = end.preshared_keys.key(0)
             self._shake_hands()
             for number, end in enumerate(self.ends):
                 other = self.ends[1 - number]
@@ -180,15 +180,15 @@ def test_resets_of_either_end_at_any_point_are_overcome_by_three_exchanges(steps
 
 
 def test_a_key_is_not_made_with_another_node_on_the_port(lab: Lab) -> None:
-    lab.ends[0].agree_on_key(0, node("c").name)
+    lab.ends[0].preshared_keys.agree(0, node("c").name)
     lab.run(1)
-    assert lab.ends[0].preshared_key(0) == NO_KEY
-    assert lab.ends[1].preshared_key(0) == NO_KEY
+    assert lab.ends[0].preshared_keys.key(0) == NO_KEY
+    assert lab.ends[1].preshared_keys.key(0) == NO_KEY
 
 
 def test_a_hello_that_may_be_recorded_begins_no_agreement() -> None:
     second, peer = hello_protocol(ENDS[1], 2), ENDS[0]
-    second.agree_on_key(0, peer.name)
+    second.preshared_keys.agree(0, peer.name)
     hello = Hello(
         nonce=b"n" * NONCE_BYTES,
         sequence=1,

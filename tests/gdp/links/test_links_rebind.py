@@ -51,9 +51,9 @@ class Robot:
         runtime.add_port.side_effect = itertools.count()
         settings = NodeSettings(incarnation=0, first_sequence=0, random_bytes=Nonces(1))
         switch = SwitchCore(ROBOT, POLICY, Table(), settings)
-        monkeypatch.setattr(switch.hello_protocol, "set_uplink", lambda *_: None)
+        monkeypatch.setattr(switch.hello_protocol.liveness, "set_uplink", lambda *_: None)
         monkeypatch.setattr(
-            switch.hello_protocol, "neighbour", lambda _, name: MagicMock() if name in self.up else None
+            switch.hello_protocol.neighbours, "get", lambda _, name: MagicMock() if name in self.up else None
         )
         self.links = TunnelLinks(
             config=LinksConfig(peers=folder, direct=False),

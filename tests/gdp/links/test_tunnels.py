@@ -131,7 +131,7 @@ def test_states_are_read_at_once_when_a_peer_polls(bed: Bed) -> None:
     bed.look(1)
     reads = bed.device.reads
     for _ in range(3):  # a peer polls often while it waits
-        bed.switch.hello_protocol._polled.add(PORT)
+        bed.switch.hello_protocol.liveness.note_polled(PORT)
         bed.loop.follow[0]()
     assert bed.device.reads == reads + 1
 
@@ -146,7 +146,7 @@ def test_wireguard_has_the_key_while_both_ends_have_it_and_a_session_has_it_from
 ) -> None:
     agreed = b"k" * 32
     key = agreed
-    monkeypatch.setattr(bed.switch.hello_protocol, "preshared_key", lambda port: key if port == PORT else NO_KEY)
+    monkeypatch.setattr(bed.switch.hello_protocol.preshared_keys, "key", lambda port: key if port == PORT else NO_KEY)
     bed.look(1)
     assert bed.device.preshared_key == agreed
     assert not bed.tunnel.is_preshared  # the session is older than the key
