@@ -11,14 +11,17 @@ from typing import Annotated, Final
 
 from gdp.crypto.cbor import encode
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.schema import FLAG, MAP, NAME, NAME_OR_ZERO, OCTETS, Body, Keyed, text, uint
+from gdp.crypto.schema import FLAG, MAP, NAME, NAME_OR_ZERO, OCTETS, Body, FieldSet, Keyed, text, uint
 from gdp.crypto.statements import StatementType, assemble, sign
+from gdp.crypto.subject import SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import HOPS_MASK
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
 from gdp.names import ZERO, Name
+from gdp.trust.adcert import CHAIN
+from gdp.trust.right import RIGHT, Right
 
-__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "cut_to_fit"]
+__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "RightEvidence", "cut_to_fit"]
 
 ASK_MAX_CHARS: Final = 16
 _ERROR_MAX_CHARS: Final = 32
@@ -68,6 +71,19 @@ class DiagnosticRequest(Body):
         size = len(assemble(self.TYPE, body, signer, _NO_SIGNATURE))
         body["z"] = bytes(max(max(reply_bytes, least) - size - _PAD_HEAD_BYTES, 0))
         return sign(self.TYPE, body, signer, key)
+
+
+@dataclass(frozen=True, slots=True)
+class RightEvidence(FieldSet):
+    """What shows the asker's right on the name of a request: keys of its body.
+
+    Args:
+        chain: AdCerts from the owner to the asker.
+    """
+
+    subject: Annotated[Subject, SUBJECT]
+    right: Annotated[Right, Keyed("right", RIGHT)]
+    chain: Annotated[tuple[bytes, ...], Keyed("chain", CHAIN)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

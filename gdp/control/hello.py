@@ -9,10 +9,10 @@ import hashlib
 from dataclasses import dataclass, field
 from typing import Annotated, Final, NamedTuple
 
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import ENDPOINT_MAX_BYTES, Endpoint
 from gdp.control.preshared_key import SIZES
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
-from gdp.crypto.schema import OCTETS, Body, Form, Keyed, many, octets, or_empty, packed, row, uint
+from gdp.crypto.schema import OCTETS, Body, Keyed, many, mapped, octets, or_empty, packed, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
@@ -85,12 +85,9 @@ _TIMING: Final = row(Timing, uint(INTERVAL_MAX_MS), uint(INTERVAL_MAX_MS), uint(
 _COOKIE: Final = packed(
     NONCE_BYTES + COOKIE_BYTES, lambda each: (each[:NONCE_BYTES], each[NONCE_BYTES:]), lambda pair: pair[0] + pair[1]
 )
-_OBSERVED: Final = Form(
-    "a nonce and an endpoint",
-    lambda value: (
-        OCTETS.read(value)[:NONCE_BYTES],
-        Endpoint.from_wire(OCTETS.read(value)[NONCE_BYTES:]),
-    ),
+_OBSERVED: Final = mapped(
+    octets(most=NONCE_BYTES + ENDPOINT_MAX_BYTES),
+    lambda each: (each[:NONCE_BYTES], Endpoint.from_wire(each[NONCE_BYTES:])),
     lambda pair: pair[0] + pair[1].to_wire(),
 )
 

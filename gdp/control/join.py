@@ -12,7 +12,7 @@ from typing import Annotated, Final, NamedTuple
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.link_state import LINK_KEY_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.schema import NAME, NAME_OR_ZERO, OCTETS, Body, Form, Keyed, many, number, octets, row, uint
+from gdp.crypto.schema import NAME, NAME_OR_ZERO, OCTETS, Body, Keyed, many, mapped, number, octets, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S, PATHS_MAX
@@ -34,10 +34,7 @@ Route = tuple[RouteLink, ...]  # from a switch towards the publisher's, in order
 
 
 _LINK: Final = row(RouteLink, NAME, uint(LINK_KEY_MAX))
-_NAMES: Final = many(NAME, TRANSIT_MAX)
-_ALLOWED: Final = Form(
-    _NAMES.words, lambda value: frozenset(_NAMES.read(value)), lambda names: _NAMES.write(tuple(sorted(names)))
-)
+_ALLOWED: Final = mapped(many(NAME, TRANSIT_MAX), frozenset, lambda names: tuple(sorted(names)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

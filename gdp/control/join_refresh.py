@@ -12,7 +12,6 @@ from functools import partial
 from typing import Annotated, Final
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
-from gdp.crypto.fields import Fields
 from gdp.crypto.schema import Body, Keyed, joined, octets, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
@@ -46,11 +45,6 @@ class JoinRefresh(Body):
     def statement_type(self) -> StatementType:
         """Return the type of its statement."""
         return StatementType.JOIN_UNKNOWN if self.is_reply else StatementType.JOIN_REFRESH
-
-    @classmethod
-    def from_fields(cls, fields: Fields, *, is_reply: bool = False) -> JoinRefresh:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls.read(fields, is_reply=is_reply)
 
     def check(self) -> None:
         """Return if there are numbers. Raises ``StatementError``: MALFORMED."""

@@ -19,8 +19,8 @@ from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import Fields, Statement, parse
-from gdp.crypto.subject import Subject
-from gdp.crypto.validity import Validity
+from gdp.crypto.subject import NAMED_SUBJECT
+from gdp.crypto.validity import VALIDITY
 from gdp.crypto.x509_profile import read_request
 from gdp.errors import EnvelopeError, FrameError, LocalError, RemoteError, StatementError
 from gdp.frame import codec
@@ -175,13 +175,13 @@ DECODERS: Final = (
     ),
     Decoder(
         "subject",
-        _of_fields(lambda fields: Subject.from_fields(fields, CAMERA.name)),
-        (cbor.encode(CAMERA.to_fields()),),
+        _of_fields(NAMED_SUBJECT.read),
+        (cbor.encode(NAMED_SUBJECT.to_fields(CAMERA)),),
         (StatementError,),
         is_cbor=True,
     ),
     Decoder(
-        "validity", _of_fields(Validity.from_fields), (cbor.encode(DAY.to_fields()),), (StatementError,), is_cbor=True
+        "validity", _of_fields(VALIDITY.read), (cbor.encode(VALIDITY.to_fields(DAY)),), (StatementError,), is_cbor=True
     ),
     Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
     Decoder("card", NodeDescriptor.from_wire, (NodeDescriptor.make(_NODE),), (StatementError,)),

@@ -119,7 +119,7 @@ def test_a_refusal_of_a_later_version_is_a_refusal() -> None:
 def test_a_field_may_be_absent_left_out_or_given() -> None:
     body = Outer(Inner(3))
     assert body.to_fields() == {"i": {"s": 3}, "w": "none"}
-    assert Outer.read(Fields({"i": {"s": 3}, "later": 1}), here=7) == Outer(Inner(3), here=7)
+    assert Outer.from_fields(Fields({"i": {"s": 3}, "later": 1}), here=7) == Outer(Inner(3), here=7)
     assert Outer(Inner(3), extra=b"x").to_fields()["x"] == b"x"
 
 
