@@ -27,9 +27,8 @@ from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, StatementError

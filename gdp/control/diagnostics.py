@@ -15,10 +15,9 @@ from typing import Any, Final
 from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import CERTIFICATE
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.errors import DropReason, FrameError, LocalError, StatementError
 from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
 from gdp.frame.kinds import Kind

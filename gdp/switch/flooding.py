@@ -20,9 +20,8 @@ from gdp.control.link_state import Adjacency, AttachedRib, LinkState, LinkStateV
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement
+from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
 from gdp.names import Name

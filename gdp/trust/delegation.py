@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from types import MappingProxyType
 from typing import Annotated, Final, cast
 
 from gdp.crypto.cbor import Value
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import MAP, NAME, OCTETS, FieldSet, Keyed, inner, many, mapped, text, uint
+from gdp.crypto.schema import MAP, NAME, OCTETS, FieldSet, Keyed, inner, many, mapped, one_of, uint
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CHAIN_MAX
@@ -27,7 +28,10 @@ __all__ = ["DELEGATION_MAX_BYTES", "EPOCHS_MAX", "Delegation"]
 
 DELEGATION_MAX_BYTES: Final = 512 << 10
 EPOCHS_MAX: Final = 256  # in one file
-_FORMAT: Final = "gdp-delegation-1"
+
+
+class _Format(str, Enum):
+    DELEGATION_1 = "gdp-delegation-1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +72,7 @@ class Delegation(FieldSet):
     chain: Annotated[tuple[bytes, ...], Keyed("chain", CHAIN)]
     grants: Annotated[Mapping[int, bytes], Keyed("grants", _GRANTS)]
     metadata: Annotated[Metadata | None, Keyed("metadata", _METADATA, absent=None, is_omitted=True)] = None
-    format: Annotated[str, Keyed("format", text(len(_FORMAT)))] = _FORMAT
+    format: Annotated[_Format, Keyed("format", one_of(_Format))] = _Format.DELEGATION_1
 
     @property
     def name(self) -> Name:
@@ -91,9 +95,7 @@ class Delegation(FieldSet):
         return cls.from_cbor(wire)
 
     def check(self) -> None:
-        """Return if the format is known and the metadata is the name's. Raises ``StatementError``."""
-        if self.format != _FORMAT:
-            raise StatementError(DropReason.MALFORMED, "a delegation of another format")
+        """Return if the metadata is the name's. Raises ``StatementError``: WRONG_NAME."""
         if self.metadata is not None and self.metadata.digest() != self.subject.digest:
             raise StatementError(DropReason.WRONG_NAME, "metadata of another name")
 

@@ -6,6 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from enum import Enum
 from types import MappingProxyType
 from typing import Final
@@ -45,4 +46,4 @@ def _delegable(rights: Collection[Right]) -> frozenset[Right]:
     return frozenset(rights)
 
 
-RIGHTS: Final = mapped(many(RIGHT, len(DELEGABLE)), _delegable, _sorted)
+RIGHTS: Final = replace(mapped(many(RIGHT, len(DELEGABLE)), _delegable, _sorted), edges=([], ["read"]))

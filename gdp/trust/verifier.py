@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import check_sequence
-from gdp.crypto.statements import Statement, parse
+from gdp.crypto.statements import Statement, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S

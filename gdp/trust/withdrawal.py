@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.schema import NAME, Body, Keyed, uint
-from gdp.crypto.statements import Statement, StatementType
+from gdp.crypto.statements import Statement, StatementType, check_sequence
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import Name
 from gdp.trust.right import RIGHT, Right

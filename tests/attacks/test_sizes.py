@@ -29,7 +29,7 @@ PADDINGS = (ADVERTISEMENT_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
 def padded(world: Simulation, wire: bytes, size: int) -> bytes:
     """Return a statement of the robot's with an additional value under a key that no node reads."""
     statement, robot = parse(wire), world.identities[ROBOT]
-    body = {**statement.body, "zz": b""}
+    body = {**statement.fields, "zz": b""}
     wide = sign(statement.type, body, robot.name, robot.key)
     return sign(statement.type, {**body, "zz": bytes(max(size - len(wide) - 2, 0))}, robot.name, robot.key)
 

@@ -484,7 +484,7 @@ class Forge:
             advertisement = self._inner(rng, identity)
             try:
                 statement = parse(advertisement)
-                name, advertiser = Name(statement.fields.bytes_("name", 32)), statement.signer
+                name, advertiser = NAMED_SUBJECT.read(statement.fields).name, statement.signer
             except StatementError:
                 pass
         elif chance < 0.8:
@@ -642,7 +642,7 @@ class Forge:
         return dict(parse(AdCert.make(
             identity.key, identity.name, identity.subject, rng.choice(self._identities()).subject,
             [Right.READ, Right.PUBLISH], self._lasting(),
-        )).body)  # fmt: skip
+        )).fields)  # fmt: skip
 
     def _rtcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {"switch": self._switch_at(rng, None), **VALIDITY.to_fields(self._lasting())}

@@ -81,7 +81,7 @@ def test_new_revocations_are_distinguished_from_known_ones(make: Callable[..., S
     assert take(revoked, statement) is not None
     assert take(revoked, statement) is None
     assert len(revoked) == 1
-    assert revoked.has(fingerprint(1), statement.fields.bytes_("owner"))
+    assert revoked.has(fingerprint(1), Revocation.read(statement).issuer.owner_key)
     assert not revoked.has(fingerprint(1), ROBOT.key.public.compressed)
 
 
@@ -89,7 +89,7 @@ def test_new_revocations_are_distinguished_from_known_ones(make: Callable[..., S
 def test_a_statement_comes_out_as_it_went_in(make: Callable[..., Statement]) -> None:
     revoked, statement = Revocations(ROOTS), make(1)
     take(revoked, statement)
-    assert revoked.wire(statement.fields.bytes_("owner"), fingerprint(1)) == statement.wire
+    assert revoked.wire(Revocation.read(statement).issuer.owner_key, fingerprint(1)) == statement.wire
 
 
 def test_a_statement_of_a_later_form_comes_out_whole() -> None:
