@@ -41,6 +41,7 @@ __all__ = [
     "Spread",
     "inner",
     "joined",
+    "literal",
     "many",
     "mapped",
     "number",
@@ -314,6 +315,19 @@ def one_of(kind: type[_E]) -> Form[_E]:
     """Return the form of a member of an enumeration, which travels as its value."""
     words = "/".join(str(each.value) for each in kind)
     return Form(words, kind, lambda value: value.value, tuple(each.value for each in kind))
+
+
+def literal(*values: _T) -> Form[_T]:
+    """Return the form of one of a few texts or numbers."""
+    words = "/".join(str(each) for each in values)
+
+    def read(value: Value) -> _T:
+        for each in values:
+            if type(value) is type(each) and value == each:
+                return each
+        raise ValueError(words)
+
+    return Form(words, read, edges=cast("tuple[Value, ...]", values))
 
 
 def or_empty(form: Form[_T], none: _N) -> Form[_T | _N]:

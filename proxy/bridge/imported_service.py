@@ -201,10 +201,10 @@ class ImportedService(ServiceFlow):
             exchange = self.parts.known(self.dispatcher.endpoint, self.flow_spec.rule.encoding)
         except LocalError:
             return b""
-        return exchange.to_wire()
+        return exchange.to_cbor()
 
     def _open(self, ours: Exchange) -> None:
-        self._publisher.describe(ours.to_wire())
+        self._publisher.describe(ours.to_cbor())
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
         self._no_answers = tuple(NoAnswer.of(each) for each in ours.services)
         self._virtual_server.open(ours)

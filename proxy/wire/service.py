@@ -1,6 +1,6 @@
 """Service protocol: wire forms of the calls of a service or an action inside sealed messages, and its description.
 
-Sans-I/O. Every ``from_wire`` raises ``RemoteError`` (MALFORMED or BAD_VERSION) for any invalid bytes.
+Sans-I/O. Every reader raises ``RemoteError`` (MALFORMED or BAD_VERSION) for any invalid bytes.
 
 A service has one part, itself. An action has five, in this order: the services ``send_goal``, ``cancel_goal``
 and ``get_result``, and the topics ``feedback`` and ``status``. Wire forms, big-endian::
@@ -16,15 +16,15 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
-from gdp.crypto.cbor import decode, encode
-from gdp.errors import DropReason, RemoteError
+from gdp.crypto.schema import FLAG, FieldSet, Keyed, many
+from gdp.errors import DropReason, RemoteError, StatementError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.service.dispatch import STOP_MAX
-from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
-from proxy.serial.serializer import Encoding
-from proxy.serial.service import Service
+from proxy.serial.channel import CHANNEL, CHANNEL_MAX_BYTES, Channel
+from proxy.serial.serializer import ENCODING, Encoding
+from proxy.serial.service import SERVICE, Service
 
 __all__ = ["Answer", "Exchange", "News", "Outcome", "Request", "Stop", "too_large"]
 
@@ -39,7 +39,6 @@ _NEWS: Final = struct.Struct("!BBQ")
 _STOP: Final = struct.Struct("!BB")
 _CALL: Final = struct.Struct("!Q")
 _HEAD_MAX_BYTES: Final = max(_REQUEST.size, _ANSWER.size, _NEWS.size)
-_ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
 
 class Outcome(IntEnum):
@@ -163,7 +162,7 @@ def _head(form: struct.Struct, wire: bytes) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Exchange:
+class Exchange(FieldSet):
     """Description of a service or an action by one side, with its encoding.
 
     Args:
@@ -172,37 +171,14 @@ class Exchange:
         is_ordered: it keeps state, and executes requests in one order only.
     """
 
-    encoding: Encoding
-    services: tuple[Service, ...]
-    topics: tuple[Channel, ...] = ()
-    is_leaving: bool = False
-    is_ordered: bool = False
+    MAX_BYTES = 2 * PARTS_MAX * CHANNEL_MAX_BYTES
+    encoding: Annotated[Encoding, Keyed("e", ENCODING)]
+    services: Annotated[tuple[Service, ...], Keyed("s", many(SERVICE, PARTS_MAX, is_cut=False))]
+    topics: Annotated[tuple[Channel, ...], Keyed("c", many(CHANNEL, PARTS_MAX, is_cut=False))] = ()
+    is_leaving: Annotated[bool, Keyed("l", FLAG, absent=False, is_omitted=True)] = False
+    is_ordered: Annotated[bool, Keyed("o", FLAG, absent=False, is_omitted=True)] = False
 
-    def to_wire(self) -> bytes:
-        """Return the wire form.
-
-        Raises:
-            LocalError: a part is longer than a peer would accept.
-        """
-        services = [service.to_wire() for service in self.services]
-        said = {"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]}
-        flags = {"l": self.is_leaving, "o": self.is_ordered}
-        return encode(said | {flag: True for flag, is_so in flags.items() if is_so})
-
-    @classmethod
-    def from_wire(cls, wire: bytes) -> Exchange:
-        """Read the wire form."""
-        match decode(wire, 2 * PARTS_MAX * CHANNEL_MAX_BYTES):
-            case {"e": str(encoding), "s": [*services], "c": [*topics], **more} if (
-                encoding in _ENCODINGS and services and len(services) + len(topics) <= PARTS_MAX
-            ):
-                parts = [each for each in [*services, *topics] if isinstance(each, bytes)]
-                if len(parts) == len(services) + len(topics):
-                    return cls(
-                        _ENCODINGS[encoding],
-                        tuple(map(Service.from_wire, parts[: len(services)])),
-                        tuple(map(Channel.from_wire, parts[len(services) :])),
-                        more.get("l") is True,
-                        more.get("o") is True,
-                    )
-        raise RemoteError(DropReason.MALFORMED, "a description of a service")
+    def check(self) -> None:
+        """Return if there is a service, and not too many parts. Raises ``StatementError``: MALFORMED."""
+        if not self.services or len(self.services) + len(self.topics) > PARTS_MAX:
+            raise StatementError(DropReason.MALFORMED, "a description of a service")

@@ -15,7 +15,7 @@ from gdp.crypto import cbor
 from gdp.crypto.schema import Body, FieldSet
 from gdp.crypto.statements import parse
 from gdp.crypto.subject import NAMED_SUBJECT
-from gdp.errors import StatementError
+from gdp.errors import RemoteError
 from gdp.trust.advertisement import Advertisement
 from tests.fuzzing.decoder import Decoder
 from tests.gdp.trust.world import CAMERA
@@ -28,18 +28,19 @@ _NAMES: Final = {  # where it is not the type of the statement
     "gdp.trust.node_descriptor._Card": "card-body",
     "gdp.control.link_state.LinkStateVersion": "link-state-version",
     "gdp.sharing.exchange.Mail": "folder-mail",
+    "proxy.wire.message.TopicDescription": "description",
 }
 
 
-def declared() -> list[type[FieldSet]]:
-    """Return every declared map of the product that is read."""
-    for path in sorted(file for package in ("gdp", "proxy", "fog") for file in (_ROOT / package).rglob("*.py")):
+def declared(package: str) -> list[type[FieldSet]]:
+    """Return every declared map of a package that is read."""
+    for path in sorted((_ROOT / package).rglob("*.py")):
         if "from gdp.crypto.schema import" in path.read_text():
             import_module(".".join(path.relative_to(_ROOT).with_suffix("").parts))
     found = {
         each
         for each in _below(FieldSet)
-        if not each.__module__.startswith("tests.")
+        if each.__module__.startswith(f"{package}.")
         and getattr(sys.modules[each.__module__], each.__name__, None) is each  # not as it was before it had slots
         and each not in (Body, Advertisement)  # which nothing reads
         and not (each.__name__.startswith("_") and each.__subclasses__())
@@ -57,18 +58,25 @@ def seeds_of(kind: type[FieldSet]) -> tuple[bytes, ...]:
     return tuple(cbor.encode(each) for each in (least, most, *lacking))
 
 
-def decoders(statements: Iterable[bytes]) -> Iterator[Decoder]:
-    """Yield the decoder of each declared map; the bodies of the statements are seeds, too."""
+def decoders(package: str, made: Iterable[bytes | FieldSet]) -> Iterator[Decoder]:
+    """Yield the decoder of each declared map of a package.
+
+    Args:
+        made: statements and maps that are seeds, too.
+    """
     real: dict[object, list[bytes]] = {}
-    for statement in map(parse, statements):
-        real.setdefault(statement.type, []).append(cbor.encode(dict(statement.fields)))
-    for kind in declared():
-        seeds = (*real.get(getattr(kind, "TYPE", None), ()), *seeds_of(kind))
-        yield Decoder(_name(kind), partial(_read, kind), seeds, (StatementError,), is_cbor=True)
+    for each in made:
+        if isinstance(each, bytes):
+            real.setdefault(parse(each).type, []).append(cbor.encode(dict(parse(each).fields)))
+        else:
+            real.setdefault(type(each), []).append(each.to_cbor())
+    for kind in declared(package):
+        seeds = (*real.get(kind, ()), *real.get(getattr(kind, "TYPE", None), ()), *seeds_of(kind))
+        yield Decoder(_name(kind), partial(_read, kind), seeds, (RemoteError,), is_cbor=True)
 
 
 def _read(kind: type[FieldSet], data: bytes) -> object:
-    value = cbor.decode(data)
+    value = cbor.decode(data, kind.MAX_BYTES)
     given = [each.name for each in fields(cast("Any", kind)) if each.init and each.default is MISSING]
     return kind.from_fields(value if isinstance(value, Mapping) else {}, **dict.fromkeys(given))
 

@@ -157,7 +157,7 @@ DECODERS: Final = (
     Decoder("control", _control, (_control_seed(),), (FrameError,)),
     Decoder("cbor", cbor.decode, (cbor.encode({"a": [1, b"x", None, 1.5]}),), (StatementError,), is_cbor=True),
     Decoder("statement", parse, _STATEMENTS, (StatementError,)),
-    *decoders(_STATEMENTS),
+    *decoders("gdp", _STATEMENTS),
     Decoder(
         "revocation",
         lambda data: Revocation.from_statement(replace(_REVOCATION, fields=_fields(data))),
