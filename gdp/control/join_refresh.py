@@ -35,6 +35,7 @@ class JoinRefresh(Body):
         sequence: rises with every join, leave and refresh of the sender within its session.
     """
 
+    TYPE = StatementType.JOIN_REFRESH
     numbers: Annotated[tuple[int, ...], Keyed("k", _NUMBERS)]
     session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
     sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))]
@@ -44,7 +45,7 @@ class JoinRefresh(Body):
     @property
     def statement_type(self) -> StatementType:
         """Return the type of its statement."""
-        return StatementType.JOIN_UNKNOWN if self.is_reply else StatementType.JOIN_REFRESH
+        return StatementType.JOIN_UNKNOWN if self.is_reply else self.TYPE
 
     def check(self) -> None:
         """Return if there are numbers. Raises ``StatementError``: MALFORMED."""

@@ -16,7 +16,7 @@ from typing import Annotated, Final, NamedTuple, TypeVar
 
 from gdp.control.hello import INCARNATION_BYTES, NONCE_BYTES
 from gdp.crypto.cbor import Value
-from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Keyed, many, octets, one_of, row, uint
+from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, Body, Keyed, many, octets, one_of, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
 from gdp.names import Name
@@ -90,7 +90,7 @@ class AttachedRib(NamedTuple):
 
 
 _ADJACENCY: Final = row(Adjacency, NAME, NAME, uint(COST_MAX, 1), uint(FRAME_MAX_BYTES, 1), uint(LINK_KEY_MAX))
-_RIB: Final = row(AttachedRib, NAME, NAME, octets(NONCE_BYTES), octets(INCARNATION_BYTES), OCTETS, OCTETS)
+_RIB: Final = row(AttachedRib, NAME, NAME, octets(NONCE_BYTES), octets(INCARNATION_BYTES), CERT, STATEMENT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

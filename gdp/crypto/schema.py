@@ -15,7 +15,7 @@ fuzzers' seeds come from the same declarations.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from typing import Any, ClassVar, Final, Generic, TypeVar, cast, get_type_hints
 
@@ -27,6 +27,7 @@ from gdp.limits import CONTROL_MAX_BYTES
 from gdp.names import NAME_BYTES, ZERO, Name
 
 __all__ = [
+    "CERT",
     "CERTIFICATE",
     "FLAG",
     "MAP",
@@ -34,6 +35,7 @@ __all__ = [
     "NAME_OR_ZERO",
     "OCTETS",
     "REASON",
+    "STATEMENT",
     "Body",
     "FieldSet",
     "Form",
@@ -105,6 +107,11 @@ class Keyed(Generic[_T]):
     def keys(self) -> tuple[Keyed[Any], ...]:
         """Return the keys that the field takes."""
         return (self,)
+
+    @property
+    def is_required(self) -> bool:
+        """Return whether a map without the key is malformed."""
+        return self.absent is _REQUIRED
 
     def read(self, received: Mapping[str, Value]) -> _T:
         """Return the field of a received map. Raises ``StatementError``: MALFORMED."""
@@ -252,7 +259,7 @@ def _marks(kind: type[FieldSet]) -> tuple[tuple[str, Keyed[Any] | Spread[Any]], 
 
 def uint(maximum: int = _U64_MAX, minimum: int = 0) -> Form[int]:
     """Return the form of a whole number within the bounds."""
-    words = "uint" if maximum == _U64_MAX else f"uint, {minimum} to {maximum:,}" if minimum else f"uint ≤{maximum:,}"
+    words = "uint" if maximum == _U64_MAX else f"uint {minimum}–{maximum:,}" if minimum else f"uint ≤{maximum:,}"
 
     def read(value: Value) -> int:
         if type(value) is not int or not minimum <= value <= maximum:
@@ -264,7 +271,7 @@ def uint(maximum: int = _U64_MAX, minimum: int = 0) -> Form[int]:
 
 def number(minimum: float, maximum: float) -> Form[float]:
     """Return the form of a finite number within the bounds; it is sent as a floating one."""
-    words = f"number, {minimum:g} to {maximum:,g}"
+    words = f"number {minimum:g}–{maximum:,g}"
 
     def read(value: Value) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not minimum <= value <= maximum:
@@ -417,7 +424,9 @@ def _exactly(kind: type[_T], words: str, *edges: Value) -> Form[_T]:
 
 FLAG: Final = _exactly(bool, "bool", False, True)
 OCTETS: Final = _exactly(bytes, "bytes", b"", bytes(NAME_BYTES))
-CERTIFICATE: Final = Keyed("c", OCTETS)  # of the signer, which many statements have beside their body
+CERT: Final = replace(OCTETS, words="cert")  # of a membership, DER
+STATEMENT: Final = replace(OCTETS, words="statement")
+CERTIFICATE: Final = Keyed("c", CERT)  # of the signer, which many statements have beside their body
 NAME: Final = Form("name", _name, edges=(b"\1" * NAME_BYTES,))
 NAME_OR_ZERO: Final = mapped(octets(NAME_BYTES), Name, _as_is, "name or zeros")
 REASON: Final[Form[DropReason | None]] = mapped(

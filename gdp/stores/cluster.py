@@ -21,7 +21,7 @@ from typing import Annotated, Final
 
 from gdp.control.query import TRANSIT_MAX
 from gdp.control.rib_replication import Key
-from gdp.crypto.schema import NAME, OCTETS, FieldSet, Keyed, many
+from gdp.crypto.schema import CERT, NAME, STATEMENT, FieldSet, Keyed, many
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError
 from gdp.names import NAME_BYTES, Name
@@ -79,8 +79,8 @@ class _Context(FieldSet):
     domain: Annotated[Name, Keyed("d", NAME)]
     via: Annotated[Name, Keyed("v", NAME)]
     transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
-    membership: Annotated[bytes, Keyed("m", OCTETS)]
-    rtcert: Annotated[bytes, Keyed("r", OCTETS)]
+    membership: Annotated[bytes, Keyed("m", CERT)]
+    rtcert: Annotated[bytes, Keyed("r", STATEMENT)]
 
 
 class ClusterStore:

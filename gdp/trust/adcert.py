@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from gdp.crypto.keys import KEY_BYTES, PublicKey, SigningKey
-from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Keyed, many, octets
+from gdp.crypto.schema import FLAG, NAME, STATEMENT, Body, Keyed, many, octets
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.crypto.validity import VALIDITY, Validity
@@ -30,7 +30,7 @@ from gdp.trust.right import RIGHTS, Right
 
 __all__ = ["CHAIN", "AdCert", "AdCertCache", "Chain"]
 
-CHAIN: Final = many(OCTETS, CHAIN_MAX, is_cut=False)  # AdCerts from the owner on, signed statements
+CHAIN: Final = many(STATEMENT, CHAIN_MAX, is_cut=False)  # AdCerts from the owner on, signed statements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

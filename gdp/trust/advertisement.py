@@ -17,7 +17,7 @@ from typing import Annotated, Final
 from gdp.crypto.certificates import Membership
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Keyed, octets, or_empty, uint
+from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, Body, Keyed, octets, or_empty, uint
 from gdp.crypto.statements import StatementType
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import LocalError
@@ -75,8 +75,8 @@ class UnverifiedAdvertisement(_Advertised):
     """
 
     lease_ms: Annotated[int, Keyed("lease", uint())]
-    rtcert: Annotated[bytes, Keyed("rt", OCTETS)]
-    membership: Annotated[bytes, Keyed("member", OCTETS)] = b""
+    rtcert: Annotated[bytes, Keyed("rt", STATEMENT)]
+    membership: Annotated[bytes, Keyed("member", CERT)] = b""
     chain: Annotated[tuple[bytes, ...], Keyed("chain", CHAIN)] = ()
 
     def signed(self, identity: Identity) -> bytes:

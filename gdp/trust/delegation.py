@@ -14,7 +14,7 @@ from typing import Annotated, Final, cast
 
 from gdp.crypto.cbor import Value
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import MAP, NAME, OCTETS, FieldSet, Keyed, inner, many, mapped, one_of, uint
+from gdp.crypto.schema import MAP, NAME, STATEMENT, FieldSet, Keyed, inner, many, mapped, one_of, uint
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CHAIN_MAX
@@ -37,7 +37,7 @@ class _Format(str, Enum):
 @dataclass(frozen=True, slots=True)
 class _Epoch(FieldSet):
     epoch: Annotated[int, Keyed("epoch", uint(EPOCH_MAX))]
-    grant: Annotated[bytes, Keyed("grant", OCTETS)]
+    grant: Annotated[bytes, Keyed("grant", STATEMENT)]
 
 
 def _metadata(items: Mapping[str, Value]) -> Metadata:

@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from gdp.crypto.certificates import Unverified
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, octets, text, uint
+from gdp.crypto.schema import CERT, NAME, Body, Keyed, octets, text, uint
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
@@ -33,7 +33,7 @@ class Mail(Body):
     """
 
     TYPE = StatementType.MAIL
-    certificate: Annotated[bytes, Keyed("c", OCTETS)] = field(repr=False)
+    certificate: Annotated[bytes, Keyed("c", CERT)] = field(repr=False)
     to: Annotated[Name, Keyed("to", NAME)]
     kind: Annotated[str, Keyed("k", text(MAIL_KIND_MAX_CHARS))]
     body: Annotated[bytes, Keyed("b", octets(most=MAIL_BODY_MAX_BYTES))] = field(repr=False)

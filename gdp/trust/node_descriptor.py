@@ -12,7 +12,7 @@ from typing import Annotated, Protocol
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.identity import Identity
 from gdp.crypto.kem import KEM_PUBLIC, KemPublicKey
-from gdp.crypto.schema import OCTETS, Body, Keyed
+from gdp.crypto.schema import CERT, Body, Keyed
 from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.subject import Subject
 from gdp.names import Name
@@ -35,7 +35,7 @@ class Recipient(Protocol):
 @dataclass(frozen=True, slots=True)
 class _Card(Body):
     TYPE = StatementType.CARD
-    member: Annotated[bytes, Keyed("member", OCTETS)]
+    member: Annotated[bytes, Keyed("member", CERT)]
     kem: Annotated[KemPublicKey, Keyed("kem", KEM_PUBLIC)]
 
 
