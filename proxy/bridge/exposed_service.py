@@ -20,6 +20,7 @@ from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
+from gdp.service.frames import Answer, Request, Stop
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
@@ -49,7 +50,6 @@ from proxy.endpoints.core.endpoint import (
 )
 from proxy.serial.schema import DefinitionError
 from proxy.wire.replication import is_word, sequencer_message, to_wire
-from proxy.wire.service import Answer, Request, Stop
 
 __all__ = ["ExposedService"]
 

@@ -9,10 +9,11 @@ import pytest
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.errors import LocalError
+from gdp.service.frames import Answer, Outcome, Request
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel, Qos
 from proxy.wire.message import RosMessage, TopicDescription
-from proxy.wire.service import Answer, Exchange, News, Outcome, Request
+from proxy.wire.service import Exchange, News
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from gdp.errors import RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.service.dispatch import STOP_MAX
-from proxy.wire.service import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
+from gdp.service.frames import PATIENCE_MAX_MS, Answer, Outcome, Request, Stop
+from proxy.wire.service import Exchange, News, too_large
 from tests.proxy.bridge import known
 
 SWITCH = known.services()[known.SET_BOOL]
