@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import Any, ClassVar, Final, Generic, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar, cast, get_type_hints
 
 from gdp.crypto.cbor import Value, decode, encode
 from gdp.crypto.keys import SigningKey
@@ -58,14 +58,16 @@ __all__ = [
 
 _B = TypeVar("_B", bound="FieldSet")
 _E = TypeVar("_E", bound=Enum)
+_L = TypeVar("_L", str, bytes)
 _N = TypeVar("_N")
 _S = TypeVar("_S", bound="Body")
 _T = TypeVar("_T")
 _V = TypeVar("_V")
+_Marks: TypeAlias = "tuple[tuple[str, Keyed[Any] | Spread[Any], Any, Callable[[Any], Any]], ...]"
 _U64_MAX: Final = (1 << 64) - 1
 _REQUIRED: Final = object()
 _NO_REASON: Final = 255
-_KNOWN: Final[dict[type[FieldSet], tuple[tuple[str, Keyed[Any] | Spread[Any]], ...]]] = {}
+_KNOWN: Final[dict[type[FieldSet], _Marks]] = {}
 
 
 def _as_is(value: object) -> object:
@@ -115,9 +117,9 @@ class Keyed(Generic[_T]):
 
     def read(self, received: Mapping[str, Value]) -> _T:
         """Return the field of a received map. Raises ``StatementError``: MALFORMED."""
-        value = received.get(self.key, cast("Any", _REQUIRED))
-        if value is _REQUIRED and self.absent is not _REQUIRED:
+        if self.absent is not _REQUIRED and self.key not in received:
             return cast("_T", self.absent)
+        value = received.get(self.key)
         try:
             return self.form.read(value)
         except ValueError as error:
@@ -144,7 +146,11 @@ class Spread(Generic[_T]):
 
     def read(self, received: Mapping[str, Value]) -> _T:
         """Return the field of a received map. Raises ``StatementError``: MALFORMED, or as ``make``."""
-        return self.make(*[key.read(received) for key in self.keys])
+        try:  # as ``Keyed.read``, without its cost
+            values = [key.form.read(received[key.key]) for key in self.keys]
+        except (KeyError, ValueError):
+            values = [key.read(received) for key in self.keys]
+        return self.make(*values)
 
     def write(self, value: _T, sent: dict[str, object]) -> None:
         """Add the field to a map that is sent."""
@@ -171,7 +177,7 @@ class FieldSet:
     @classmethod
     def declared(cls) -> tuple[Keyed[Any], ...]:
         """Return the keys of the fields, in order."""
-        return tuple(key for _, mark in _marks(cls) for key in mark.keys)
+        return tuple(key for _, mark, *_ in _marks(cls) for key in mark.keys)
 
     def check(self) -> None:
         """Return if the fields fit together. Raises ``StatementError``."""
@@ -179,7 +185,7 @@ class FieldSet:
     def to_fields(self) -> dict[str, object]:
         """Return the fields as a map."""
         sent: dict[str, object] = {}
-        for attribute, mark in _marks(type(self)):
+        for attribute, mark, *_ in _marks(type(self)):
             mark.write(getattr(self, attribute), sent)
         return sent
 
@@ -190,8 +196,18 @@ class FieldSet:
         Raises:
             StatementError: MALFORMED, or as ``check``.
         """
-        for attribute, mark in _marks(cls):
-            given[attribute] = mark.read(received)
+        return cls._made(received, given)
+
+    @classmethod
+    def _made(cls: type[_B], received: Mapping[str, Value], given: dict[str, object]) -> _B:
+        for attribute, mark, key, read in _KNOWN.get(cls) or _marks(cls):
+            if key in received:  # as ``Keyed.read``, without its cost
+                try:
+                    given[attribute] = read(received[key])
+                except ValueError:
+                    mark.read(received)  # which raises
+            else:
+                given[attribute] = mark.read(received)
         found = cls(**given)
         found.check()
         return found
@@ -239,7 +255,7 @@ class Body(FieldSet):
         received = statement.expect(cls.TYPE)
         if len(statement.wire) > cls.MAX_BYTES:
             raise StatementError(DropReason.TOO_BIG, f"{cls.TYPE.value} of {len(statement.wire)} bytes")
-        return cls.from_fields(received, **cls.given_by(statement))
+        return cls._made(received, cls.given_by(statement))
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes | None = None) -> bytes:
         """Return the signed statement, with the signer's certificate if given. Raises ``LocalError``: too long."""
@@ -247,13 +263,17 @@ class Body(FieldSet):
         return sign(self.statement_type, self.to_fields() | certificate, signer, key)
 
 
-def _marks(kind: type[FieldSet]) -> tuple[tuple[str, Keyed[Any] | Spread[Any]], ...]:
-    """Return the fields of a body that travel; resolved once, when all modules are there."""
+def _marks(kind: type[FieldSet]) -> _Marks:
+    """Return the fields that travel, each with its mark, key and reader; resolved once, when all modules are there."""
     known = _KNOWN.get(kind)
     if known is None:
         hints = get_type_hints(kind, include_extras=True)
         names = [each.name for each in fields(cast("Any", kind)) if hasattr(hints[each.name], "__metadata__")]
-        known = _KNOWN[kind] = tuple((name, mark) for name in names for mark in hints[name].__metadata__)
+        marks = [(name, mark) for name in names for mark in hints[name].__metadata__]
+        known = _KNOWN[kind] = tuple(
+            (name, mark, mark.key, mark.form.read) if isinstance(mark, Keyed) else (name, mark, None, mark.read)
+            for name, mark in marks
+        )
     return known
 
 
@@ -281,11 +301,11 @@ def number(minimum: float, maximum: float) -> Form[float]:
     return Form(words, read, float, edges=(minimum, maximum))
 
 
-def _sized(kind: type[_V], words: str, least: int, most: int) -> Form[_V]:
+def _sized(kind: type[_L], words: str, least: int, most: int) -> Form[_L]:
     """Return the form of text or bytes of a length within the bounds."""
 
-    def read(value: Value) -> _V:
-        if type(value) is not kind or not least <= len(cast("Any", value)) <= most:
+    def read(value: Value) -> _L:
+        if type(value) is not kind or not least <= len(value) <= most:
             raise ValueError(words)
         return value
 
