@@ -36,7 +36,7 @@ from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
-from gdp.trust.advertisement import MS_PER_S, UnverifiedAdvertisement
+from gdp.trust.advertisement import MS, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
@@ -402,7 +402,7 @@ class Attachment:
             rtcert=self._rtcert_for(self._switch.name),
             sequence=self._next_sequence(),
             incarnation=self._incarnation,
-            lease_ms=round(self._lease_s * MS_PER_S),
+            lease_ms=round(self._lease_s * MS),
             is_global=each.is_global,
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,

@@ -446,7 +446,7 @@ FLAG: Final = _exactly(bool, "bool", False, True)
 OCTETS: Final = _exactly(bytes, "bytes", b"", bytes(NAME_BYTES))
 CERT: Final = replace(OCTETS, words="cert")  # of a membership, DER
 STATEMENT: Final = replace(OCTETS, words="statement")
-CERTIFICATE: Final = Keyed("c", CERT)  # of the signer, which many statements have beside their body
+CERTIFICATE: Final = Keyed("c", CERT)  # of the signer, which many statements have in addition to their body
 NAME: Final = Form("name", _name, edges=(b"\1" * NAME_BYTES,))
 NAME_OR_ZERO: Final = mapped(octets(NAME_BYTES), Name, _as_is, "name or zeros")
 REASON: Final[Form[DropReason | None]] = mapped(

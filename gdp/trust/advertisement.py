@@ -27,9 +27,9 @@ from gdp.trust.adcert import CHAIN, Chain
 from gdp.trust.right import RIGHT, Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["MS_PER_S", "Advertisement", "UnverifiedAdvertisement", "paths_value", "session_value"]
+__all__ = ["MS", "Advertisement", "UnverifiedAdvertisement", "paths_value", "session_value"]
 
-MS_PER_S: Final = 1_000
+MS: Final = 1_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ class UnverifiedAdvertisement(_Advertised):
         Raises:
             LocalError: a lease out of the bounds of ``limits``, or more than one statement can carry.
         """
-        if not LEASE_MIN_S * MS_PER_S <= self.lease_ms <= LEASE_MAX_S * MS_PER_S:
+        if not LEASE_MIN_S * MS <= self.lease_ms <= LEASE_MAX_S * MS:
             raise LocalError(f"a lease lasts from {LEASE_MIN_S} to {LEASE_MAX_S} s, not {self.lease_ms} ms")
         wire = replace(self, membership=identity.membership).to_wire(identity.name, identity.key)
         if len(wire) > self.MAX_BYTES:
@@ -97,7 +97,7 @@ class UnverifiedAdvertisement(_Advertised):
     def verified(self, member: Membership, chain: Chain, rtcert: RtCert, wire: bytes) -> Advertisement:
         """Return the advertisement, whose evidence the caller has verified."""
         said = {each.name: getattr(self, each.name) for each in fields(_Advertised)}
-        lease_s = self.lease_ms / MS_PER_S
+        lease_s = self.lease_ms / MS
         return Advertisement(**said, lease_s=lease_s, member=member, chain=chain, rtcert=rtcert, wire=wire)
 
 

@@ -17,7 +17,7 @@ from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
-from gdp.trust.advertisement import MS_PER_S, Advertisement, UnverifiedAdvertisement
+from gdp.trust.advertisement import MS, Advertisement, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right
@@ -72,7 +72,7 @@ class AdvertisementVerifier:
             StatementError: with the reason.
         """
         body = UnverifiedAdvertisement.from_statement(statement)
-        if not LEASE_MIN_S * MS_PER_S <= body.lease_ms <= LEASE_MAX_S * MS_PER_S:
+        if not LEASE_MIN_S * MS <= body.lease_ms <= LEASE_MAX_S * MS:
             raise StatementError(DropReason.LEASE_BOUNDS, f"{body.lease_ms} ms")
         check_sequence(body.sequence, unix_s)
         member = self.policy.verify_sender(statement, unix_s, body.membership)
