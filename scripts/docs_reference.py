@@ -9,6 +9,9 @@ A table stands between two comments. The first one names its source:
     <!-- keys MODULE:MODEL [without KEY... | only KEY...] -->    keys of a section of a configuration file
     <!-- arguments MODULE:CLASS -->                              arguments of a constructor, by its docstring
     <!-- end -->
+
+In ``docs/reference/statements.md`` a list below ``**TYPE, TYPE**`` names keys of bodies. The forms in brackets come
+from the bodies' declarations, the meaning stands in the page.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import inspect
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -25,10 +29,15 @@ from typing import Any, Final, TypeAlias
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
+from gdp.control.rib_replication import Entry
+from gdp.crypto.schema import CERTIFICATE, Body, FieldSet
+
 ROOT: Final = Path(__file__).resolve().parents[1]
 _TABLE: Final = re.compile(
     r"(<!-- (keys|arguments) (\S+)(?: (without|only) ([^>]*?))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
+SECTION: Final = re.compile(r"^\*\*([a-z, -]+)\*\*\n\n((?:- .*\n(?:  .*\n)*)+)", re.MULTILINE)
+_BULLET: Final = re.compile(r"^- ([^(:]*`[^(:]*) \([^)]*\): (.*(?:\n  .*)*)", re.MULTILINE)
 _ARGUMENT: Final = re.compile(r"^    (\w[\w, ]*): (.*?)(?=^    \w[\w, ]*: |\Z)", re.MULTILINE | re.DOTALL)
 
 Schema: TypeAlias = "dict[str, Any]"
@@ -149,10 +158,47 @@ def written(page: str) -> str:
     return _TABLE.sub(table, page)
 
 
+def bodies() -> dict[str, list[type[FieldSet]]]:
+    """Return the declared bodies by the type of their statement, and the entry of a batch."""
+    for path in sorted((ROOT / "gdp").rglob("*.py")):
+        if "gdp.crypto.schema import" in path.read_text():
+            importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    found: dict[str, list[type[FieldSet]]] = {"entry": [Entry]}
+    kinds = Body.__subclasses__()
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+        if kind.__module__.startswith("gdp."):
+            found.setdefault(kind.TYPE.value, []).append(kind)
+    return found | {"join-unknown": found["join-refresh"]}
+
+
+def _with_forms(section: re.Match[str], known: dict[str, list[type[FieldSet]]]) -> str:
+    """Return a list of keys with the forms that are declared."""
+    kinds = [kind for type_ in section[1].split(", ") for kind in known[type_]]
+    declared = {CERTIFICATE.key: CERTIFICATE} | {key.key: key for kind in kinds for key in kind.declared()}
+
+    def bullet(match: re.Match[str]) -> str:
+        keys = [declared[key] for key in re.findall("`([^`]+)`", match[1])]
+        forms = [key.form.words + ("" if key.is_required else ", optional") for key in keys]
+        line = f"- {match[1]} ({'; '.join(forms if len(set(forms)) > 1 else forms[:1])}): {match[2]}"
+        return textwrap.fill(
+            " ".join(line.split()), 120, subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
+        )
+
+    return f"**{section[1]}**\n\n{_BULLET.sub(bullet, section[2])}"
+
+
+def statements(page: str) -> str:
+    """Return the text of the page about statements with the forms of keys as they are declared."""
+    known = bodies()
+    return SECTION.sub(lambda section: _with_forms(section, known), page)
+
+
 def main(argv: Sequence[str]) -> int:
     """Run the command; return its exit status."""
     pages = {page: page.read_text() for page in sorted((ROOT / "docs").rglob("*.md"))}
-    differ = {page: new for page, text in pages.items() if (new := written(text)) != text}
+    made = {page: (statements if page.name == "statements.md" else written)(text) for page, text in pages.items()}
+    differ = {page: new for page, new in made.items() if new != pages[page]}
     for page, new in differ.items():
         if "--check" in argv:
             print(f"{page.relative_to(ROOT)}: a table differs from its source (run scripts/docs_reference.py)")

@@ -25,7 +25,6 @@ from gdp.cli.output import (
 from gdp.cli.program import Program
 from gdp.cli.rights_file import delegate_rights
 from gdp.crypto.statements import parse
-from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
@@ -36,6 +35,7 @@ from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
 from gdp.terminal import echo
 from gdp.trust.adcert import AdCert
 from gdp.trust.audit import Action
+from gdp.trust.rtcert import RtCert
 
 __all__ = ["app", "main"]
 
@@ -157,7 +157,7 @@ def route(
     result = {
         "node": statement.signer.to_text(),
         "switch": target.to_text(),
-        **span(Validity.from_fields(statement.fields)),
+        **span(RtCert.from_statement(statement).validity),
         "rtcert": str(out),
     }
     show(result, as_json=as_json)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
@@ -26,9 +27,8 @@ from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, StatementError
@@ -37,7 +37,7 @@ from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
-from gdp.trust.advertisement import sign_advertisement
+from gdp.trust.advertisement import MS, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
@@ -195,7 +195,7 @@ class Attachment:
         """Return the fields that show this node's right on a name that it advertises; empty if it does not."""
         for (its, right), each in self._advertisements.items():
             if its == name:
-                return each.subject.to_fields() | {"right": right.value, "chain": list(each.chain)}
+                return RightEvidence(each.subject, right, tuple(each.chain)).to_fields()
         return {}
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
@@ -271,7 +271,7 @@ class Attachment:
             return statement  # it proves itself
         if header.kind == Kind.REVOKED:
             if statement.type is StatementType.REVOKE:
-                self._sync.took(switch, hash_of(statement.fields.bytes_("owner")), now.mono_s)
+                self._sync.took(switch, hash_of(Revocation.read(statement).issuer.owner_key), now.mono_s)
                 return statement
             self._sync.receive(switch, statement, now)
             return None
@@ -396,14 +396,13 @@ class Attachment:
 
     def _advertisement_wire(self, each: PendingAdvertisement, now: Timestamps) -> bytes:
         assert self._switch is not None
-        return sign_advertisement(
-            self._identity,
-            each.right,
-            each.subject,
+        advertisement = UnverifiedAdvertisement(
+            subject=each.subject,
+            right=each.right,
             rtcert=self._rtcert_for(self._switch.name),
             sequence=self._next_sequence(),
             incarnation=self._incarnation,
-            lease_s=self._lease_s,
+            lease_ms=round(self._lease_s * MS),
             is_global=each.is_global,
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
@@ -411,6 +410,7 @@ class Attachment:
             paths=each.paths,
             is_session=each.is_session,
         )
+        return advertisement.signed(self._identity)
 
     def _rtcert_for(self, switch: Name) -> bytes:
         """Return the certificate by which this node lets a switch attract its traffic."""
@@ -444,9 +444,8 @@ class Attachment:
 
     def _handle_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
         """Process the acknowledgement of an advertisement, or return a statement about a publisher's location."""
-        fields = statement.fields
-        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer or (member.name != switch.name and member.role is not Role.RIB):
+        member = self._policy.verify_sender(statement, now.unix_s)
+        if member.name != switch.name and member.role is not Role.RIB:
             raise StatementError(DropReason.BAD_CERTIFICATE, "an AdvertiseAck from a node that may not give it")
         statement.verify(member.key)
         if statement.type is StatementType.ANSWER:

@@ -23,6 +23,7 @@ from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation
 
 __all__ = ["RibHost"]
 
@@ -144,7 +145,7 @@ class RibHost:
         switch = self.attachment.switch
         if switch is not None:
             self.rib.revoke(statement.wire, switch.name, now)
-            self.attachment.hello_protocol.recheck(statement.fields.bytes_("cert"), now)
+            self.attachment.hello_protocol.recheck(Revocation.read(statement).fingerprint, now)
 
     def _record_connection(self, now: Timestamps) -> None:
         is_connected = self.attachment.switch is not None

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 
 from gdp.config.schema import Section, first_fault
 from gdp.crypto.cbor import decode, encode
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import NAME, Keyed
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
@@ -20,6 +20,7 @@ __all__ = ["OFFERED_DEPTH_MAX", "OfferedQos"]
 
 OFFERED_DEPTH_MAX: Final = 1_000
 _MAX_BYTES: Final = 1_024
+_NAME: Final = Keyed("name", NAME)
 
 
 class OfferedQos(Section):
@@ -45,5 +46,5 @@ class OfferedQos(Section):
     def from_wire(cls, wire: bytes) -> tuple[Name, OfferedQos]:
         """Return a topic's name and QoS from a mail. Raises ``StatementError``: the mail is malformed."""
         value = decode(wire, _MAX_BYTES)
-        fields = Fields(value if isinstance(value, dict) else {})
-        return fields.name("name"), cls.from_fields(fields)
+        received = value if isinstance(value, dict) else {}
+        return _NAME.read(received), cls.from_fields(received)

@@ -19,15 +19,15 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Final, NamedTuple
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
 from gdp.crypto.records import RecordKey
-from gdp.crypto.statements import Statement, StatementType, parse, sign
+from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, octets
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
@@ -59,6 +59,27 @@ _PEERS_MAX: Final = 8_192
 _OFFERS_PER_S: Final = 20.0  # accepted of one peer
 _HINTS_PER_S: Final = 100.0
 _PEER_ROLES: Final = (Role.SWITCH, Role.LEAF, Role.RIB)
+
+
+@dataclass(frozen=True, slots=True)
+class _Open(Body):
+    """Offer of a channel to a RIB, by the public X25519 key of its sender."""
+
+    TYPE = StatementType.OPEN
+    key: Annotated[bytes, Keyed("k", octets(EXCHANGE_KEY_BYTES))]
+    rib: Annotated[Name, Keyed("w", NAME)]
+    padding: Annotated[bytes, Keyed("p", OCTETS, absent=b"")] = b""
+
+
+@dataclass(frozen=True, slots=True)
+class _Accept(Body):
+    """Acceptance of an offer, by its fingerprint."""
+
+    TYPE = StatementType.ACCEPT
+    offer: Annotated[bytes, Keyed("o", octets(32))]
+    channel: Annotated[bytes, Keyed("i", octets(_ID_BYTES))]
+    key: Annotated[bytes, Keyed("k", octets(EXCHANGE_KEY_BYTES))]
+    asker: Annotated[Name, Keyed("w", NAME)]
 
 
 class Opened(NamedTuple):
@@ -234,10 +255,10 @@ class Channels:
             return
         key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
         identity = self._identity
-        body: dict[str, object] = {"k": key.public, "w": peer, "c": identity.membership, "p": b""}
-        bare = sign(StatementType.OPEN, body, identity.name, identity.key)
-        body["p"] = bytes(max(_OFFER_BYTES - len(bare), 0))
-        wire = sign(StatementType.OPEN, body, identity.name, identity.key)
+        body = _Open(key.public, peer)
+        bare = body.to_wire(identity.name, identity.key, identity.membership)
+        body = replace(body, padding=bytes(max(_OFFER_BYTES - len(bare), 0)))
+        wire = body.to_wire(identity.name, identity.key, identity.membership)
         asked.offer = _Offer(key, wire, parse(wire).fingerprint)
         asked.reopened_s = now_s
         self._offers.start(peer, now_s)
@@ -252,15 +273,14 @@ class Channels:
         self._offers.cancel(peer)
 
     def _take_accept(self, statement: Statement, now: Timestamps) -> None:
-        fields = statement.fields
+        accept = _Accept.from_statement(statement)
         asked = self._asked.get(statement.signer)
         offer = None if asked is None else asked.offer
-        if asked is None or offer is None or fields.bytes_("o") != offer.fingerprint:
+        if asked is None or offer is None or accept.offer != offer.fingerprint:
             raise StatementError(DropReason.REPLAYED, "it accepts no offer of ours")
         self._verified(statement, now)
-        id_ = fields.bytes_("i", _ID_BYTES)
-        keys = _keys(offer.key, fields, offer.fingerprint, statement.fingerprint)
-        asked.channel = _Channel(id=id_, out_key=keys[0], in_key=keys[1], begun_s=now.mono_s)
+        keys = _keys(offer.key, accept.key, offer.fingerprint, statement.fingerprint)
+        asked.channel = _Channel(id=accept.channel, out_key=keys[0], in_key=keys[1], begun_s=now.mono_s)
         self._end_offer(statement.signer, asked)
         waiting, asked.waiting = list(asked.waiting), deque(maxlen=_WAITING_MAX)
         for wire, until_s in waiting:
@@ -278,8 +298,8 @@ class Channels:
     # -- the queried side
 
     def _take_offer(self, statement: Statement, now: Timestamps) -> None:
-        fields = statement.fields
-        if not self._accepts or fields.name("w") != self._identity.name:
+        offered = _Open.from_statement(statement)
+        if not self._accepts or offered.rib != self._identity.name:
             raise StatementError(DropReason.NOT_FOR_US, "an offer of a channel")
         known = self._askers.get(statement.signer)
         fingerprint = statement.fingerprint
@@ -292,11 +312,11 @@ class Channels:
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
         identity, id_ = self._identity, self._random_bytes(_ID_BYTES)
-        body = {"o": fingerprint, "i": id_, "k": key.public, "w": statement.signer, "c": identity.membership}
-        accept = sign(StatementType.ACCEPT, body, identity.name, identity.key)
+        body = _Accept(fingerprint, id_, key.public, statement.signer)
+        accept = body.to_wire(identity.name, identity.key, identity.membership)
         if len(accept) > len(statement.wire):
             raise StatementError(DropReason.MALFORMED, "an offer that is shorter than its answer")
-        keys = _keys(key, fields, fingerprint, parse(accept).fingerprint)
+        keys = _keys(key, offered.key, fingerprint, parse(accept).fingerprint)
         asker = self._askers.setdefault(statement.signer, _Asker())
         self._askers.move_to_end(statement.signer)
         asker.offers[fingerprint] = _Channel(id=id_, out_key=keys[1], in_key=keys[0], begun_s=now.mono_s, accept=accept)
@@ -338,14 +358,12 @@ class Channels:
         Raises:
             StatementError: the signer is no member of a trusted domain, or did not sign.
         """
-        member = self._policy.verify_membership(statement.fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
+        member = self._policy.verify_sender(statement, now.unix_s)
         statement.verify(member.key)
         return member.role
 
 
-def _keys(key: ExchangeKey, far: Fields, offer: bytes, accept: bytes) -> list[RecordKey]:
+def _keys(key: ExchangeKey, far: bytes, offer: bytes, accept: bytes) -> list[RecordKey]:
     """Return the keys of both directions: from the querying end, then to it."""
     bound = [purpose + offer + accept for purpose in _PURPOSES]
-    return [RecordKey(secret) for secret in key.agree(far.bytes_("k"), *bound)]
+    return [RecordKey(secret) for secret in key.agree(far, *bound)]

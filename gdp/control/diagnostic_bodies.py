@@ -11,20 +11,23 @@ from typing import Annotated, Final
 
 from gdp.crypto.cbor import encode
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.schema import FLAG, MAP, NAME, NAME_OR_ZERO, OCTETS, Body, Keyed, text, uint
-from gdp.crypto.statements import StatementType, assemble, sign
+from gdp.crypto.schema import CERT, FLAG, MAP, NAME, NAME_OR_ZERO, OCTETS, Body, FieldSet, Keyed, text, uint
+from gdp.crypto.statements import StatementType, assemble
+from gdp.crypto.subject import SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import HOPS_MASK
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
 from gdp.names import ZERO, Name
+from gdp.trust.adcert import CHAIN
+from gdp.trust.right import RIGHT, Right
 
-__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "cut_to_fit"]
+__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "RightEvidence", "cut_to_fit"]
 
 ASK_MAX_CHARS: Final = 16
 _ERROR_MAX_CHARS: Final = 32
 _SHORT_REPLY_BYTES: Final = 360  # an empty result, and a few counters
 _CERTIFICATE_BYTES: Final = 680  # of the member that replies, if we lack it: label and domain of some 60 letters
-_PAD_HEAD_BYTES: Final = 5  # key and head of the padding
+_PAD_HEAD_BYTES: Final = 2  # of the head of the padding, above that of an empty one
 _NO_SIGNATURE: Final = bytes(64)
 
 
@@ -46,7 +49,8 @@ class DiagnosticRequest(Body):
     sequence: Annotated[int, Keyed("s", uint())]
     body: Annotated[Mapping[str, object], Keyed("b", MAP)] = field(default_factory=dict)
     knows_target: Annotated[bool, Keyed("k", FLAG)] = False
-    membership: Annotated[bytes, Keyed("c", OCTETS, absent=b"", is_omitted=True)] = b""
+    membership: Annotated[bytes, Keyed("c", CERT, absent=b"", is_omitted=True)] = b""
+    padding: Annotated[bytes, Keyed("z", OCTETS, absent=b"")] = field(default=b"", compare=False, repr=False)
 
     def check(self) -> None:
         """Return if what is asked is a word. Raises ``StatementError``: MALFORMED."""
@@ -63,11 +67,23 @@ class DiagnosticRequest(Body):
             raise LocalError(
                 f"an ask has 1 to {ASK_MAX_CHARS} letters, its reply at most {DIAGNOSTIC_REPLY_MAX_BYTES} bytes"
             )
-        body = self.to_fields()
         least = _SHORT_REPLY_BYTES + (0 if self.knows_target else _CERTIFICATE_BYTES)
-        size = len(assemble(self.TYPE, body, signer, _NO_SIGNATURE))
-        body["z"] = bytes(max(max(reply_bytes, least) - size - _PAD_HEAD_BYTES, 0))
-        return sign(self.TYPE, body, signer, key)
+        size = len(assemble(self.TYPE, self.to_fields(), signer, _NO_SIGNATURE))
+        padding = bytes(max(max(reply_bytes, least) - size - _PAD_HEAD_BYTES, 0))
+        return replace(self, padding=padding).to_wire(signer, key)
+
+
+@dataclass(frozen=True, slots=True)
+class RightEvidence(FieldSet):
+    """What shows the asker's right on the name of a request: keys of its body.
+
+    Args:
+        chain: AdCerts from the owner to the asker.
+    """
+
+    subject: Annotated[Subject, SUBJECT]
+    right: Annotated[Right, Keyed("right", RIGHT)]
+    chain: Annotated[tuple[bytes, ...], Keyed("chain", CHAIN)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +108,7 @@ class DiagnosticReply(Body):
     is_withheld: Annotated[bool, Keyed("w", FLAG)] = False
     is_cut: Annotated[bool, Keyed("m", FLAG)] = False
     hops_left: Annotated[int, Keyed("h", uint(HOPS_MASK))] = 0
-    membership: Annotated[bytes, Keyed("c", OCTETS, absent=b"", is_omitted=True)] = b""
+    membership: Annotated[bytes, Keyed("c", CERT, absent=b"", is_omitted=True)] = b""
 
 
 def cut_to_fit(reply: DiagnosticReply, max_bytes: int) -> DiagnosticReply | None:

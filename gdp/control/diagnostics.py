@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import Fields, check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.schema import CERTIFICATE
+from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.errors import DropReason, FrameError, LocalError, StatementError
 from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
 from gdp.frame.kinds import Kind
@@ -62,7 +62,7 @@ class Question:
     ask: str
     name: Name
     target: Name
-    body: Fields
+    body: Mapping[str, Any]
     asker: Membership
     is_neighbour: bool
     port: int | None = None
@@ -82,7 +82,7 @@ class Reply:
     """
 
     member: Membership
-    result: Fields
+    result: Mapping[str, Any]
     error: str = ""
     is_withheld: bool = False
     is_cut: bool = False
@@ -211,9 +211,7 @@ class Diagnostics:
         self._sequence += 1
         until_s = now.mono_s + timeout_s
         if target == self._identity.name:
-            own = Question(
-                ask=ask, name=name, target=target, body=_as_fields(body), asker=self._identity.member, is_neighbour=True
-            )
+            own = Question(ask=ask, name=name, target=target, body=body, asker=self._identity.member, is_neighbour=True)
             self._answer(_Asked(own, self._sequence, 0, True, until_s, on_reply, now.mono_s), now)
             return
         if ask == _SHOWS_RIGHT:
@@ -284,7 +282,7 @@ class Diagnostics:
         self, statement: Statement, header: Header, arrival: ReceivedFrame, now: Timestamps, *, is_neighbour: bool
     ) -> None:
         fields = statement.expect(StatementType.DIAGNOSTIC_REQUEST)
-        peer = self._verified(statement, fields, now)
+        peer = self._verified(statement, now)
         request = DiagnosticRequest.from_fields(fields)
         if request.target != header.destination:
             raise StatementError(DropReason.NOT_FOR_US, "a request to another member")
@@ -298,7 +296,7 @@ class Diagnostics:
             ask=request.ask,
             name=request.name,
             target=request.target,
-            body=_as_fields(request.body),
+            body=request.body,
             asker=peer.member,
             is_neighbour=is_neighbour,
             port=arrival.port,
@@ -328,7 +326,7 @@ class Diagnostics:
         if result is None:
             result, error = {}, "not-known"
         if asked.on_reply is not None:
-            reply = Reply(member=self._identity.member, result=_as_fields(result), error=error)
+            reply = Reply(member=self._identity.member, result=result, error=error)
             asked.on_reply(reply, now.mono_s - asked.begun_s)
             return
         made = DiagnosticReply(
@@ -356,7 +354,7 @@ class Diagnostics:
             raise StatementError(DropReason.STALE, "a reply without a request")
         if pending.hops == HOPS_MAX and statement.signer != pending.target:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a reply of a member that was not asked")
-        member = self._verified(statement, fields, now).member
+        member = self._verified(statement, now).member
         if member.name != pending.target and not member.role.is_switch:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a reply of a member that is not on the path")
         del self._pending[reply.sequence]
@@ -367,7 +365,7 @@ class Diagnostics:
         rtt_s = max(now.mono_s - arrival.waited_s - pending.sent_s, 0.0)
         made = Reply(
             member=member,
-            result=_as_fields(reply.result),
+            result=reply.result,
             error=reply.error,
             is_withheld=reply.is_withheld,
             is_cut=reply.is_cut,
@@ -375,17 +373,15 @@ class Diagnostics:
         )
         pending.on_reply(made, rtt_s)
 
-    def _verified(self, statement: Statement, fields: Fields, now: Timestamps) -> _Peer:
+    def _verified(self, statement: Statement, now: Timestamps) -> _Peer:
         """Return the signer of a statement, whose signature is proved.
 
         Raises:
             StatementError: it is no member now, its certificate is neither here nor known, or the signature is wrong.
         """
         peer = self._peers.get(statement.signer)
-        if "c" in fields:
-            member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-            if member.name != statement.signer:
-                raise StatementError(DropReason.BAD_CERTIFICATE, "the certificate of another member")
+        if CERTIFICATE.key in statement.fields:
+            member = self._policy.verify_sender(statement, now.unix_s)
         elif peer is not None:
             member = peer.member
             self._policy.check_member(member, now.unix_s)
@@ -401,7 +397,3 @@ class Diagnostics:
     def _put(self, kind: Kind, wire: bytes, to: Name, now: Timestamps, hops: int = HOPS_MAX) -> None:
         frames = self._fragmenter.split(kind, wire, _FIRST_LINK_BYTES, to)
         self._send([frame[:HOPS_AT] + bytes([hops]) + frame[HOPS_AT + 1 :] for frame in frames], to, now)
-
-
-def _as_fields(items: Mapping[str, object]) -> Fields:
-    return items if isinstance(items, Fields) else Fields(dict(items))  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from gdp.control.endpoint_record import RECORD_MAX_BYTES
-from gdp.crypto.schema import OCTETS, REASON, Body, Keyed, many, number, packed, uint
+from gdp.crypto.schema import REASON, STATEMENT, Body, Keyed, many, number, packed, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, LEASE_MAX_S, RECORD_OVERHEAD_BYTES
@@ -63,7 +63,7 @@ class EndpointResponse(Body):
     """
 
     TYPE = StatementType.ENDPOINTS_ANSWER
-    records: Annotated[tuple[bytes, ...], Keyed("e", many(OCTETS, RECORDS_MAX))] = ()
+    records: Annotated[tuple[bytes, ...], Keyed("e", many(STATEMENT, RECORDS_MAX))] = ()
     kept_sequence: Annotated[int, Keyed("s", uint())] = 0
     refused: Annotated[DropReason | None, Keyed("r", REASON)] = None
 

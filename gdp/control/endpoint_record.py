@@ -6,14 +6,15 @@ Sans-I/O. A record names the WireGuard key of each uplink and the candidates at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import ENDPOINT_MAX_BYTES, Endpoint
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Fields, StatementType, parse
+from gdp.crypto.schema import CERTIFICATE, Body, Keyed, many, mapped, octets, one_of, row, uint
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.crypto.tunnel_key import TUNNEL_KEY_BYTES
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
@@ -43,8 +44,12 @@ class Candidate(NamedTuple):
     endpoint: Endpoint
 
 
+_ENDPOINT: Final = mapped(octets(most=ENDPOINT_MAX_BYTES), Endpoint.from_wire, Endpoint.to_wire)
+_CANDIDATE: Final = row(Candidate, uint(), one_of(CandidateType), _ENDPOINT)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EndpointRecord:
+class EndpointRecord(Body):
     """A record of one switch.
 
     Args:
@@ -57,12 +62,13 @@ class EndpointRecord:
         wire: the signed statement.
     """
 
+    TYPE = StatementType.ENDPOINTS
     name: Name
-    keys: tuple[bytes, ...]
-    candidates: tuple[Candidate, ...]
-    sequence: int
-    until_unix_s: int
-    membership: bytes = field(repr=False)
+    keys: Annotated[tuple[bytes, ...], Keyed("k", many(octets(TUNNEL_KEY_BYTES), UPLINKS_MAX))]
+    candidates: Annotated[tuple[Candidate, ...], Keyed("a", many(_CANDIDATE, CANDIDATES_MAX))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    until_unix_s: Annotated[int, Keyed("u", uint())]
+    membership: Annotated[bytes, CERTIFICATE] = field(repr=False)
     wire: bytes = field(default=b"", repr=False)
 
     @classmethod
@@ -76,24 +82,15 @@ class EndpointRecord:
         until_unix_s: int,
     ) -> EndpointRecord:
         """Return a record that the node signs; candidates beyond ``CANDIDATES_MAX`` are left out."""
-        candidates = candidates[:CANDIDATES_MAX]
-        body = {
-            "k": list(keys[:UPLINKS_MAX]),
-            "a": [[each.uplink, each.type.value, each.endpoint.to_wire()] for each in candidates],
-            "s": sequence,
-            "u": until_unix_s,
-            "c": identity.membership,
-        }
-        wire = identity.sign(StatementType.ENDPOINTS, body)
-        return cls(
+        record = cls(
             name=identity.name,
             keys=keys,
-            candidates=candidates,
+            candidates=candidates[:CANDIDATES_MAX],
             sequence=sequence,
             until_unix_s=until_unix_s,
             membership=identity.membership,
-            wire=wire,
         )
+        return replace(record, wire=record.to_wire(identity.name, identity.key))
 
     @classmethod
     def verified(cls, wire: bytes, policy: Policy, unix_s: float) -> tuple[EndpointRecord, Membership]:
@@ -105,36 +102,19 @@ class EndpointRecord:
         if len(wire) > RECORD_MAX_BYTES:
             raise StatementError(DropReason.TOO_BIG, "endpoint record")
         statement = parse(wire)
-        record = cls._from_fields(statement.signer, statement.expect(StatementType.ENDPOINTS), wire)
-        member = policy.verify_membership(record.membership, unix_s)
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "an endpoint record under another's certificate")
+        record = cls.from_statement(statement)
+        member = policy.verify_sender(statement, unix_s)
         statement.verify(member.key)
         if record.until_unix_s < unix_s:
             raise StatementError(DropReason.EXPIRED, "endpoint record")
         return record, member
 
     @classmethod
-    def _from_fields(cls, signer: Name, fields: Fields, wire: bytes) -> EndpointRecord:
-        keys = tuple(fields.byte_strings("k", UPLINKS_MAX, TUNNEL_KEY_BYTES))
-        if not keys:
-            raise StatementError(DropReason.MALFORMED, "an endpoint record without a key")
-        return cls(
-            name=signer,
-            keys=keys,
-            candidates=tuple(_candidate(each, len(keys)) for each in fields.list_("a", CANDIDATES_MAX)),
-            sequence=fields.uint("s"),
-            until_unix_s=fields.uint("u"),
-            membership=fields.bytes_("c"),
-            wire=wire,
-        )
+    def given_by(cls, statement: Statement) -> dict[str, object]:
+        """Return the switch and the bytes."""
+        return {"name": statement.signer, "wire": statement.wire}
 
-
-def _candidate(value: object, uplinks: int) -> Candidate:
-    match value:
-        case [int(uplink), str(kind), bytes(endpoint)] if 0 <= uplink < uplinks:
-            try:
-                return Candidate(uplink, CandidateType(kind), Endpoint.from_wire(endpoint))
-            except ValueError as error:
-                raise StatementError(DropReason.MALFORMED, "a candidate of an endpoint record") from error
-    raise StatementError(DropReason.MALFORMED, "a candidate of an endpoint record")
+    def check(self) -> None:
+        """Return if there are keys, and each candidate is of an uplink. Raises ``StatementError``: MALFORMED."""
+        if not self.keys or any(each.uplink >= len(self.keys) for each in self.candidates):
+            raise StatementError(DropReason.MALFORMED, "an endpoint record without the key of an uplink")

@@ -13,12 +13,13 @@ from typing import Final, NamedTuple
 from gdp.errors import LocalError
 from gdp.names import Name
 
-__all__ = ["Endpoint", "inner_address", "tunnel_vni"]
+__all__ = ["ENDPOINT_MAX_BYTES", "Endpoint", "inner_address", "tunnel_vni"]
 
 _PORT_MAX: Final = 65_535
 _ULA: Final = b"\xfd"  # RFC 4193, section 3.1, locally assigned
 _ADDRESS_BYTES: Final = 16
 _PORT_BYTES: Final = 2
+ENDPOINT_MAX_BYTES: Final = _ADDRESS_BYTES + _PORT_BYTES
 _VNI_BYTES: Final = 3
 _PRIVATE: Final = tuple(  # RFC 1918, RFC 6598
     ipaddress.ip_network(each) for each in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10")

@@ -9,10 +9,10 @@ import hashlib
 from dataclasses import dataclass, field
 from typing import Annotated, Final, NamedTuple
 
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import ENDPOINT_MAX_BYTES, Endpoint
 from gdp.control.preshared_key import SIZES
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
-from gdp.crypto.schema import OCTETS, Body, Form, Keyed, many, octets, or_empty, packed, row, uint
+from gdp.crypto.schema import CERT, OCTETS, STATEMENT, Body, Keyed, many, mapped, octets, or_empty, packed, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
@@ -85,12 +85,9 @@ _TIMING: Final = row(Timing, uint(INTERVAL_MAX_MS), uint(INTERVAL_MAX_MS), uint(
 _COOKIE: Final = packed(
     NONCE_BYTES + COOKIE_BYTES, lambda each: (each[:NONCE_BYTES], each[NONCE_BYTES:]), lambda pair: pair[0] + pair[1]
 )
-_OBSERVED: Final = Form(
-    "a nonce and an endpoint",
-    lambda value: (
-        OCTETS.read(value)[:NONCE_BYTES],
-        Endpoint.from_wire(OCTETS.read(value)[NONCE_BYTES:]),
-    ),
+_OBSERVED: Final = mapped(
+    octets(most=NONCE_BYTES + ENDPOINT_MAX_BYTES),
+    lambda each: (each[:NONCE_BYTES], Endpoint.from_wire(each[NONCE_BYTES:])),
     lambda pair: pair[0] + pair[1].to_wire(),
 )
 
@@ -122,12 +119,12 @@ class Hello(Body):
     heard: Annotated[tuple[bytes, ...], Keyed("h", many(octets(ECHO_BYTES), HEARD_MAX))]
     mtu: Annotated[int, Keyed("m", uint(FRAME_MAX_BYTES))]
     digest: Annotated[bytes, Keyed("d", octets(DIGEST_BYTES))]
-    membership: Annotated[bytes, Keyed("c", OCTETS)]
+    membership: Annotated[bytes, Keyed("c", CERT)]
     timing: Annotated[Timing, Keyed("k", _TIMING)] = NO_KEEPALIVES
     exchange_key: Annotated[bytes, Keyed("x", or_empty(octets(EXCHANGE_KEY_BYTES), b""))] = b""
     incarnation_id: Annotated[bytes, Keyed("b", octets(INCARNATION_BYTES))] = bytes(INCARNATION_BYTES)
     conflicts: Annotated[tuple[bytes, ...], Keyed("u", many(octets(ECHO_BYTES), CONFLICTS_MAX))] = ()
-    rtcerts: Annotated[tuple[bytes, ...], Keyed("r", many(OCTETS, RTCERTS_MAX))] = ()
+    rtcerts: Annotated[tuple[bytes, ...], Keyed("r", many(STATEMENT, RTCERTS_MAX))] = ()
     cookies: Annotated[tuple[tuple[bytes, bytes], ...], Keyed("y", many(_COOKIE, COOKIES_MAX))] = ()
     observed: Annotated[tuple[tuple[bytes, Endpoint], ...], Keyed("o", many(_OBSERVED, OBSERVED_MAX), absent=())] = ()
     preshared: Annotated[bytes, Keyed("p", OCTETS, absent=b"", is_omitted=True)] = field(default=b"", repr=False)

@@ -12,7 +12,7 @@ from typing import Annotated, Final, NamedTuple
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.link_state import LINK_KEY_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.schema import NAME, NAME_OR_ZERO, OCTETS, Body, Form, Keyed, many, number, octets, row, uint
+from gdp.crypto.schema import NAME, NAME_OR_ZERO, STATEMENT, Body, Keyed, many, mapped, number, octets, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S, PATHS_MAX
@@ -34,10 +34,7 @@ Route = tuple[RouteLink, ...]  # from a switch towards the publisher's, in order
 
 
 _LINK: Final = row(RouteLink, NAME, uint(LINK_KEY_MAX))
-_NAMES: Final = many(NAME, TRANSIT_MAX)
-_ALLOWED: Final = Form(
-    _NAMES.words, lambda value: frozenset(_NAMES.read(value)), lambda names: _NAMES.write(tuple(sorted(names)))
-)
+_ALLOWED: Final = mapped(many(NAME, TRANSIT_MAX), frozenset, lambda names: tuple(sorted(names)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,13 +67,13 @@ class Join(Body):
     allowed: Annotated[frozenset[Name], Keyed("x", _ALLOWED)]
     mtu: Annotated[int, Keyed("m", uint(FRAME_MAX_BYTES))]
     lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
-    evidence: Annotated[bytes, Keyed("e", OCTETS)]
+    evidence: Annotated[bytes, Keyed("e", STATEMENT)]
     session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
     sequence: Annotated[int, Keyed("s", uint())]
     version: Annotated[int, Keyed("v", uint())] = 0
     backup_for: Annotated[Name, Keyed("b", NAME_OR_ZERO)] = ZERO
     sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))] = bytes(NONCE_BYTES)
-    proof: Annotated[bytes, Keyed("c", OCTETS)] = b""
+    proof: Annotated[bytes, Keyed("c", STATEMENT)] = b""
     path: Annotated[int, Keyed("a", uint(PATHS_MAX, 1))] = 1
     route: Annotated[Route, Keyed("r", many(_LINK, ROUTE_MAX))] = ()
 

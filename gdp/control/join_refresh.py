@@ -12,7 +12,6 @@ from functools import partial
 from typing import Annotated, Final
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
-from gdp.crypto.fields import Fields
 from gdp.crypto.schema import Body, Keyed, joined, octets, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
@@ -36,6 +35,7 @@ class JoinRefresh(Body):
         sequence: rises with every join, leave and refresh of the sender within its session.
     """
 
+    TYPE = StatementType.JOIN_REFRESH
     numbers: Annotated[tuple[int, ...], Keyed("k", _NUMBERS)]
     session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
     sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))]
@@ -45,12 +45,7 @@ class JoinRefresh(Body):
     @property
     def statement_type(self) -> StatementType:
         """Return the type of its statement."""
-        return StatementType.JOIN_UNKNOWN if self.is_reply else StatementType.JOIN_REFRESH
-
-    @classmethod
-    def from_fields(cls, fields: Fields, *, is_reply: bool = False) -> JoinRefresh:
-        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
-        return cls.read(fields, is_reply=is_reply)
+        return StatementType.JOIN_UNKNOWN if self.is_reply else self.TYPE
 
     def check(self) -> None:
         """Return if there are numbers. Raises ``StatementError``: MALFORMED."""

@@ -9,18 +9,19 @@ that are reachable behind it. When a failure partitions a domain, each part is r
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Annotated, Final, NamedTuple, TypeVar
 
 from gdp.control.hello import INCARNATION_BYTES, NONCE_BYTES
-from gdp.crypto.fields import Fields
-from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Form, Keyed, many, octets, row, text, uint
+from gdp.crypto.cbor import Value
+from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, Body, Keyed, many, octets, one_of, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = ["LINK_KEY_MAX", "Adjacency", "AttachedRib", "LinkState", "Scope", "link_key"]
+__all__ = ["LINK_KEY_MAX", "Adjacency", "AttachedRib", "LinkState", "LinkStateVersion", "Scope", "link_key"]
 
 LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
@@ -88,13 +89,28 @@ class AttachedRib(NamedTuple):
         return _RIB_BYTES + len(self.membership) + len(self.rtcert)
 
 
-_SCOPE: Final = Form("domain or border", lambda value: Scope(text(8).read(value)), lambda scope: scope.value)
 _ADJACENCY: Final = row(Adjacency, NAME, NAME, uint(COST_MAX, 1), uint(FRAME_MAX_BYTES, 1), uint(LINK_KEY_MAX))
-_RIB: Final = row(AttachedRib, NAME, NAME, octets(NONCE_BYTES), octets(INCARNATION_BYTES), OCTETS, OCTETS)
+_RIB: Final = row(AttachedRib, NAME, NAME, octets(NONCE_BYTES), octets(INCARNATION_BYTES), CERT, STATEMENT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkState(Body):
+class LinkStateVersion(Body):
+    """Which link state of its origin it is; a receiver drops most by these fields alone.
+
+    Args:
+        incarnation_id: mark of the origin's incarnation.
+        said_unix_s: when it was signed, by the origin's wall clock.
+    """
+
+    TYPE = StatementType.LINK_STATE
+    scope: Annotated[Scope, Keyed("o", one_of(Scope))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    incarnation_id: Annotated[bytes, Keyed("b", octets(INCARNATION_BYTES))] = bytes(INCARNATION_BYTES)
+    said_unix_s: Annotated[int, Keyed("e", uint())] = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkState(LinkStateVersion):
     """Link state of one switch in one scope.
 
     Args:
@@ -102,26 +118,19 @@ class LinkState(Body):
         inside: BORDER only.
         ribs: attached here (DOMAIN), or reachable within this domain (BORDER).
         members: BORDER only: switches of the domain that are reachable within it from here.
-        incarnation_id: mark of the origin's incarnation.
         refused: identities refused at this switch, because an older node has them.
         is_partial: there are members that are not listed.
-        said_unix_s: when it was signed, by the origin's wall clock.
         is_leaf: from the origin's certificate: no path leads through it.
     """
 
-    TYPE = StatementType.LINK_STATE
     origin: Name
     domain: Name
-    scope: Annotated[Scope, Keyed("o", _SCOPE)]
-    sequence: Annotated[int, Keyed("s", uint())]
     links: Annotated[tuple[Adjacency, ...], Keyed("l", many(_ADJACENCY, LINKS_MAX))]
     inside: Annotated[tuple[Adjacency, ...], Keyed("i", many(_ADJACENCY, LINKS_MAX))]
     ribs: Annotated[tuple[AttachedRib, ...], Keyed("r", many(_RIB, RIBS_MAX))]
     members: Annotated[tuple[Name, ...], Keyed("m", many(NAME, MEMBERS_MAX))] = ()
-    incarnation_id: Annotated[bytes, Keyed("b", octets(INCARNATION_BYTES))] = bytes(INCARNATION_BYTES)
     refused: Annotated[tuple[Name, ...], Keyed("u", many(NAME, RIBS_MAX))] = ()
     is_partial: Annotated[bool, Keyed("z", FLAG)] = False
-    said_unix_s: Annotated[int, Keyed("e", uint())] = 0
     is_leaf: bool = False
 
     def fitted(self, membership: bytes) -> LinkState:
@@ -142,7 +151,9 @@ class LinkState(Body):
         )  # fmt: skip
 
     @classmethod
-    def from_origin(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
+    def from_origin(
+        cls, fields: Mapping[str, Value], origin: Name, domain: Name, *, is_leaf: bool = False
+    ) -> LinkState:
         """Read a parsed statement's body; role and domain of the origin come from its certificate.
 
         Of a leaf, links that leave its domain are left out.
@@ -150,7 +161,7 @@ class LinkState(Body):
         Raises:
             StatementError: MALFORMED.
         """
-        found = cls.read(fields, origin=origin, domain=domain, is_leaf=is_leaf)
+        found = cls.from_fields(fields, origin=origin, domain=domain, is_leaf=is_leaf)
         return replace(found, links=tuple(each for each in found.links if each.domain == domain)) if is_leaf else found
 
 

@@ -15,9 +15,10 @@ accepted here until it is accepted there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import not_
 from typing import Annotated, Final
 
-from gdp.crypto.schema import FLAG, NAME, Body, Form, Keyed, uint
+from gdp.crypto.schema import FLAG, NAME, Body, Keyed, mapped, uint
 from gdp.crypto.statements import StatementType
 from gdp.names import Name
 
@@ -28,7 +29,7 @@ _BELIEVED_S: Final = 0.5  # an answer "is there" is valid for this time, before 
 # a refusal from above is valid for this time; a refused node repeats its advertisement more often
 _REFUSED_ABOVE_S: Final = 10.0
 _CHECKS_MAX: Final = 1_024
-_NOT: Final = Form("false, or true for a query", lambda value: not FLAG.read(value), lambda flag: not flag)
+_NOT: Final = mapped(FLAG, not_, not_)  # it travels as "is a query"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

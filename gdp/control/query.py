@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, many, number, octets, or_empty, uint
+from gdp.crypto.schema import NAME, STATEMENT, Body, Keyed, many, number, octets, or_empty, uint
 from gdp.crypto.statements import StatementType
 from gdp.limits import LEASE_MAX_S
 from gdp.names import Name
@@ -51,7 +51,7 @@ class Response(Body):
     TYPE = StatementType.ANSWER
     name: Annotated[Name, Keyed("n", NAME)]
     advertiser: Annotated[Name, Keyed("a", NAME)]
-    advertisement: Annotated[bytes, Keyed("q", OCTETS)]
+    advertisement: Annotated[bytes, Keyed("q", STATEMENT)]
     domain: Annotated[Name, Keyed("d", NAME)]
     transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
     lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]

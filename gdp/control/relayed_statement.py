@@ -12,7 +12,7 @@ from typing import Annotated
 
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, many, or_empty
+from gdp.crypto.schema import CERT, NAME, STATEMENT, Body, Keyed, many, or_empty
 from gdp.crypto.statements import StatementType
 from gdp.names import Name
 
@@ -31,9 +31,9 @@ class RelayedStatement(Body):
     """
 
     TYPE = StatementType.RELAY
-    statement: Annotated[bytes, Keyed("q", OCTETS)]
+    statement: Annotated[bytes, Keyed("q", STATEMENT)]
     transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
-    membership: Annotated[bytes, Keyed("c", OCTETS)]
+    membership: Annotated[bytes, Keyed("c", CERT)]
     domain: Annotated[Name | None, Keyed("d", or_empty(NAME, None))] = None
 
 

@@ -12,7 +12,23 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.schema import FLAG, NAME, OCTETS, Body, Form, Keyed, inner, many, number, octets, packed, uint
+from gdp.crypto.schema import (
+    CERT,
+    FLAG,
+    NAME,
+    OCTETS,
+    STATEMENT,
+    Body,
+    FieldSet,
+    Form,
+    Keyed,
+    inner,
+    many,
+    number,
+    octets,
+    packed,
+    uint,
+)
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, LEASE_MAX_S
@@ -113,7 +129,7 @@ class Inventory(Body):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Entry(Body):
+class Entry(FieldSet):
     """An advertisement or a withdrawal as one RIB sends it to another.
 
     Args:
@@ -129,8 +145,8 @@ class Entry(Body):
             advertisement.
     """
 
-    statement: Annotated[bytes, Keyed("q", OCTETS)]
-    membership: Annotated[bytes, Keyed("m", OCTETS)]
+    statement: Annotated[bytes, Keyed("q", STATEMENT)]
+    membership: Annotated[bytes, Keyed("m", CERT)]
     sender: Annotated[Name, Keyed("w", NAME)]
     domain: Annotated[Name, Keyed("d", NAME)]
     via: Annotated[Name, Keyed("v", NAME)]

@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.crypto.keys import PublicKey
+from gdp.crypto.statements import Statement
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import DOMAIN_UNIT, Certificate, bad, issuer_common_name, read, to_pem
@@ -216,6 +217,19 @@ class Unverified:
             wire=certificate.wire,
             certificate=certificate,
         )
+
+    @classmethod
+    def of_signer(cls, wire: bytes, statement: Statement) -> Unverified:
+        """Return the membership in a statement if it is its signer's, and the signature holds.
+
+        Raises:
+            StatementError: BAD_CERTIFICATE, WRONG_NAME or BAD_SIGNATURE.
+        """
+        stranger = cls.from_wire(wire)
+        if stranger.subject.name != statement.signer:
+            raise bad(f"{statement.type.value} under another's certificate")
+        statement.verify(stranger.key)
+        return stranger
 
     def verify(self, root: Root, unix_s: float) -> Membership:
         """Return the membership if ``root`` issued it and both are valid at ``unix_s``.

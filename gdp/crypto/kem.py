@@ -21,9 +21,10 @@ from typing import Final
 from cryptography.exceptions import InvalidTag, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import x25519
 
+from gdp.crypto.schema import mapped, octets
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["KEM_PRIVATE_BYTES", "KEM_PUBLIC_BYTES", "SEALING_BYTES", "KemPrivateKey", "KemPublicKey"]
+__all__ = ["KEM_PRIVATE_BYTES", "KEM_PUBLIC", "KEM_PUBLIC_BYTES", "SEALING_BYTES", "KemPrivateKey", "KemPublicKey"]
 
 _SEED_BYTES: Final = 64
 _MLKEM_PUBLIC_BYTES: Final = 1_184
@@ -66,6 +67,9 @@ class KemPublicKey:
             return library.suite.encrypt(secret, key, info)
         except ValueError as error:  # also a point of small order
             raise StatementError(DropReason.MALFORMED, "not a public KEM key") from error
+
+
+KEM_PUBLIC: Final = mapped(octets(KEM_PUBLIC_BYTES), KemPublicKey, lambda key: key.wire)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,13 +18,12 @@ from enum import Enum
 from typing import Final
 
 from gdp.crypto.cbor import Value, decode, encode
-from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import CONTROL_MAX_BYTES
+from gdp.limits import CONTROL_MAX_BYTES, SEQUENCE_AHEAD_S
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Fields", "Statement", "StatementType", "Value", "assemble", "parse", "sign"]
+__all__ = ["Statement", "StatementType", "Value", "assemble", "check_sequence", "parse", "sign"]
 
 
 class StatementType(str, Enum):
@@ -89,22 +88,17 @@ class Statement:
 
     type: StatementType
     signer: Name
-    fields: Fields
+    fields: Mapping[str, Value]
     signature: bytes
     signed_bytes: bytes
     wire: bytes
-
-    @property
-    def body(self) -> Mapping[str, Value]:
-        """Return the body as it was decoded."""
-        return self.fields
 
     @property
     def fingerprint(self) -> bytes:
         """Return SHA-256 of the signed bytes: the same for every valid signature over them."""
         return hashlib.sha256(self.signed_bytes).digest()
 
-    def expect(self, expected: StatementType) -> Fields:
+    def expect(self, expected: StatementType) -> Mapping[str, Value]:
         """Return the body if the statement is of this type. Raises ``StatementError``: MALFORMED."""
         if self.type is not expected:
             raise StatementError(DropReason.MALFORMED, f"{self.type.value} where {expected.value} was due")
@@ -168,11 +162,24 @@ def parse(wire: bytes) -> Statement:
     return Statement(
         type=type_,
         signer=Name(wire[_SIGNER_AT:_PROTECTED_END]),
-        fields=Fields(body),
+        fields=body,
         signature=wire[payload_end + 2 :],
         signed_bytes=_SIGNED_HEAD + wire[2:_PROTECTED_END] + _NO_EXTERNAL_DATA + boxed,
         wire=wire,
     )
+
+
+def check_sequence(sequence: int, unix_s: float) -> None:
+    """Return if a sequence number leaves values for newer ones.
+
+    Sequence numbers are milliseconds of wall clocks, which may be wrong. A number of the far future would be the last
+    that its owner, or a node that has to exceed it, can use.
+
+    Raises:
+        StatementError: MALFORMED.
+    """
+    if sequence > (unix_s + SEQUENCE_AHEAD_S) * 1_000:
+        raise StatementError(DropReason.MALFORMED, "a sequence number of the far future")
 
 
 def _check_size(size: int) -> None:

@@ -7,13 +7,14 @@ docs/explanation/design.md, section 2.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import NAME, Keyed, Spread, octets, or_empty
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
-from gdp.names import Name, name_of
+from gdp.names import OWNER_KEY_BYTES, Name, name_of
 
-__all__ = ["Subject"]
+__all__ = ["NAMED_SUBJECT", "SUBJECT", "Subject"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +45,6 @@ class Subject:
         return cls(metadata.digest(), owner_key)
 
     @classmethod
-    def from_fields(cls, fields: Fields, name: Name) -> Subject:
-        """Read ``digest`` and ``owner`` of a statement's body and prove ``name`` by them.
-
-        Raises:
-            StatementError: MALFORMED, or WRONG_NAME where the hash differs.
-        """
-        return cls.proving(name, fields.bytes_("digest"), fields.bytes_("owner"))
-
-    @classmethod
     def proving(cls, name: Name, digest: bytes, owner_key: bytes) -> Subject:
         """Return the subject if its hash is ``name``.
 
@@ -63,10 +55,17 @@ class Subject:
             subject = cls(digest, owner_key)
         except LocalError as error:
             raise StatementError(DropReason.MALFORMED, str(error)) from error
-        if subject.name != name:
-            raise StatementError(DropReason.WRONG_NAME, "the hash of metadata and key does not come out")
+        subject.expect(name)
         return subject
 
-    def to_fields(self) -> dict[str, object]:
-        """Return the fields that ``from_fields`` reads, without the name."""
-        return {"digest": self.digest, "owner": self.owner_key}
+    def expect(self, name: Name) -> None:
+        """Return if it has this name. Raises ``StatementError``: WRONG_NAME."""
+        if self.name != name:
+            raise StatementError(DropReason.WRONG_NAME, "the hash of metadata and key does not come out")
+
+
+_KEYS: Final = (Keyed("digest", octets(32)), Keyed("owner", or_empty(octets(OWNER_KEY_BYTES), b"")))
+SUBJECT: Final = Spread(_KEYS, Subject, lambda subject: (subject.digest, subject.owner_key))
+NAMED_SUBJECT: Final = Spread(
+    (Keyed("name", NAME), *_KEYS), Subject.proving, lambda subject: (subject.name, subject.digest, subject.owner_key)
+)

@@ -7,13 +7,14 @@ set back must not lose the certificates of the last hour.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import Final
 
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import Keyed, Spread, uint
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CLOCK_EARLY_S, CLOCK_SKEW_S
 
-__all__ = ["Validity"]
+__all__ = ["VALIDITY", "Validity"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +35,6 @@ class Validity:
             raise LocalError("a validity begins after 1970 and lasts a second or longer")
         return cls(int(unix_s), int(unix_s + duration_s))
 
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Validity:
-        """Read ``from`` and ``until`` of a statement's body; a malformed one raises ``StatementError``."""
-        return cls(fields.uint("from"), fields.uint("until"))
-
-    def to_fields(self) -> dict[str, object]:
-        """Return the fields that ``from_fields`` reads."""
-        return {"from": self.not_before_unix_s, "until": self.not_after_unix_s}
-
     def check(self, unix_s: float, what: str) -> None:
         """Return if ``unix_s`` lies within the period, with a tolerance for clock differences.
 
@@ -53,3 +45,6 @@ class Validity:
             raise StatementError(DropReason.EXPIRED, what)
         if unix_s < self.not_before_unix_s - CLOCK_EARLY_S:
             raise StatementError(DropReason.EXPIRED, f"{what}: not valid yet")
+
+
+VALIDITY: Final = Spread((Keyed("from", uint()), Keyed("until", uint())), Validity, astuple)

@@ -26,6 +26,7 @@ from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Invent
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import NAME, Keyed
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.diagnosis.facts import RibFacts, RouteFact
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
@@ -57,6 +58,7 @@ from gdp.trust.adcert import AdCert
 from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
 from gdp.trust.withdrawal import Withdrawal
@@ -323,7 +325,7 @@ class RibCore:
 
     def _take_relay(self, statement: Statement, now: Timestamps) -> None:
         relayed = RelayedStatement.from_fields(statement.fields)
-        member = self._sender(relayed.membership, statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s, relayed.membership)
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
@@ -393,7 +395,7 @@ class RibCore:
         raise StatementError(DropReason.IN_USE, "another node with this identity")
 
     def _take_presence(self, statement: Statement, now: Timestamps) -> None:
-        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         statement.verify(member.key)
         presence = Presence.from_fields(statement.fields)
         if presence.is_answer:
@@ -445,7 +447,7 @@ class RibCore:
         )
 
     def _take_withdrawal(self, statement: Statement, member: Membership, now: Timestamps) -> None:
-        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        withdrawal = Withdrawal.received(statement, now.unix_s)
         name, advertiser, sequence = withdrawal.name, statement.signer, withdrawal.sequence
         known = self._store.get(name, advertiser)
         if not isinstance(known, Route) or sequence < known.sequence:
@@ -514,7 +516,7 @@ class RibCore:
 
     def _handle_query(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
-        member = self._sender(fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
@@ -708,7 +710,7 @@ class RibCore:
 
     def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
         """Return the signer of a statement from the tier above. Raises ``StatementError``: it is not from there."""
-        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         if not self._upstream.has(member.name) or member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
         statement.verify(member.key)
@@ -759,7 +761,7 @@ class RibCore:
 
     def _take_sign_of_life(self, statement: Statement, now: Timestamps) -> None:
         """Take the answer of a RIB below to a probe."""
-        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         statement.verify(member.key)
         self._lower.record_alive(member.name, now.mono_s)
 
@@ -831,7 +833,7 @@ class RibCore:
     def _pass_revocation_up(self, statement: Statement, sender: Name, now: Timestamps) -> None:
         """Forward a revocation that changes nothing here to the tier above, if that is allowed."""
         upper = self._upstream.rib
-        is_root = self._policy.revoked.is_root(statement.fields.bytes_("owner"))
+        is_root = self._policy.revoked.is_root(Revocation.read(statement).issuer.owner_key)
         if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:
             return
         if self._revocations.may_pass_up(statement, sender, now):
@@ -871,7 +873,7 @@ class RibCore:
         return tuple(peer for peer in peers if peer != self._identity.name)
 
     def _take_endpoint_message(self, statement: Statement, now: Timestamps) -> None:
-        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         statement.verify(member.key)
         if statement.type is StatementType.ENDPOINTS_QUERY:
             self._endpoints.handle_query(statement, member, now)
@@ -923,7 +925,7 @@ class RibCore:
         return None
 
     def _take_peer_message(self, statement: Statement, now: Timestamps) -> None:
-        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s)
         if member.role is not Role.RIB or member.domain != self._policy.own or self._replication is None:
             raise StatementError(DropReason.WRONG_DOMAIN, "replicates with RIBs of this domain only")
         statement.verify(member.key)
@@ -977,12 +979,12 @@ class RibCore:
         return is_same and isinstance(known, Route) and (known.is_from_upstream or expires_s > known.expires_s)
 
     def _take_withdrawn_entry(self, entry: Entry, statement: Statement, now: Timestamps) -> None:
-        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        withdrawal = Withdrawal.received(statement, now.unix_s)
         name, sequence = withdrawal.name, withdrawal.sequence
         known = self._store.get(name, statement.signer)
         if known is not None and _rank(known) >= 2 * sequence + 1:
             return
-        member = self._sender(entry.membership, statement, now)
+        member = self._policy.verify_sender(statement, now.unix_s, entry.membership)
         statement.verify(member.key)
         until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer must not shorten the lease of a known entry
@@ -999,20 +1001,14 @@ class RibCore:
     def _is_own_switch(self, member: Membership) -> bool:
         return member.role.is_switch and member.domain == self._policy.own
 
-    def _sender(self, membership: bytes, statement: Statement, now: Timestamps) -> Membership:
-        member = self._policy.verify_membership(membership, now.unix_s)
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
-        return member
-
 
 def _name_in(wire: bytes) -> Name | None:
     """Return the name that a query or a relay is about, unverified; None for other statements."""
     try:
         statement = parse(wire)
         if statement.type is StatementType.RELAY:
-            statement = parse(statement.fields.bytes_("q"))
-        return statement.fields.name("name" if statement.type is StatementType.ADVERTISE else "n")
+            statement = parse(RelayedStatement.from_statement(statement).statement)
+        return Keyed("name" if statement.type is StatementType.ADVERTISE else "n", NAME).read(statement.fields)
     except StatementError:
         return None
 

@@ -18,9 +18,8 @@ from gdp.control.endpoint_query import EndpointQuery, EndpointResponse, batches
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Membership, Role
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, parse
+from gdp.crypto.statements import Statement, check_sequence, parse
 from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind

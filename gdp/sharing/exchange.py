@@ -10,20 +10,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Protocol
 
 from gdp.config.yaml_source import read_yaml
-from gdp.crypto.cbor import decode, encode
 from gdp.crypto.certificates import Role, Root
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import FLAG, NAME, OCTETS, FieldSet, Keyed, text
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
+from gdp.trust.delegation import DELEGATION_MAX_BYTES
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["Exchange", "Exposure", "Mail", "MailKind", "load_groups", "proxies_of", "resolve_recipients"]
-
-
-_EXPOSURE_MAX_BYTES: Final = 256
 
 
 class MailKind(str, Enum):
@@ -36,7 +33,7 @@ class MailKind(str, Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mail:
+class Mail(FieldSet):
     """One received mail.
 
     Args:
@@ -44,28 +41,19 @@ class Mail:
         kind: value of a ``MailKind``.
     """
 
-    sender: str
-    kind: str
-    data: bytes
+    MAX_BYTES = DELEGATION_MAX_BYTES + 1_024
+    sender: Annotated[str, Keyed("from", text(4_096))]
+    kind: Annotated[str, Keyed("kind", text(4_096))]
+    data: Annotated[bytes, Keyed("data", OCTETS)]
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class Exposure(FieldSet):
     """Whether the machine that offered a name exposes it: body of a mail, which is sent where that changes."""
 
-    name: Name
-    is_exposed: bool
-
-    def to_wire(self) -> bytes:
-        """Return the body of the mail."""
-        return encode({"name": self.name, "exposed": self.is_exposed})
-
-    @classmethod
-    def from_wire(cls, wire: bytes) -> Exposure:
-        """Read the body of a mail. Raises ``StatementError``: it is malformed."""
-        value = decode(wire, _EXPOSURE_MAX_BYTES)
-        fields = Fields(value if isinstance(value, dict) else {})
-        return cls(fields.name("name"), fields.flag("exposed"))
+    MAX_BYTES = 256
+    name: Annotated[Name, Keyed("name", NAME)]
+    is_exposed: Annotated[bool, Keyed("exposed", FLAG)]
 
 
 class Exchange(Protocol):

@@ -15,21 +15,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from gdp.crypto.cbor import decode, encode
-from gdp.crypto.fields import Fields
 from gdp.errors import StatementError
 from gdp.names import Name
 from gdp.sharing.exchange import Mail
 from gdp.stores.files import private, public, read_public, write_all
 from gdp.stores.keyring import load_card
-from gdp.trust.delegation import DELEGATION_MAX_BYTES
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["FolderExchange"]
 
 log = logging.getLogger(__name__)
 
-_MAIL_MAX_BYTES: Final = DELEGATION_MAX_BYTES + 1_024
 _NODES: Final = "nodes"
 _MAIL: Final = "mail"
 
@@ -57,16 +53,14 @@ class FolderExchange:
     def send(self, to: Name, kind: str, data: bytes) -> None:
         """Write a mail for a member. Raises ``LocalError``: the folder cannot be written."""
         name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.mail"
-        wire = encode({"from": self._own.label, "kind": kind, "data": data})
+        wire = Mail(sender=self._own.label, kind=kind, data=data).to_cbor()
         write_all(self._folder / _MAIL / to.to_text(), {name: private(wire)})
 
     def receive_mail(self) -> Iterator[Mail]:
         """Yield the waiting mails; each is removed when the next one is asked for, a malformed one at once."""
         for path in sorted((self._folder / _MAIL / self._own.name.to_text()).glob("*.mail")):
             try:
-                value = decode(read_public(path), _MAIL_MAX_BYTES)
-                fields = Fields(value if isinstance(value, dict) else {})
-                mail = Mail(sender=fields.text("from"), kind=fields.text("kind"), data=fields.bytes_("data"))
+                mail = Mail.from_cbor(read_public(path))
             except StatementError as error:
                 log.warning("mail removed path=%s reason=%s", path, error)
                 path.unlink()

@@ -215,7 +215,7 @@ class Grants:
         known, takes = issued.is_exposed, issued.delegation.rights - _GIVES
         if issued.is_own or not takes or is_exposed is bool(known):
             return
-        wire = Exposure(issued.delegation.name, is_exposed).to_wire()
+        wire = Exposure(issued.delegation.name, is_exposed).to_cbor()
         self._inform(store, issued, MailKind.EXPOSURE, None if known is None else wire, {"is_exposed": is_exposed})
 
     def _inform(

@@ -373,7 +373,7 @@ class Sharing:
                     at.state = self._folder.update_offer(at.state, name, mail.sender, qos=qos)
                     at.offers = list(self._folder.offers(at.state))
                 elif mail.kind == MailKind.EXPOSURE.value:
-                    stated = Exposure.from_wire(mail.data)
+                    stated = Exposure.from_cbor(mail.data)
                     is_withdrawn = not stated.is_exposed
                     at.state = self._folder.update_offer(at.state, stated.name, mail.sender, is_withdrawn=is_withdrawn)
                     at.offers = list(self._folder.offers(at.state))

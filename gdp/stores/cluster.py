@@ -17,11 +17,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
+from gdp.control.query import TRANSIT_MAX
 from gdp.control.rib_replication import Key
-from gdp.crypto import cbor
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import CERT, NAME, STATEMENT, FieldSet, Keyed, many
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError
 from gdp.names import NAME_BYTES, Name
@@ -69,6 +69,18 @@ class _Write:
     tag: bytes
     command: Command
     context: bytes = b""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Context(FieldSet):
+    """What a node's advertisements at one sender share."""
+
+    sender: Annotated[Name, Keyed("w", NAME)]
+    domain: Annotated[Name, Keyed("d", NAME)]
+    via: Annotated[Name, Keyed("v", NAME)]
+    transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
+    membership: Annotated[bytes, Keyed("m", CERT)]
+    rtcert: Annotated[bytes, Keyed("r", STATEMENT)]
 
 
 class ClusterStore:
@@ -266,16 +278,14 @@ class ClusterStore:
         The context that a node's advertisements share is the dictionary of the compression.
         """
         body = UnverifiedAdvertisement.from_statement(parse(route.advertisement))
-        context = cbor.encode(
-            {
-                "w": route.sender,
-                "d": route.domain,
-                "v": route.via,
-                "x": list(route.transit),
-                "m": body.membership,
-                "r": body.rtcert,
-            }
-        )
+        context = _Context(
+            sender=route.sender,
+            domain=route.domain,
+            via=route.via,
+            transit=route.transit,
+            membership=body.membership,
+            rtcert=body.rtcert,
+        ).to_cbor()
         tag = tag_of(route.name)
         context_id = blake2b(context, digest_size=_ID_BYTES).digest()
         squeeze = zlib.compressobj(6, zlib.DEFLATED, -15, zdict=context)
@@ -311,19 +321,16 @@ class ClusterStore:
             advertisement_wire = zlib.decompressobj(-15, zdict=context).decompress(data[_ID_BYTES:], 1 << 16)
         except zlib.error as error:
             raise StatementError(DropReason.MALFORMED, "a record of the store") from error
-        decoded = cbor.decode(context)
-        if not isinstance(decoded, dict):
-            raise StatementError(DropReason.MALFORMED, "a context of the store")
-        fields = Fields(decoded)
+        shared = _Context.from_cbor(context)
         advertisement = self._verifier.verify(advertisement_wire, self._now.unix_s)
         if advertisement.name != name:
             raise StatementError(DropReason.WRONG_NAME, "a record of the store under another name")
         return Route.of(
             advertisement,
-            sender=fields.name("w"),
-            domain=fields.name("d"),
-            via=fields.name("v"),
-            transit=tuple(fields.names("x", 64)),
+            sender=shared.sender,
+            domain=shared.domain,
+            via=shared.via,
+            transit=shared.transit,
             expires_s=self._now.mono_s + min(left_s, advertisement.lease_s),
         )
 

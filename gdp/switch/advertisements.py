@@ -202,7 +202,7 @@ class AdvertisementHandler:
         Raises:
             StatementError: it is not valid, or is older than the present advertisement.
         """
-        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        withdrawal = Withdrawal.received(statement, now.unix_s)
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
         statement.verify(neighbour.key)

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.diagnostics import Diagnostics, Question
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
-from gdp.crypto.subject import Subject
+from gdp.crypto.schema import NAME_OR_ZERO, Keyed
 from gdp.errors import DropReason, StatementError
-from gdp.limits import CHAIN_MAX
-from gdp.names import NAME_BYTES, ZERO, Name
+from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.multicast import MulticastTrees
@@ -28,6 +28,8 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["DiagnosticAnswers"]
 
 _MAC_BYTES: Final = 6
+_END: Final = Keyed("t", NAME_OR_ZERO, absent=None)
+_PUBLISHER: Final = Keyed("p", NAME_OR_ZERO, absent=ZERO)
 
 
 class DiagnosticAnswers:
@@ -77,7 +79,7 @@ class DiagnosticAnswers:
         result: dict[str, object] = {}
         if question.port is not None:
             result["in"] = self._link(question.port, question.mac)
-        end = Name(question.body.bytes_("t", NAME_BYTES)) if "t" in question.body else question.target
+        end = _END.read(question.body) or question.target
         hops = self._table.entries.get(end + question.asker.name) or self._table.entries.get(end)
         if end != self._me and hops:
             result["out"] = self._link(hops[0][0], hops[0][1][:_MAC_BYTES])
@@ -85,7 +87,7 @@ class DiagnosticAnswers:
             self._check_right(question, now)
         except StatementError as error:
             return result | {"w": error.reason.label}
-        wanted = Name(question.body.bytes_("p", NAME_BYTES)) if "p" in question.body else ZERO
+        wanted = _PUBLISHER.read(question.body)
         result["branches"] = [
             {"p": tree.publisher, **self._link(port, mac)}
             for tree in self._multicast.trees.of_topic(question.name)
@@ -102,8 +104,9 @@ class DiagnosticAnswers:
             return
         if "right" not in body:
             raise StatementError(DropReason.NOT_DELEGATED, "no right on the name")
-        subject, right = Subject.from_fields(body, name), Right.from_wire(body.text("right"))
-        self._verifier.verify_right(subject, right, body.byte_strings("chain", CHAIN_MAX), asker, now.unix_s)
+        shown = RightEvidence.from_fields(body)
+        shown.subject.expect(name)
+        self._verifier.verify_right(shown.subject, shown.right, shown.chain, asker, now.unix_s)
 
     def resolve(self, question: Question, now: Timestamps) -> Mapping[str, object] | None:
         """Return who advertises a name, for a node that is attached here; None: the RIB is being queried."""

@@ -43,8 +43,8 @@ class Evidence:
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
         """Return the location that a switch reports of a node that is attached to it."""
         relayed = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
-        member = self._policy.verify_membership(relayed.membership, now.unix_s)
-        if member.name != statement.signer or not member.role.is_switch:
+        member = self._policy.verify_sender(statement, now.unix_s)
+        if not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
         advertisement = self._verifier.verify_statement(parse(relayed.statement), now.unix_s)

@@ -16,13 +16,12 @@ from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES, INCARNATION_BYTES
 from gdp.control.hello_port import HelloPort
-from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
+from gdp.control.link_state import Adjacency, AttachedRib, LinkState, LinkStateVersion, Scope
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement
+from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
 from gdp.names import Name
@@ -114,19 +113,17 @@ class Flooding:
             StatementError: it is not valid, or does not belong here.
         """
         fields = statement.fields
+        version = LinkStateVersion.from_fields(fields)
         if statement.signer != self._identity.name:
-            scope = Scope.BORDER if fields.text("o", 8) == Scope.BORDER.value else Scope.DOMAIN
-            if not self.link_states.is_news(statement.signer, scope, fields.uint("s")):
+            if not self.link_states.is_news(statement.signer, version.scope, version.sequence):
                 return False
-            if self.link_states.is_past(
-                statement.signer, scope, fields.uint("s"), fields.bytes_("b", INCARNATION_BYTES)
-            ):
+            if self.link_states.is_past(statement.signer, version.scope, version.sequence, version.incarnation_id):
                 raise StatementError(DropReason.STALE, "a link state that is over")
-            if abs(now.unix_s - fields.uint("e")) > LINK_STATE_AGE_MAX_S:
+            if abs(now.unix_s - version.said_unix_s) > LINK_STATE_AGE_MAX_S:
                 raise StatementError(DropReason.STALE, "a link state of another time")
-        check_sequence(fields.uint("s"), now.unix_s)
-        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer or not member.role.is_switch:
+        check_sequence(version.sequence, now.unix_s)
+        member = self._policy.verify_sender(statement, now.unix_s)
+        if not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
         is_leaf = member.role is Role.LEAF
         state = LinkState.from_origin(fields, member.name, member.domain, is_leaf=is_leaf)

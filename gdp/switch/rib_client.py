@@ -28,6 +28,7 @@ from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
@@ -224,7 +225,7 @@ class RibClient:
             StatementError: it is not valid, or its sender received no query.
         """
         fields = statement.fields
-        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
+        member = self._policy.verify_membership(CERTIFICATE.read(fields), now.unix_s)
         if statement.type is StatementType.PRESENCE and member.role is Role.RIB and member.name == statement.signer:
             statement.verify(member.key)
             self._presence.handle_question(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
@@ -278,8 +279,8 @@ class RibClient:
             StatementError: it is not valid, or contains no location.
         """
         fields = statement.expect(StatementType.ANSWER)
-        member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
-        if member.name != statement.signer or not (member.role.is_switch or member.role is Role.RIB):
+        member = self._policy.verify_sender(statement, now.unix_s)
+        if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
         statement.verify(member.key)
         response = Response.from_fields(fields)

@@ -14,23 +14,27 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Final
 
 from gdp.crypto.keys import KEY_BYTES, PublicKey, SigningKey
-from gdp.crypto.statements import Statement, StatementType, parse, sign
-from gdp.crypto.subject import Subject
-from gdp.crypto.validity import Validity
+from gdp.crypto.schema import FLAG, NAME, STATEMENT, Body, Keyed, many, octets
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.subject import NAMED_SUBJECT, Subject
+from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, StatementError
 from gdp.limits import CHAIN_MAX
 from gdp.names import Name
 from gdp.trust.lru import Lru
 from gdp.trust.revocations import Revocations
-from gdp.trust.right import Right, rights_from_fields, rights_to_wire
+from gdp.trust.right import RIGHTS, Right
 
-__all__ = ["AdCert", "AdCertCache", "Chain"]
+__all__ = ["CHAIN", "AdCert", "AdCertCache", "Chain"]
+
+CHAIN: Final = many(STATEMENT, CHAIN_MAX, is_cut=False)  # AdCerts from the owner on, signed statements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AdCert:
+class AdCert(Body):
     """One link of a chain.
 
     Args:
@@ -40,14 +44,15 @@ class AdCert:
         fingerprint: SHA-256 of the signed part, for revocation.
     """
 
-    subject: Subject
+    TYPE = StatementType.ADCERT
+    subject: Annotated[Subject, NAMED_SUBJECT]
     issuer: Name
-    delegate: Name
-    delegate_key: bytes
-    rights: frozenset[Right]
-    validity: Validity
-    may_delegate: bool
-    fingerprint: bytes
+    delegate: Annotated[Name, Keyed("to", NAME)]
+    delegate_key: Annotated[bytes, Keyed("key", octets(KEY_BYTES))]
+    rights: Annotated[frozenset[Right], Keyed("rights", RIGHTS)]
+    validity: Annotated[Validity, VALIDITY]
+    may_delegate: Annotated[bool, Keyed("more", FLAG)]
+    fingerprint: bytes = b""
 
     @staticmethod
     def make(
@@ -70,31 +75,21 @@ class AdCert:
         Raises:
             LocalError: rights that cannot be delegated.
         """
-        body = {
-            **subject.to_fields(),
-            "name": subject.name,
-            "to": delegate.name,
-            "key": delegate.owner_key,
-            "rights": rights_to_wire(rights),
-            "more": may_delegate,
-            **validity.to_fields(),
-        }
-        return sign(StatementType.ADCERT, body, issuer, key)
+        link = AdCert(
+            subject=subject,
+            issuer=issuer,
+            delegate=delegate.name,
+            delegate_key=delegate.owner_key,
+            rights=frozenset(rights),
+            validity=validity,
+            may_delegate=may_delegate,
+        )
+        return link.to_wire(issuer, key)
 
     @classmethod
-    def from_statement(cls, statement: Statement) -> AdCert:
-        """Read a parsed statement; its signature is not checked. Raises ``StatementError``: MALFORMED or WRONG_NAME."""
-        fields = statement.expect(StatementType.ADCERT)
-        return cls(
-            subject=Subject.from_fields(fields, fields.name("name")),
-            issuer=statement.signer,
-            delegate=fields.name("to"),
-            delegate_key=fields.bytes_("key", KEY_BYTES),
-            rights=rights_from_fields(fields, "rights"),
-            validity=Validity.from_fields(fields),
-            may_delegate=fields.flag("more"),
-            fingerprint=statement.fingerprint,
-        )
+    def given_by(cls, statement: Statement) -> dict[str, object]:
+        """Return issuer and fingerprint."""
+        return {"issuer": statement.signer, "fingerprint": statement.fingerprint}
 
 
 class AdCertCache:

@@ -8,30 +8,55 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final, cast
 
-from gdp.crypto.cbor import decode, encode
-from gdp.crypto.fields import Fields
+from gdp.crypto.cbor import Value
 from gdp.crypto.identity import Identity
-from gdp.crypto.subject import Subject
+from gdp.crypto.schema import MAP, NAME, STATEMENT, FieldSet, Keyed, inner, many, mapped, one_of, uint
+from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.trust.adcert import AdCertCache, Chain
+from gdp.trust.adcert import CHAIN, AdCertCache, Chain
 from gdp.trust.grants import EPOCH_MAX, Grant, open_grant
-from gdp.trust.right import Right, rights_from_fields, rights_to_wire
+from gdp.trust.right import RIGHTS, Right
 
 __all__ = ["DELEGATION_MAX_BYTES", "EPOCHS_MAX", "Delegation"]
 
 DELEGATION_MAX_BYTES: Final = 512 << 10
 EPOCHS_MAX: Final = 256  # in one file
-_FORMAT: Final = "gdp-delegation-1"
+
+
+class _Format(str, Enum):
+    DELEGATION_1 = "gdp-delegation-1"
+
+
+@dataclass(frozen=True, slots=True)
+class _Epoch(FieldSet):
+    epoch: Annotated[int, Keyed("epoch", uint(EPOCH_MAX))]
+    grant: Annotated[bytes, Keyed("grant", STATEMENT)]
+
+
+def _metadata(items: Mapping[str, Value]) -> Metadata:
+    try:
+        return Metadata(cast("Mapping[str, str | int]", items))
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+
+
+_METADATA: Final = mapped(MAP, _metadata, dict)
+_GRANTS: Final = mapped(
+    many(inner(_Epoch), EPOCHS_MAX),
+    lambda grants: MappingProxyType({each.epoch: each.grant for each in grants}),
+    lambda grants: tuple(_Epoch(*each) for each in sorted(grants.items())),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Delegation:
+class Delegation(FieldSet):
     """The rights of a node on a name, and their proofs.
 
     Args:
@@ -40,12 +65,14 @@ class Delegation:
         metadata: the meaning of the name, if the issuer added it; its hash belongs to the name.
     """
 
-    subject: Subject
-    node: Name
-    rights: frozenset[Right]
-    chain: tuple[bytes, ...]
-    grants: Mapping[int, bytes]
-    metadata: Metadata | None = None
+    MAX_BYTES = DELEGATION_MAX_BYTES
+    subject: Annotated[Subject, NAMED_SUBJECT]
+    node: Annotated[Name, Keyed("node", NAME)]
+    rights: Annotated[frozenset[Right], Keyed("rights", RIGHTS)]
+    chain: Annotated[tuple[bytes, ...], Keyed("chain", CHAIN)]
+    grants: Annotated[Mapping[int, bytes], Keyed("grants", _GRANTS)]
+    metadata: Annotated[Metadata | None, Keyed("metadata", _METADATA, absent=None, is_omitted=True)] = None
+    format: Annotated[_Format, Keyed("format", one_of(_Format))] = _Format.DELEGATION_1
 
     @property
     def name(self) -> Name:
@@ -56,19 +83,7 @@ class Delegation:
         """Return the file's bytes: deterministic CBOR. Raises ``LocalError``: more epochs than a file may hold."""
         if len(self.grants) > EPOCHS_MAX:
             raise LocalError(f"a delegation holds at most {EPOCHS_MAX} epochs")
-        grants = [{"epoch": epoch, "grant": wire} for epoch, wire in sorted(self.grants.items())]
-        body = {
-            **self.subject.to_fields(),
-            "format": _FORMAT,
-            "name": self.subject.name,
-            "node": self.node,
-            "rights": rights_to_wire(self.rights),
-            "chain": list(self.chain),
-            "grants": grants,
-        }
-        if self.metadata is not None:
-            body["metadata"] = dict(self.metadata)
-        return encode(body)
+        return self.to_cbor()
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Delegation:
@@ -77,21 +92,12 @@ class Delegation:
         Raises:
             StatementError: MALFORMED or WRONG_NAME.
         """
-        value = decode(wire, DELEGATION_MAX_BYTES)
-        fields = Fields(value if isinstance(value, dict) else {})
-        if fields.text("format") != _FORMAT:
-            raise StatementError(DropReason.MALFORMED, "a delegation of another format")
-        subject = Subject.from_fields(fields, fields.name("name"))
-        return cls(
-            subject=subject,
-            node=fields.name("node"),
-            rights=rights_from_fields(fields, "rights"),
-            chain=tuple(fields.byte_strings("chain", CHAIN_MAX)),
-            grants=MappingProxyType(
-                {each.uint("epoch", EPOCH_MAX): each.bytes_("grant") for each in fields.maps("grants", EPOCHS_MAX)}
-            ),
-            metadata=_metadata(fields.map_("metadata"), subject) if "metadata" in fields else None,
-        )
+        return cls.from_cbor(wire)
+
+    def check(self) -> None:
+        """Return if the metadata is the name's. Raises ``StatementError``: WRONG_NAME."""
+        if self.metadata is not None and self.metadata.digest() != self.subject.digest:
+            raise StatementError(DropReason.WRONG_NAME, "metadata of another name")
 
     def verify(self, identity: Identity, unix_s: float) -> None:
         """Return if the node now has all rights in the file. Revocations are checked elsewhere.
@@ -121,18 +127,3 @@ class Delegation:
             if (grant.name, grant.epoch) != (self.name, epoch):
                 raise StatementError(DropReason.MALFORMED, "a grant for another name or epoch")
         return opened
-
-
-def _metadata(fields: Fields, subject: Subject) -> Metadata:
-    items: dict[str, str | int] = {}
-    for key, value in fields.items():
-        if isinstance(value, bool) or not isinstance(value, str | int):
-            raise StatementError(DropReason.MALFORMED, "metadata of the wrong form")
-        items[key] = value
-    try:
-        metadata = Metadata(items)
-    except LocalError as error:
-        raise StatementError(DropReason.MALFORMED, str(error)) from error
-    if metadata.digest() != subject.digest:
-        raise StatementError(DropReason.WRONG_NAME, "metadata of another name")
-    return metadata

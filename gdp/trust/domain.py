@@ -12,6 +12,8 @@ from types import MappingProxyType
 from typing import Final
 
 from gdp.crypto.certificates import Membership, Root, Unverified
+from gdp.crypto.schema import CERTIFICATE
+from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.trust.audit import AuditTrail
@@ -95,6 +97,20 @@ class Policy:
             member = self._verified(Unverified.from_wire(wire), unix_s)
             self._members.put(entry, member)
         self.check_member(member, unix_s)
+        return member
+
+    def verify_sender(self, statement: Statement, unix_s: float, wire: bytes | None = None) -> Membership:
+        """Return the membership in a statement if it is its signer's. The signature is not checked.
+
+        Args:
+            wire: of the membership, where it does not stand under ``c``.
+
+        Raises:
+            StatementError: MALFORMED, or as ``verify_membership``.
+        """
+        member = self.verify_membership(CERTIFICATE.read(statement.fields) if wire is None else wire, unix_s)
+        if member.name != statement.signer:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
         return member
 
     def check_member(self, member: Membership, unix_s: float) -> None:

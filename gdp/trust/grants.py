@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Annotated, Final
 
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
@@ -23,8 +23,9 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp.crypto.identity import Identity
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey, SigningKey
-from gdp.crypto.statements import Statement, StatementType, parse, sign
-from gdp.crypto.subject import Subject
+from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, uint
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.subject import SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 
@@ -56,6 +57,17 @@ class Grant:
     name: Name
     epoch: int
     secret: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sealed(Body):
+    """A grant as it is signed."""
+
+    TYPE = StatementType.GRANT
+    subject: Annotated[Subject, SUBJECT]
+    node: Annotated[Name, Keyed("to", NAME)]
+    epoch: Annotated[int, Keyed("epoch", uint(EPOCH_MAX))]
+    sealed: Annotated[bytes, Keyed("sealed", OCTETS)]
 
 
 def begun_epochs(secrets: Mapping[int, bytes], unix_s: float) -> dict[int, bytes]:
@@ -107,13 +119,8 @@ def make_grant(
         StatementError: MALFORMED, the node's public key is invalid.
     """
     secret = topic_secret(owner_master, subject.name, epoch)
-    body = {
-        **subject.to_fields(),
-        "to": node,
-        "epoch": epoch,
-        "sealed": kem.seal(secret, _info(subject.name, epoch, node)),
-    }
-    return sign(StatementType.GRANT, body, subject.name, key)
+    sealed = kem.seal(secret, _info(subject.name, epoch, node))
+    return _Sealed(subject, node, epoch, sealed).to_wire(subject.name, key)
 
 
 def open_grant(identity: Identity, wire: bytes, delegates: Collection[bytes] = ()) -> Grant:
@@ -127,17 +134,15 @@ def open_grant(identity: Identity, wire: bytes, delegates: Collection[bytes] = (
         LocalError: a library without the KEM.
     """
     statement = parse(wire)
-    fields = statement.expect(StatementType.GRANT)
-    subject = Subject.from_fields(fields, statement.signer)
-    epoch = fields.uint("epoch", EPOCH_MAX)
-    if fields.name("to") != identity.name:
+    grant = _Sealed.from_statement(statement)
+    grant.subject.expect(statement.signer)
+    if grant.node != identity.name:
         raise StatementError(DropReason.NOT_FOR_US, "a grant to another node")
-    sealed = fields.bytes_("sealed")
-    _verify(statement, (subject.owner_key, *delegates))
-    secret = identity.kem.open(sealed, _info(subject.name, epoch, identity.name))
+    _verify(statement, (grant.subject.owner_key, *delegates))
+    secret = identity.kem.open(grant.sealed, _info(grant.subject.name, grant.epoch, identity.name))
     if len(secret) != SECRET_BYTES:
         raise StatementError(DropReason.MALFORMED, f"a secret has {SECRET_BYTES} bytes")
-    return Grant(subject.name, epoch, secret)
+    return Grant(grant.subject.name, grant.epoch, secret)
 
 
 def _verify(statement: Statement, keys: tuple[bytes, ...]) -> None:

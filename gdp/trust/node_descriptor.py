@@ -7,14 +7,14 @@ this is the node that the owner means; the name in it cannot be another's.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Annotated, Protocol
 
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.identity import Identity
-from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.kem import KEM_PUBLIC, KemPublicKey
+from gdp.crypto.schema import CERT, Body, Keyed
 from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.subject import Subject
-from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
 __all__ = ["NodeDescriptor", "Recipient"]
@@ -30,6 +30,13 @@ class Recipient(Protocol):
     @property
     def kem(self) -> KemPublicKey:
         """Return the public key that secrets for the node are sealed to."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Card(Body):
+    TYPE = StatementType.CARD
+    member: Annotated[bytes, Keyed("member", CERT)]
+    kem: Annotated[KemPublicKey, Keyed("kem", KEM_PUBLIC)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +67,7 @@ class NodeDescriptor:
     @staticmethod
     def make(identity: Identity) -> bytes:
         """Return the node's signed statement."""
-        body = {"member": identity.membership, "kem": identity.kem.public.wire}
-        return identity.sign(StatementType.CARD, body)
+        return _Card(identity.membership, identity.kem.public).to_wire(identity.name, identity.key)
 
     @classmethod
     def from_wire(cls, wire: bytes) -> NodeDescriptor:
@@ -71,13 +77,9 @@ class NodeDescriptor:
             StatementError: MALFORMED, BAD_CERTIFICATE, WRONG_NAME or BAD_SIGNATURE.
         """
         statement = parse(wire)
-        fields = statement.expect(StatementType.CARD)
-        stranger = Unverified.from_wire(fields.bytes_("member"))
-        if stranger.subject.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "a card under another's certificate")
-        kem = KemPublicKey.from_wire(fields.bytes_("kem"))
-        statement.verify(stranger.key)
-        return cls(stranger.subject, kem, stranger, wire)
+        card = _Card.from_statement(statement)
+        stranger = Unverified.of_signer(card.member, statement)
+        return cls(stranger.subject, card.kem, stranger, wire)
 
     def member_of(self, root: Root, unix_s: float) -> Membership:
         """Return the membership if ``root`` issued it and it is valid now.

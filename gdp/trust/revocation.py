@@ -9,16 +9,18 @@ revoke only its own certificates. ``revocations.py`` stores them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from gdp.crypto.keys import PublicKey, SigningKey
-from gdp.crypto.statements import Statement, StatementType, sign
-from gdp.crypto.subject import Subject
+from gdp.crypto.schema import Body, Keyed, octets, uint
+from gdp.crypto.statements import Statement, StatementType
+from gdp.crypto.subject import SUBJECT, Subject
 
 __all__ = ["Revocation"]
 
 
 @dataclass(frozen=True, slots=True)
-class Revocation:
+class Revocation(Body):
     """One revoked certificate.
 
     Args:
@@ -27,15 +29,15 @@ class Revocation:
         until_unix_s: when the certificate would have expired.
     """
 
-    fingerprint: bytes
-    issuer: Subject
-    until_unix_s: int
+    TYPE = StatementType.REVOKE
+    fingerprint: Annotated[bytes, Keyed("cert", octets(32))]
+    issuer: Annotated[Subject, SUBJECT]
+    until_unix_s: Annotated[int, Keyed("until", uint())]
 
     @staticmethod
     def make(key: SigningKey, issuer: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
         """Return the signed statement; ``key`` must be the issuer's."""
-        body = {**issuer.to_fields(), "cert": fingerprint, "until": until_unix_s}
-        return sign(StatementType.REVOKE, body, issuer.name, key)
+        return Revocation(fingerprint, issuer, until_unix_s).to_wire(issuer.name, key)
 
     @classmethod
     def read(cls, statement: Statement) -> Revocation:
@@ -44,9 +46,9 @@ class Revocation:
         Raises:
             StatementError: MALFORMED or WRONG_NAME.
         """
-        fields = statement.expect(StatementType.REVOKE)
-        issuer = Subject.from_fields(fields, statement.signer)
-        return cls(fields.bytes_("cert", 32), issuer, fields.uint("until"))
+        revocation = cls.from_fields(statement.expect(cls.TYPE))
+        revocation.issuer.expect(statement.signer)
+        return revocation
 
     def verify(self, statement: Statement) -> None:
         """Return if the issuer signed the statement that this was read from.

@@ -18,7 +18,7 @@ from hashlib import blake2b, sha256
 from operator import xor
 from typing import Final, NamedTuple
 
-from gdp.crypto.statements import Statement, StatementType, assemble
+from gdp.crypto.statements import Statement, assemble
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.limits import (
@@ -426,5 +426,5 @@ def _packed(root: _Root, revocation: Revocation, statement: Statement) -> bytes:
 def _unpacked(root: _Root, fingerprint: bytes, value: bytes) -> bytes:
     if len(value) != _UNTIL_BYTES + _SIGNATURE_BYTES or root.subject is None:
         return value[_UNTIL_BYTES:]
-    body = {**root.subject.to_fields(), "cert": fingerprint, "until": _end_of(value)}
-    return assemble(StatementType.REVOKE, body, root.subject.name, value[_UNTIL_BYTES:])
+    body = Revocation(fingerprint, root.subject, _end_of(value))
+    return assemble(body.TYPE, body.to_fields(), root.subject.name, value[_UNTIL_BYTES:])

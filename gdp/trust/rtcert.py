@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import Annotated
 
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey
-from gdp.crypto.statements import StatementType, parse
-from gdp.crypto.validity import Validity
+from gdp.crypto.schema import NAME, Body, Keyed
+from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 from gdp.trust.lru import Lru
@@ -20,18 +22,24 @@ __all__ = ["RtCert", "RtCertCache"]
 
 
 @dataclass(frozen=True, slots=True)
-class RtCert:
+class RtCert(Body):
     """The right of ``switch`` to attract the traffic of ``node``."""
 
+    TYPE = StatementType.RTCERT
     node: Name
-    switch: Name
-    validity: Validity
-    fingerprint: bytes
+    switch: Annotated[Name, Keyed("switch", NAME)]
+    validity: Annotated[Validity, VALIDITY]
+    fingerprint: bytes = b""
 
     @staticmethod
     def make(identity: Identity, switch: Name, validity: Validity) -> bytes:
         """Return the node's signed statement."""
-        return identity.sign(StatementType.RTCERT, {"switch": switch, **validity.to_fields()})
+        return RtCert(identity.name, switch, validity).to_wire(identity.name, identity.key)
+
+    @classmethod
+    def given_by(cls, statement: Statement) -> dict[str, object]:
+        """Return node and fingerprint."""
+        return {"node": statement.signer, "fingerprint": statement.fingerprint}
 
 
 class RtCertCache:
@@ -50,8 +58,7 @@ class RtCertCache:
         known = self._good.get(entry)
         if known is None:
             statement = parse(wire)
-            fields = statement.expect(StatementType.RTCERT)
-            known = RtCert(statement.signer, fields.name("switch"), Validity.from_fields(fields), statement.fingerprint)
+            known = RtCert.from_statement(statement)
             if known.node != node:
                 raise StatementError(DropReason.NOT_DELEGATED, "an RtCert of another node")
             statement.verify(node_key)

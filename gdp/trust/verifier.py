@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import check_sequence
-from gdp.crypto.statements import Statement, parse
+from gdp.crypto.statements import Statement, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
-from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.advertisement import MS, Advertisement, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right
@@ -28,7 +27,6 @@ __all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "AdvertisementVerifier"]
 
 ADCERTS_REMEMBERED: Final = 16_384
 RTCERTS_REMEMBERED: Final = 4_096
-_MS = 1_000
 
 
 class AdvertisementVerifier:
@@ -74,31 +72,14 @@ class AdvertisementVerifier:
             StatementError: with the reason.
         """
         body = UnverifiedAdvertisement.from_statement(statement)
-        if not LEASE_MIN_S * _MS <= body.lease_ms <= LEASE_MAX_S * _MS:
+        if not LEASE_MIN_S * MS <= body.lease_ms <= LEASE_MAX_S * MS:
             raise StatementError(DropReason.LEASE_BOUNDS, f"{body.lease_ms} ms")
         check_sequence(body.sequence, unix_s)
-        member = self.policy.verify_membership(body.membership, unix_s)
-        if member.name != statement.signer:
-            raise StatementError(DropReason.BAD_CERTIFICATE, "the membership is of another node")
+        member = self.policy.verify_sender(statement, unix_s, body.membership)
         statement.verify(member.key)
         rtcert = self._rtcerts.verified(body.rtcert, member.name, member.key)
         chain = self._chain(body.subject, body.right, body.chain, member)
-        advertisement = Advertisement(
-            subject=body.subject,
-            right=body.right,
-            member=member,
-            chain=chain,
-            rtcert=rtcert,
-            sequence=body.sequence,
-            incarnation=body.incarnation,
-            lease_s=body.lease_ms / _MS,
-            is_global=body.is_global,
-            wire=statement.wire,
-            previous=body.previous,
-            exchange=body.exchange,
-            paths=body.paths,
-            is_session=body.is_session,
-        )
+        advertisement = body.verified(member, chain, rtcert, statement.wire)
         self._check_evidence(advertisement, unix_s)
         return advertisement
 

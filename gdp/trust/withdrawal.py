@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.schema import NAME, Body, Keyed, uint
-from gdp.crypto.statements import Statement, StatementType
-from gdp.errors import DropReason, StatementError
+from gdp.crypto.statements import Statement, StatementType, check_sequence
 from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import Name
 from gdp.trust.right import RIGHT, Right
@@ -25,20 +23,18 @@ class Withdrawal(Body):
     """The name and the right that its signer advertises no more."""
 
     TYPE = StatementType.WITHDRAW
+    MAX_BYTES = WITHDRAWAL_MAX_BYTES
     name: Annotated[Name, Keyed("n", NAME)]
     right: Annotated[Right, Keyed("right", RIGHT)]
     sequence: Annotated[int, Keyed("s", uint())]
 
     @classmethod
-    def from_statement(cls, statement: Statement, unix_s: float) -> Withdrawal:
+    def received(cls, statement: Statement, unix_s: float) -> Withdrawal:
         """Read a parsed statement; no signature is checked.
 
         Raises:
             StatementError: MALFORMED, or TOO_BIG to be forwarded.
         """
-        fields = statement.expect(StatementType.WITHDRAW)
-        if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
-            raise StatementError(DropReason.TOO_BIG, "a withdrawal")
-        withdrawal = cls.from_fields(fields)
+        withdrawal = cls.from_statement(statement)
         check_sequence(withdrawal.sequence, unix_s)
         return withdrawal

@@ -10,9 +10,9 @@ from typing import TypeAlias
 
 from gdp.service.dispatch import Ask
 from gdp.service.dispatch import Stop as DispatchStop
+from gdp.service.frames import Stop
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.wire.replication import to_wire
-from proxy.wire.service import Stop
 
 __all__ = ["BroadcastQueue", "Effect", "wire_of"]
 

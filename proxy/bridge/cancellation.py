@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from gdp.names import Name
+from gdp.service.frames import Stop
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.core.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.endpoints.core.endpoint import RosEndpoint
-from proxy.wire.service import Stop
 
 __all__ = ["NO_FIELDS", "TRIGGER", "Cancellation"]
 

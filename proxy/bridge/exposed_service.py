@@ -20,6 +20,7 @@ from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
+from gdp.service.frames import Answer, Request, Stop
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
@@ -49,7 +50,6 @@ from proxy.endpoints.core.endpoint import (
 )
 from proxy.serial.schema import DefinitionError
 from proxy.wire.replication import is_word, sequencer_message, to_wire
-from proxy.wire.service import Answer, Request, Stop
 
 __all__ = ["ExposedService"]
 
@@ -101,7 +101,7 @@ class ExposedService(ServiceFlow):
         self._kept = None if not rule.is_ordered else self._keep(random_start)
         topics = zip(self.parts.topics, PROFILES, strict=False)
         self._topics = [dispatcher.subscribe(self, *part, profile) for part, profile in topics]
-        self._publisher = context.member.serve(topic, self._exchange.to_wire(), **self.options())
+        self._publisher = context.member.serve(topic, self._exchange.to_cbor(), **self.options())
         self._responses = ResponseSender(self, self._exchange, self._serving, self._publisher)
         self._cancellation = Cancellation(
             endpoint=endpoint,
@@ -187,7 +187,7 @@ class ExposedService(ServiceFlow):
         """Redirect clients to other servers, and answer calls under way."""
         if self._refuses_from_s is None:
             self._refuses_from_s = now_s + _NOTICE_S
-            self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
+            self._publisher.describe(replace(self._exchange, is_leaving=True).to_cbor())
 
     def is_drained(self, now_s: float) -> bool:
         """Return whether none will be accepted, none is under way, and the clients have confirmed their responses."""
@@ -211,7 +211,7 @@ class ExposedService(ServiceFlow):
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
             self.dispatcher.close(handle)
-        self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
+        self._publisher.describe(replace(self._exchange, is_leaving=True).to_cbor())
         self.context.member.flush(now_s)
 
     def close(self, now_s: float) -> None:

@@ -21,6 +21,7 @@ from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
+from gdp.service.frames import PATIENCE_MAX_MS, Answer, Outcome, Request
 from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
@@ -39,7 +40,7 @@ from proxy.endpoints.core.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
 from proxy.wire.replication import follower_message, is_word
-from proxy.wire.service import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, too_large
+from proxy.wire.service import Exchange, News, too_large
 
 __all__ = ["ImportedService"]
 
@@ -201,10 +202,10 @@ class ImportedService(ServiceFlow):
             exchange = self.parts.known(self.dispatcher.endpoint, self.flow_spec.rule.encoding)
         except LocalError:
             return b""
-        return exchange.to_wire()
+        return exchange.to_cbor()
 
     def _open(self, ours: Exchange) -> None:
-        self._publisher.describe(ours.to_wire())
+        self._publisher.describe(ours.to_cbor())
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
         self._no_answers = tuple(NoAnswer.of(each) for each in ours.services)
         self._virtual_server.open(ours)

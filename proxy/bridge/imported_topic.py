@@ -179,7 +179,7 @@ class ImportedTopic:
         publisher = delivered.publisher
         if (publisher, message.description) not in self._sources:
             self._sources.put(publisher, message.description, None)
-            ready = self._describe(publisher, TopicDescription.from_wire(message.description))
+            ready = self._describe(publisher, TopicDescription.from_cbor(message.description))
             self._sources.put(publisher, message.description, ready)
         channels = self._sources.get(publisher, message.description)
         if channels is None or not self._output.is_open:

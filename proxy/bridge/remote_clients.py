@@ -63,7 +63,7 @@ class RemoteClients:
 
     def _learn(self, description: bytes) -> _Caller:
         try:
-            theirs = Exchange.from_wire(description)
+            theirs = Exchange.from_cbor(description)
             pairs = zip(theirs.services, self._ours.services, strict=False)
             ready = (MessageDecoder.ready(a.request, theirs.encoding, b.request, self._ros) for a, b in pairs)
             return _Caller(description, tuple(ready))

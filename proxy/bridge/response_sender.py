@@ -9,11 +9,12 @@ from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
+from gdp.service.frames import Answer, Outcome
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.faults import Fault
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.serial.serializer import Serializer
-from proxy.wire.service import Answer, Exchange, News, Outcome, too_large
+from proxy.wire.service import Exchange, News, too_large
 
 __all__ = ["ResponseSender"]
 

@@ -11,6 +11,7 @@ from typing import Final
 
 from gdp.control.diagnostics import Question
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import Keyed, text
 from gdp.diagnosis.facts import ProxyFacts, WaitFact
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
@@ -22,7 +23,7 @@ from proxy.bridge.name_facts import proxy_facts
 
 __all__ = ["answer_for_proxy"]
 
-_ASKED_MAX_CHARS: Final = 256
+_ASKED: Final = Keyed("q", text(256), absent="")
 
 
 def answer_for_proxy(
@@ -40,7 +41,7 @@ def answer_for_proxy(
     member, begun_s = context.member, time.monotonic()
 
     def gather(question: Question, now: Timestamps) -> ProxyFacts:
-        asked = question.body.text("q", _ASKED_MAX_CHARS) if "q" in question.body else ""
+        asked = _ASKED.read(question.body)
         if not asked or question.asker.domain not in policy.diagnostics:
             asked = question.name.to_text() if question.name != ZERO else ""
         return proxy_facts(

@@ -155,7 +155,7 @@ class FrameReader:
                 return self._counts(take(size))
             if kind != Kind.CHANNEL or left < 0 or len(self.channels) == CHANNELS_MAX:
                 raise LocalError(f"{kind.name} before OPENED")
-            self.channels.append(Channel.from_wire(take(size)))
+            self.channels.append(Channel.from_cbor(take(size)))
 
     def skip(self, take: Take) -> None:
         """Discard the remaining messages."""

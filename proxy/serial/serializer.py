@@ -14,6 +14,7 @@ import cbor2
 import orjson
 import pybase64
 
+from gdp.crypto.schema import Form, literal
 from gdp.errors import DropReason, RemoteError
 from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.cbor_bounds import check_bounds
@@ -28,7 +29,7 @@ from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
 
-__all__ = ["Codec", "Encoding", "Serializer", "canonical", "native_codec"]
+__all__ = ["ENCODING", "Codec", "Encoding", "Serializer", "canonical", "native_codec"]
 
 _LITTLE: Final = b"\x00\x01"  # CDR_LE
 _BIG: Final = b"\x00\x00"  # CDR_BE
@@ -43,6 +44,7 @@ _CODECS_MAX: Final = 256  # compiled types, of all encodings
 
 # Encoding of a body; ``cdr``: the unchanged bytes of either ROS.
 Encoding: TypeAlias = Literal["json", "cbor", "cdr"]
+ENCODING: Final[Form[Encoding]] = literal("json", "cbor", "cdr")
 
 
 class Serializer:

@@ -10,28 +10,44 @@ Invalid bytes raise ``RemoteError``.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeVar
 
-from gdp.crypto.cbor import Value, decode, encode
-from gdp.errors import DropReason, LocalError, RemoteError
+from gdp.crypto.cbor import Value
+from gdp.crypto.schema import FieldSet, Form, Keyed, literal, many, mapped, octets
+from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from proxy.reduce.compression import DICTIONARY_MAX_BYTES
 from proxy.reduce.picture import PictureFormat
-from proxy.serial.channel import Channel
+from proxy.serial.channel import CHANNEL, Channel
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
-from proxy.serial.serializer import Encoding
+from proxy.serial.serializer import ENCODING, Encoding
 
 __all__ = ["RosMessage", "Step", "TopicDescription"]
+
+_T = TypeVar("_T")
 
 VERSION: Final = 1
 CHANNELS_MAX: Final = 256
 DESCRIPTION_MAX_BYTES: Final = 4 << 20  # many channels of one topic may contain the same definition
 _HEAD: Final = struct.Struct("!BBBQ")
-_ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
-_IMAGES: Final[dict[object, PictureFormat]] = {"jpeg": "jpeg", "png": "png"}
+
+def _known(form: Form[_T], what: str) -> Form[_T]:
+    """Return a form that a later version may extend: another value is of an unknown version, not malformed."""
+
+    def read(value: Value) -> _T:
+        try:
+            return form.read(value)
+        except ValueError as error:
+            raise RemoteError(DropReason.BAD_VERSION, f"{what} that is unknown here: {str(value)[:40]}") from error
+
+    return replace(form, read=read)
+
+
+_PICTURES: Final[Form[PictureFormat | None]] = literal("jpeg", "png")
+_IMAGE: Final = _known(_PICTURES, "an image format")
+_CODEC: Final = _known(mapped(literal("zstd"), lambda _: True, lambda _: "zstd"), "a codec")
 
 
 class Step(IntFlag):
@@ -74,7 +90,7 @@ class RosMessage(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class TopicDescription:
+class TopicDescription(FieldSet):
     """Description of the messages of one publisher of one topic.
 
     Attributes:
@@ -84,11 +100,12 @@ class TopicDescription:
         image: format of reduced images; None: none is reduced.
     """
 
-    encoding: Encoding
-    channels: tuple[Channel, ...]
-    is_compressed: bool = False
-    dictionary: bytes = b""
-    image: PictureFormat | None = None
+    MAX_BYTES = DESCRIPTION_MAX_BYTES
+    encoding: Annotated[Encoding, Keyed("e", ENCODING)]
+    channels: Annotated[tuple[Channel, ...], Keyed("c", many(CHANNEL, CHANNELS_MAX, is_cut=False))]
+    is_compressed: Annotated[bool, Keyed("z", _CODEC, absent=False, is_omitted=True)] = False
+    dictionary: Annotated[bytes, Keyed("d", octets(most=DICTIONARY_MAX_BYTES), absent=b"", is_omitted=True)] = b""
+    image: Annotated[PictureFormat | None, Keyed("i", _IMAGE, absent=None, is_omitted=True)] = None
 
     @property
     def steps(self) -> Step:
@@ -107,14 +124,7 @@ class TopicDescription:
         if self.definitions_bytes > DEFINITION_MAX_BYTES:
             detail = f"definitions of {self.definitions_bytes} bytes; at most {DEFINITION_MAX_BYTES} are allowed"
             raise LocalError(detail)
-        fields: dict[str, Value] = {"e": self.encoding, "c": [channel.to_wire() for channel in self.channels]}
-        if self.is_compressed:
-            fields["z"] = "zstd"
-        if self.dictionary:
-            fields["d"] = self.dictionary
-        if self.image:
-            fields["i"] = self.image
-        wire = encode(fields)
+        wire = self.to_cbor()
         if len(wire) > DESCRIPTION_MAX_BYTES:
             raise LocalError(f"a description of {len(wire)} bytes; at most {DESCRIPTION_MAX_BYTES} are allowed")
         return wire
@@ -124,29 +134,7 @@ class TopicDescription:
         """Return the length of all different definitions together."""
         return sum(map(definition_bytes, {channel.definition for channel in self.channels}))
 
-    @classmethod
-    def from_wire(cls, wire: bytes) -> TopicDescription:
-        """Read the wire form."""
-        match decode(wire, DESCRIPTION_MAX_BYTES):
-            case {"e": str(encoding), "c": [*channels], **more} if (
-                encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX
-            ):
-                wires = [each for each in channels if isinstance(each, bytes)]
-                if len(wires) == len(channels):
-                    described = tuple(map(Channel.from_wire, wires))
-                    description = cls(_ENCODINGS[encoding], described, *_reductions(more))
-                    if description.definitions_bytes <= DEFINITION_MAX_BYTES:
-                        return description
-        raise RemoteError(DropReason.MALFORMED, "description")
-
-
-def _reductions(fields: Mapping[object, object]) -> tuple[bool, bytes, PictureFormat | None]:
-    """Return whether bodies are compressed, the dictionary, and the image format."""
-    codec, dictionary, image = fields.get("z"), fields.get("d", b""), fields.get("i")
-    if codec not in (None, "zstd"):
-        raise RemoteError(DropReason.BAD_VERSION, f"a codec that is unknown here: {str(codec)[:40]}")
-    if image is not None and not (isinstance(image, str) and image in _IMAGES):
-        raise RemoteError(DropReason.BAD_VERSION, f"an image format that is unknown here: {str(image)[:40]}")
-    if not isinstance(dictionary, bytes) or len(dictionary) > DICTIONARY_MAX_BYTES:
-        raise RemoteError(DropReason.MALFORMED, "dictionary")
-    return codec is not None, dictionary, None if image is None else _IMAGES[image]
+    def check(self) -> None:
+        """Return if there are channels, and not too long definitions. Raises ``StatementError``: MALFORMED."""
+        if not self.channels or self.definitions_bytes > DEFINITION_MAX_BYTES:
+            raise StatementError(DropReason.MALFORMED, "description")

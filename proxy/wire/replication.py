@@ -12,6 +12,7 @@ from gdp.crypto.cbor import Value, decode, encode
 from gdp.errors import DropReason, RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.names import NAME_BYTES, Name
+from gdp.service.frames import VERSION
 from gdp.service.replication_messages import (
     AttachReplica,
     FollowerMessage,
@@ -22,7 +23,6 @@ from gdp.service.replication_messages import (
     Snapshot,
     SnapshotRequest,
 )
-from proxy.wire.service import VERSION
 
 __all__ = ["STATE_MAX_BYTES", "follower_message", "is_word", "sequencer_message", "to_wire"]
 

@@ -103,7 +103,7 @@ def test_a27_all_definitions_of_a_topic_are_at_most_64_kib() -> None:
         TopicDescription("json", channels).to_wire()
     wires = [channel.to_wire() for channel in channels]
     with pytest.raises(RemoteError):
-        TopicDescription.from_wire(encode({"e": "json", "c": wires}))
+        TopicDescription.from_cbor(encode({"e": "json", "c": wires}))
 
 
 def test_a27_many_channels_of_one_definition_are_still_described() -> None:
@@ -111,7 +111,7 @@ def test_a27_many_channels_of_one_definition_are_still_described() -> None:
         Channel("/tf", "a/msg/B", 1, definition="int8 a\n" + "#\n" * 2_000, definition_format="msg", callerid=f"/n{at}")
         for at in range(CHANNELS_MAX)
     )
-    assert TopicDescription.from_wire(TopicDescription("json", channels).to_wire()).channels == channels
+    assert TopicDescription.from_cbor(TopicDescription("json", channels).to_wire()).channels == channels
 
 
 @pytest.mark.parametrize("unit", ["float64[64] a{0}\n", "wstring a{0}\n", "bool a{0}\nfloat64 b{0}\n"])

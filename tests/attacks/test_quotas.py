@@ -26,7 +26,7 @@ from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.trust.advertisement import Advertisement, sign_advertisement
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -152,10 +152,15 @@ def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothin
     def say(numbers: range) -> int:
         before = len(tap.frames)
         for number in numbers:
-            wire = sign_advertisement(
-                robot, Right.PUBLISH, _subject(f"/own{number}", robot), rtcert=rtcert, sequence=sequence + number,
-                incarnation=incarnation, lease_s=20.0, is_global=True,
-            )  # fmt: skip
+            wire = UnverifiedAdvertisement(
+                subject=_subject(f"/own{number}", robot),
+                right=Right.PUBLISH,
+                rtcert=rtcert,
+                sequence=sequence + number,
+                incarnation=incarnation,
+                lease_ms=20_000,
+                is_global=True,
+            ).signed(robot)
             for frame in ControlFragmenter(robot.name, number).split(Kind.ADVERTISE, wire, 1_400):
                 world.network.inject("nuc1", port, frame, mac_of(world, "nuc1", port))
         return len(tap.frames) - before

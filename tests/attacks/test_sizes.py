@@ -16,7 +16,7 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import ADVERTISEMENT_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
-from gdp.trust.advertisement import sign_advertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from lab.simulation import Simulation
@@ -29,7 +29,7 @@ PADDINGS = (ADVERTISEMENT_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
 def padded(world: Simulation, wire: bytes, size: int) -> bytes:
     """Return a statement of the robot's with an additional value under a key that no node reads."""
     statement, robot = parse(wire), world.identities[ROBOT]
-    body = {**statement.body, "zz": b""}
+    body = {**statement.fields, "zz": b""}
     wide = sign(statement.type, body, robot.name, robot.key)
     return sign(statement.type, {**body, "zz": bytes(max(size - len(wide) - 2, 0))}, robot.name, robot.key)
 
@@ -53,10 +53,15 @@ def test_a01_a02_a40_no_advertisement_or_withdrawal_of_any_size_ends_a_switch_or
     if kind is Kind.ADVERTISE:
         now_s = world.network.now.unix_s
         rtcert = RtCert.make(robot, world.identities["nuc1"].name, Validity.lasting(now_s, 600))
-        wire = sign_advertisement(
-            robot, Right.ATTACH, robot.subject, rtcert=rtcert, sequence=int(now_s * 1_000) + 60_000, incarnation=9,
-            lease_s=20.0, is_global=True,
-        )  # fmt: skip
+        wire = UnverifiedAdvertisement(
+            subject=robot.subject,
+            right=Right.ATTACH,
+            rtcert=rtcert,
+            sequence=int(now_s * 1_000) + 60_000,
+            incarnation=9,
+            lease_ms=20_000,
+            is_global=True,
+        ).signed(robot)
     for number, size in enumerate(PADDINGS, 1 << 30):
         say(world, kind, padded(world, wire, size), number)
         world.network.run(0.2)

@@ -99,6 +99,31 @@ def test_every_key_of_a_file_stands_in_a_table() -> None:
     assert missing == {"expose", "import"}  # lists of the rules, which have a table of their own
 
 
+def test_every_key_of_a_body_stands_in_the_lists_of_its_statement() -> None:
+    found: dict[str, set[str]] = {}
+    for section in docs_reference.SECTION.finditer((REFERENCE / "statements.md").read_text()):
+        for type_ in section[1].split(", "):
+            heads = [line.partition(" (")[0].partition(": ")[0] for line in section[2].splitlines()]
+            keys = {key for head in heads if head.startswith("- ") for key in re.findall("`([^`]+)`", head)}
+            subject = {"digest", "owner"} if any("subject" in head for head in heads) else set()
+            found.setdefault(type_, {"c"}).update(keys | subject)
+    known = docs_reference.bodies()
+    assert len(known) == len(StatementType) + 1  # the entry of a batch
+    missing = {
+        (type_, key.key)
+        for type_, kinds in known.items()
+        for kind in kinds
+        for key in kind.declared()
+        if key.key not in found[type_]
+    }
+    assert missing == set()
+
+
+def test_the_form_of_a_key_is_as_declared() -> None:
+    page = "**query**\n\n- `n`, `w` (text): who advertises it\n- `v`: free\n"
+    assert docs_reference.statements(page) == page.replace("(text)", "(name; number 0–3,600)")
+
+
 def test_every_type_of_statement_is_listed_and_no_other() -> None:
     part = (REFERENCE / "statements.md").read_text().partition("\nTypes with their frame kinds")[2]
     found = re.findall(r"^- ([a-z, -]+) \(.*\) by ", part.partition("\nA switch")[0], re.MULTILINE)

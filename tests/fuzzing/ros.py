@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.errors import LocalError, RemoteError
+from gdp.service.frames import Answer, Outcome, Request, Stop
 from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
@@ -13,7 +14,8 @@ from proxy.serial.schema import DefinitionError, parse
 from proxy.serial.serializer import Encoding, Serializer
 from proxy.serial.service import Service
 from proxy.wire.message import RosMessage, TopicDescription
-from proxy.wire.service import Answer, Exchange, News, Outcome, Request, Stop
+from proxy.wire.service import Exchange, News
+from tests.fuzzing.bodies import decoders
 from tests.fuzzing.decoder import Decoder
 
 __all__ = ["DECODERS"]
@@ -104,24 +106,14 @@ def _converted() -> Decoder:
 _HALF: Final = Channel("/s", "a/srv/S_Request", 2, definition="bool a\n", definition_format="msg")
 _SERVICE: Final = Service("/s", "a/srv/S", "", _HALF, _HALF)
 
+_MADE: Final = (
+    *(_channel(1), _channel(2), _SERVICE),
+    *(TopicDescription("json", (_channel(2),)), Exchange("cbor", (_SERVICE,), (_HALF,))),
+)
+
 DECODERS: Final = (
     Decoder("parcel", RosMessage.from_wire, (RosMessage(0, 1, b"x").to_wire(),), (RemoteError,)),
-    Decoder(
-        "description",
-        TopicDescription.from_wire,
-        (TopicDescription("json", (_channel(2),)).to_wire(),),
-        (RemoteError,),
-        is_cbor=True,
-    ),
-    Decoder("channel", Channel.from_wire, (_channel(1).to_wire(), _channel(2).to_wire()), (RemoteError,), is_cbor=True),
-    Decoder("service", Service.from_wire, (_SERVICE.to_wire(),), (RemoteError,), is_cbor=True),
-    Decoder(
-        "exchange",
-        Exchange.from_wire,
-        (Exchange("cbor", (_SERVICE,), (_HALF,)).to_wire(),),
-        (RemoteError,),
-        is_cbor=True,
-    ),
+    *decoders("proxy", _MADE),
     Decoder("call-request", Request.from_wire, (Request(0, 1, 2, b"x").to_wire(),), (RemoteError,)),
     Decoder("call-answer", Answer.from_wire, (Answer(0, 1, Outcome.ANSWERED, b"x").to_wire(),), (RemoteError,)),
     Decoder("call-stop", Stop.from_wire, (Stop(0, (1, 2)).to_wire(),), (RemoteError,)),

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import count
-from typing import Final
+from typing import Final, TypeVar
 
+from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
 from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Item
 from gdp.crypto import cbor
+from gdp.crypto.cbor import Value
 from gdp.crypto.certificates import Root, Unverified
 from gdp.crypto.control_seal import ControlOpener, ControlSealer
 from gdp.crypto.envelope import Opener
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
-from gdp.crypto.statements import Fields, Statement, parse
-from gdp.crypto.subject import Subject
-from gdp.crypto.validity import Validity
+from gdp.crypto.schema import Spread
+from gdp.crypto.statements import parse
+from gdp.crypto.subject import NAMED_SUBJECT
+from gdp.crypto.validity import VALIDITY
 from gdp.crypto.x509_profile import read_request
 from gdp.errors import EnvelopeError, FrameError, LocalError, RemoteError, StatementError
 from gdp.frame import codec
@@ -30,8 +33,6 @@ from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.parity import Parity
 from gdp.names import Name
-from gdp.trust.adcert import AdCert
-from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.audit import BEGIN, AuditLine
 from gdp.trust.bootstrap_ticket import (
     Application,
@@ -43,15 +44,17 @@ from gdp.trust.bootstrap_ticket import (
     request_head,
     seal_request,
 )
-from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
+from tests.fuzzing.bodies import decoders
 from tests.fuzzing.decoder import Decoder
 from tests.gdp.control.test_bodies import BODIES
 from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, seal
 from tests.gdp.trust.world import CAMERA, DAY, LAB, NOW, ROBOT, SCHOOL, adcert, advertisement
 
 __all__ = ["DECODERS"]
+
+_T = TypeVar("_T")
 
 _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
@@ -69,46 +72,35 @@ _ENTRY: Final = Entry(
     lease_s=9.0,
     is_from_upstream=False,
 )
-_READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
-    **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
-    "presence": (
-        Presence(node=_A, incarnation=1, other=_A, question=7).to_wire(_NODE.name, _NODE.key, b"cert"),
-        Presence.from_fields,
-    ),
-    "digest": (Digest(b"", bytes(8), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Digest.from_fields),
-    "fetch": (Fetch((b"a",), ((_A, _A),)).to_wire(_NODE.name, _NODE.key, b"cert"), Fetch.from_fields),
-    "inventory": (
-        Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"),
-        Inventory.from_fields,
-    ),
-    "replicas": (EntryBatch((_ENTRY,), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), EntryBatch.from_fields),
-}
-_STATEMENTS: Final[dict[str, tuple[bytes, Callable[[Statement], object]]]] = {
-    "adcert": (adcert(), AdCert.from_statement),
-    "claim": (advertisement(), UnverifiedAdvertisement.from_statement),
-    "revocation": (Revocation.make(LAB.key, CAMERA, bytes(32), NOW), Revocation.from_statement),
-}
+_MADE: Final = (
+    Presence(node=_A, incarnation=1, other=_A, question=7),
+    Digest(b"", bytes(8), is_last=True),
+    Fetch((b"a",), ((_A, _A),)),
+    Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True),
+    EntryBatch((_ENTRY,), is_last=True),
+)
+_STATEMENTS: Final = (
+    *(wire for wire, _, _ in BODIES.values()),
+    *(each.to_wire(_NODE.name, _NODE.key, b"cert") for each in _MADE),
+    adcert(),
+    advertisement(),
+    NodeDescriptor.make(_NODE),
+    EndpointRecord.make(_NODE, (bytes(32),), (), sequence=1, until_unix_s=NOW).wire,
+)
+_REVOCATION: Final = parse(Revocation.make(LAB.key, CAMERA, bytes(32), NOW))
 _FRAMES: Final = seal(1, bytes(500))
 _KEY: Final = bytes(32)
 _HEADER: Final = codec.Header(Kind.KEEPALIVE, Flag.LAST, 64, 0, 16, 1, 0, 1, 1, bytes(32), bytes(_A))
 
 
-def _body(wire: bytes) -> bytes:
-    return cbor.encode(dict(parse(wire).body))
-
-
-def _fields(data: bytes) -> Fields:
+def _fields(data: bytes) -> Mapping[str, Value]:
     value = cbor.decode(data)
-    return Fields(value if isinstance(value, Mapping) else {})
+    return value if isinstance(value, Mapping) else {}
 
 
-def _of_fields(read: Callable[[Fields], object]) -> Callable[[bytes], object]:
-    return lambda data: read(_fields(data))
-
-
-def _of_statement(wire: bytes, read: Callable[[Statement], object]) -> Callable[[bytes], object]:
-    statement = parse(wire)
-    return lambda data: read(replace(statement, fields=_fields(data)))
+def _spread(name: str, spread: Spread[_T], value: _T) -> Decoder:
+    seeds = (cbor.encode(spread.to_fields(value)),)
+    return Decoder(name, lambda data: spread.read(_fields(data)), seeds, (StatementError,), is_cbor=True)
 
 
 def _control(data: bytes) -> object:
@@ -164,26 +156,17 @@ DECODERS: Final = (
     Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
     Decoder("control", _control, (_control_seed(),), (FrameError,)),
     Decoder("cbor", cbor.decode, (cbor.encode({"a": [1, b"x", None, 1.5]}),), (StatementError,), is_cbor=True),
-    Decoder("statement", parse, tuple(wire for wire, _ in _READS.values()), (StatementError,)),
-    *(
-        Decoder(name, _of_fields(read), (_body(wire),), (StatementError,), is_cbor=True)
-        for name, (wire, read) in _READS.items()
-    ),
-    *(
-        Decoder(name, _of_statement(wire, read), (_body(wire),), (StatementError,), is_cbor=True)
-        for name, (wire, read) in _STATEMENTS.items()
-    ),
+    Decoder("statement", parse, _STATEMENTS, (StatementError,)),
+    *decoders("gdp", _STATEMENTS),
     Decoder(
-        "subject",
-        _of_fields(lambda fields: Subject.from_fields(fields, CAMERA.name)),
-        (cbor.encode(CAMERA.to_fields()),),
+        "revocation",
+        lambda data: Revocation.from_statement(replace(_REVOCATION, fields=_fields(data))),
+        (cbor.encode(dict(_REVOCATION.fields)),),
         (StatementError,),
         is_cbor=True,
     ),
-    Decoder(
-        "validity", _of_fields(Validity.from_fields), (cbor.encode(DAY.to_fields()),), (StatementError,), is_cbor=True
-    ),
-    Decoder("delegation", Delegation.from_wire, (cbor.encode({"format": ""}),), (StatementError,), is_cbor=True),
+    _spread("subject", NAMED_SUBJECT, CAMERA),
+    _spread("validity", VALIDITY, DAY),
     Decoder("card", NodeDescriptor.from_wire, (NodeDescriptor.make(_NODE),), (StatementError,)),
     Decoder("root", Root.from_wire, (SCHOOL.root.wire, _HEIR.root.to_pem()), (StatementError,)),
     Decoder("audit-line", AuditLine.from_line, (_AUDIT,), (LocalError,)),

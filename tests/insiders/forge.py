@@ -26,7 +26,8 @@ from gdp.control.rib_replication import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFI
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
-from gdp.crypto.validity import Validity
+from gdp.crypto.subject import NAMED_SUBJECT, SUBJECT
+from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
@@ -424,7 +425,7 @@ class Forge:
                     else []
                 )
         return {
-            **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
+            **NAMED_SUBJECT.to_fields(subject), "right": right.value, "seq": next(self._numbers),
             "inc": int.from_bytes(self._own_incarnation(identity, rng)[8:], "big"),
             "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
             "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
@@ -483,7 +484,7 @@ class Forge:
             advertisement = self._inner(rng, identity)
             try:
                 statement = parse(advertisement)
-                name, advertiser = Name(statement.fields.bytes_("name", 32)), statement.signer
+                name, advertiser = NAMED_SUBJECT.read(statement.fields).name, statement.signer
             except StatementError:
                 pass
         elif chance < 0.8:
@@ -581,7 +582,7 @@ class Forge:
         member = rng.choice(self._identities()).member
         until = rng.choice((unix_s, unix_s + 100, _U64, 0, member.validity.not_after_unix_s))
         return {
-            **identity.subject.to_fields(),
+            **SUBJECT.to_fields(identity.subject),
             "cert": rng.choice((rng.randbytes(32), member.fingerprint)),
             "until": until,
         }
@@ -641,16 +642,21 @@ class Forge:
         return dict(parse(AdCert.make(
             identity.key, identity.name, identity.subject, rng.choice(self._identities()).subject,
             [Right.READ, Right.PUBLISH], self._lasting(),
-        )).body)  # fmt: skip
+        )).fields)  # fmt: skip
 
     def _rtcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        return {"switch": self._switch_at(rng, None), **self._lasting().to_fields()}
+        return {"switch": self._switch_at(rng, None), **VALIDITY.to_fields(self._lasting())}
 
     def _card(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {"member": identity.membership, "kem": identity.kem.public.wire}
 
     def _grant(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        return {**identity.subject.to_fields(), "to": rng.choice(self._nodes), "epoch": 1, "sealed": bytes(1_168)}
+        return {
+            **SUBJECT.to_fields(identity.subject),
+            "to": rng.choice(self._nodes),
+            "epoch": 1,
+            "sealed": bytes(1_168),
+        }
 
     def _lasting(self) -> Validity:
         unix_s = int(self._stage.world.network.now.unix_s)

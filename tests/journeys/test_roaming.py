@@ -19,7 +19,7 @@ def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
     """Return the switch of a node according to a RIB."""
     route = world.ribs[rib].rib._store.get(name, node)
     assert isinstance(route, Route)
-    switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields.name("switch")
+    switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields["switch"]
     return next(label for label, each in world.switches.items() if each.name == switch)
 
 

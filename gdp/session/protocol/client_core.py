@@ -15,10 +15,11 @@ from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
+from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
 from gdp.service.replication import Replication
 from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.protocol.messages import Response
-from gdp.session.protocol.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, StopFrame, read_response
+from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, stop_to_wire
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -122,10 +123,10 @@ class ClientCore:
         found = next((each for each in dispatches if frame.call in each), dispatches[0] if dispatches else None)
         if found is None:
             return  # a response to an earlier incarnation of this session
-        if frame.is_failure:
+        if frame.outcome is Outcome.FAILED:
             found.refused(frame.call, server, frame.reason, now_s)
         else:
-            found.answered(frame.call, server, Response(frame.payload, server), now_s)
+            found.answered(frame.call, server, Response(frame.body, server), now_s)
         self._send_out(now_s)
 
     def handle_timer(self, now_s: float) -> None:
@@ -205,7 +206,7 @@ class ClientCore:
 
         def write(number: int) -> bytes:
             """Return the wire form of the request under a call's number."""
-            return RequestFrame(number, patience_ms, call.payload).to_wire()
+            return Request(REQUEST, number, patience_ms, call.payload).to_wire()
 
         def responded(response: Response) -> None:
             """Store the response in the call."""
@@ -284,4 +285,4 @@ class ClientCore:
 
 
 def _wire_of(effect: Ask | Stop) -> bytes:
-    return effect.request if isinstance(effect, Ask) else StopFrame(effect.calls).to_wire()
+    return effect.request if isinstance(effect, Ask) else stop_to_wire(effect.calls)

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Final
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.service.frames import Answer, Outcome, Request
 from gdp.service.serving import Asked, Serving, Turn
 from gdp.session.protocol.wire import (
     LEAVING,
     PAYLOAD_MAX_BYTES,
+    RESPONSE,
     SERVING,
-    RequestFrame,
-    ResponseFrame,
-    StopFrame,
     read_request,
 )
 
@@ -87,11 +86,11 @@ class ServerCore:
         """
         client = Name(message.delivered.publisher)
         frame = read_request(message.delivered.message)
-        if isinstance(frame, StopFrame):
-            for call in frame.calls:
-                self._serving.stop(Asked(client, _PART, call))
-        else:
+        if isinstance(frame, Request):
             self._begin(client, frame, now_s)
+        else:
+            for call in frame:
+                self._serving.stop(Asked(client, _PART, call))
         self._give(now_s)
 
     def finish(self, number: int, outcome: bytes | str, now_s: float) -> None:
@@ -106,9 +105,9 @@ class ServerCore:
             if len(outcome) > PAYLOAD_MAX_BYTES:
                 outcome = f"the response has {len(outcome)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent"
             if isinstance(outcome, str):
-                self._respond(asked, ResponseFrame.failed(asked.call, outcome))
+                self._respond(asked, Answer.failed(RESPONSE, asked.call, outcome))
             else:
-                self._respond(asked, ResponseFrame(asked.call, False, outcome))
+                self._respond(asked, Answer(RESPONSE, asked.call, Outcome.ANSWERED, outcome))
         self._give(now_s)
 
     def leave(self) -> None:
@@ -119,7 +118,7 @@ class ServerCore:
     def close(self, now_s: float) -> None:
         """Stop serving the name; active calls fail."""
         for asked in self._serving.fail_all():
-            self._respond(asked, ResponseFrame.failed(asked.call, "the server was closed"))
+            self._respond(asked, Answer.failed(RESPONSE, asked.call, "the server was closed"))
         self.turns.clear()
         self._member.flush(now_s)  # the responses must leave before their stream ends
         self._member.withdraw(self._name)
@@ -128,7 +127,9 @@ class ServerCore:
         """Drop requests that no client waits for."""
         for each in self._serving.expired(now_s):
             if each.asked is not None:
-                self._respond(each.asked, ResponseFrame.failed(each.asked.call, "the server did not respond in time"))
+                self._respond(
+                    each.asked, Answer.failed(RESPONSE, each.asked.call, "the server did not respond in time")
+                )
         if self._check_at_s is not None and now_s >= self._check_at_s:
             self._check_clients(now_s)
             self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
@@ -139,7 +140,7 @@ class ServerCore:
         times = [self._serving.get_timer(), self._check_at_s]
         return min((time for time in times if time is not None), default=None)
 
-    def _begin(self, client: Name, frame: RequestFrame, now_s: float) -> None:
+    def _begin(self, client: Name, frame: Request, now_s: float) -> None:
         asked = Asked(client, _PART, frame.call)
         before = self._serving.answer_of(asked)
         if before is not None or asked in self._serving:
@@ -147,13 +148,13 @@ class ServerCore:
                 self._send(client, before)
             return
         if self._is_leaving:
-            self._respond(asked, ResponseFrame.failed(frame.call, "the server is leaving"))
+            self._respond(asked, Answer.failed(RESPONSE, frame.call, "the server is leaving"))
             return
         patience_s = min(frame.patience_ms / 1e3 + _GRACE_S, _CALL_MAX_S) if frame.patience_ms else _CALL_MAX_S
         try:
-            self._serving.begin(now_s, patience_s, asked, frame.payload)
+            self._serving.begin(now_s, patience_s, asked, frame.body)
         except LocalError as error:
-            self._respond(asked, ResponseFrame.failed(frame.call, str(error)))
+            self._respond(asked, Answer.failed(RESPONSE, frame.call, str(error)))
             return
         if self._check_at_s is None:
             self._check_at_s = now_s + _CHECK_CLIENTS_S
@@ -161,7 +162,7 @@ class ServerCore:
     def _give(self, now_s: float) -> None:
         self.turns.extend(self._serving.poll_turns(now_s))
 
-    def _respond(self, asked: Asked, frame: ResponseFrame) -> None:
+    def _respond(self, asked: Asked, frame: Answer) -> None:
         wire = frame.to_wire()
         self._serving.remember(asked, wire)
         self._send(asked.client, wire)

@@ -47,7 +47,7 @@ class RemoteServer:
             LocalError: it serves something else, or this machine cannot know it.
             RemoteError: it cannot be read.
         """
-        theirs, ros = Exchange.from_wire(description), endpoint.ros
+        theirs, ros = Exchange.from_cbor(description), endpoint.ros
         types = [*(each.type_name for each in theirs.services), *(each.type_name for each in theirs.topics)]
         if types != [type_name for _, type_name in (*parts.services, *parts.topics)]:
             raise LocalError(f"the far side serves something else under this name: {', '.join(types)}")
@@ -71,7 +71,7 @@ class RemoteServer:
         if self.exchange is None:
             return None
         exchange = replace(self.exchange, is_leaving=not self.exchange.is_leaving)
-        if exchange.to_wire() != description:
+        if exchange.to_cbor() != description:
             return None
         return replace(self, description=description, exchange=exchange)
 

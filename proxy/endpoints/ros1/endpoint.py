@@ -127,14 +127,14 @@ class Ros1Endpoint:
         wire = self._ask(Kind.ASK_CHANNEL, topic, type_name)
         if wire is None:
             raise LocalError(f"{type_name} is not known here as a ROS 1 type: install its ROS 1 package")
-        return Channel.from_wire(wire)
+        return Channel.from_cbor(wire)
 
     def service(self, name: str, type_name: str) -> Service:
         """Return an installed package's description of a type, or, without definitions, that of a live server."""
         wire = self._ask(Kind.ASK_SERVICE, name, type_name)
         if wire is None:
             raise LocalError(f"{type_name} is not known here as a ROS 1 service type: install its ROS 1 package")
-        return Service.from_wire(wire)
+        return Service.from_cbor(wire)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:  # noqa: ARG002  # of any type and QoS
         """Subscribe to a topic, whatever its publishers' type."""
@@ -164,7 +164,7 @@ class Ros1Endpoint:
         """Create a server; if a local node contradicts, ``EndpointError`` follows."""
         if service.ros != 1:
             service = self.service(service.name, service.type_name)
-        return self._hold(_Held(Kind.SERVE, service.to_wire()))
+        return self._hold(_Held(Kind.SERVE, service.to_cbor()))
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request."""
@@ -308,7 +308,7 @@ class Ros1Endpoint:
             held.subscribers = number
         elif kind is Kind.DESCRIBED:
             try:
-                self._events.append(TypeResolved(handle, Channel.from_wire(payload)))
+                self._events.append(TypeResolved(handle, Channel.from_cbor(payload)))
             except RemoteError as error:
                 self._events.append(EndpointError(handle, f"its publisher describes it badly: {error}"))
 

@@ -127,11 +127,11 @@ class Node:
             name, type_name = cbor2.loads(payload)
             self._dials[handle] = Client(self._link, handle, name, type_name)
         elif kind is Kind.ADVERTISE:
-            channel = Channel.from_wire(payload)
+            channel = Channel.from_cbor(payload)
             self._outlets[handle] = Publisher(self._link, handle, channel, known_message(channel), self._id)
             self._todo.put(lambda: self._join(handle))
         elif kind is Kind.SERVE:
-            service = Service.from_wire(payload)
+            service = Service.from_cbor(payload)
             known = known_service(service)
             self._servers[handle] = Server(self._link, handle, service.name, known, self._tickets)
             self._todo.put(lambda: self._join(handle))
@@ -166,11 +166,11 @@ class Node:
                 _channel(name, request, known.request.md5, known.request.text),
                 _channel(name, response, known.response.md5, known.response.text),
             )
-            return Service(name, type_name, known.md5, *parts).to_wire()
+            return Service(name, type_name, known.md5, *parts).to_cbor()
         for end in self._snapshot.ends if self._snapshot is not None else ():
             if (end.role, end.name, end.type_name) == ("serves", name, ros1_name(type_name)):
                 parts = _channel(name, request, "", ""), _channel(name, response, "", "")
-                return Service(name, type_name, end.md5, *parts).to_wire()
+                return Service(name, type_name, end.md5, *parts).to_cbor()
         return None
 
     # the registrar

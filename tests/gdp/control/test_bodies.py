@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -21,7 +21,8 @@ from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
 from gdp.control.revoked import Lacking, Revoked
-from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
+from gdp.crypto.cbor import Value
+from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import HEADER_BYTES
 from gdp.names import Name
@@ -58,7 +59,7 @@ REPLIED = DiagnosticReply(
     ask="trace", sequence=7, asker=A, result={"branches": [{"port": "eth0"}]}, is_cut=True, hops_left=3
 )
 
-Read = Callable[[Fields], object]
+Read = Callable[[Mapping[str, Value]], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
     "hello": (HELLO.to_wire(NODE.name, NODE.key), HELLO, Hello.from_fields),
     "hello of a tunnel": (OBSERVING.to_wire(NODE.name, NODE.key), OBSERVING, Hello.from_fields),

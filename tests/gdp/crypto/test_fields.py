@@ -7,10 +7,11 @@ from collections.abc import Callable
 import pytest
 
 from gdp.crypto.fields import Fields
+from gdp.crypto.schema import NAME
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-NAME = Name(bytes(range(32)))
+SOME = Name(bytes(range(32)))
 FIELDS = Fields(
     {
         "uint": 7,
@@ -20,11 +21,10 @@ FIELDS = Fields(
         "flag": True,
         "text": "abc",
         "bytes": b"abc",
-        "name": bytes(NAME),
-        "names": [bytes(NAME), bytes(NAME)],
+        "name": bytes(SOME),
+        "names": [bytes(SOME), bytes(SOME)],
         "mixed": [1, "a", b"b", None],
         "texts": ["a", "b"],
-        "map": {"inner": 1},
         "maps": [{"inner": 1}, {"inner": 2}],
         "null": None,
     }
@@ -38,12 +38,9 @@ def test_each_accessor_returns_its_type() -> None:
     assert FIELDS.flag("flag") is True
     assert FIELDS.text("text") == "abc"
     assert FIELDS.bytes_("bytes") == b"abc"
-    assert FIELDS.name("name") == NAME
-    assert FIELDS.names("names", 2) == [NAME, NAME]
-    assert FIELDS.list_("mixed", 4) == [1, "a", b"b", None]
+    assert FIELDS.read("name", NAME) == SOME
     assert FIELDS.texts("texts", 2) == ["a", "b"]
-    assert FIELDS.byte_strings("names", 2, 32) == [NAME, NAME]
-    assert FIELDS.map_("map").uint("inner") == 1
+    assert FIELDS.byte_strings("names", 2) == [SOME, SOME]
     assert [each.uint("inner") for each in FIELDS.maps("maps", 2)] == [1, 2]
 
 
@@ -65,13 +62,11 @@ def test_each_accessor_returns_its_type() -> None:
         lambda f: f.text("text", 2),
         lambda f: f.bytes_("text"),
         lambda f: f.bytes_("bytes", 4),
-        lambda f: f.name("bytes"),
-        lambda f: f.list_("text", 9),
-        lambda f: f.list_("mixed", 3),
-        lambda f: f.names("mixed", 9),
+        lambda f: f.read("bytes", NAME),
+        lambda f: f.byte_strings("text", 9),
+        lambda f: f.byte_strings("names", 1),
         lambda f: f.texts("mixed", 9),
         lambda f: f.byte_strings("mixed", 9),
-        lambda f: f.map_("maps"),
         lambda f: f.maps("mixed", 9),
         lambda f: f.maps("maps", 1),
     ],

@@ -21,7 +21,7 @@ from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
 from gdp.rib.route import Route
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import UnverifiedAdvertisement, sign_advertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -119,32 +119,30 @@ def withdrawal(sequence: int, by: Identity = ROBOT, key: Identity | None = None)
 
 
 def local_advertisement(sequence: int = 1) -> bytes:
-    return sign_advertisement(
-        ROBOT,
-        Right.PUBLISH,
-        CAMERA,
+    return UnverifiedAdvertisement(
+        subject=CAMERA,
+        right=Right.PUBLISH,
         rtcert=RtCert.make(ROBOT, SWITCH.name, DAY),
         sequence=sequence,
         incarnation=7,
-        lease_s=60.0,
+        lease_ms=60_000,
         is_global=False,
-        chain=[adcert()],
-    )
+        chain=(adcert(),),
+    ).signed(ROBOT)
 
 
 def foreign_advertisement(*, is_global: bool = True, sequence: int = 1) -> bytes:
     """Return an advertisement of the robot at a switch of the cloud's domain."""
-    return sign_advertisement(
-        ROBOT,
-        Right.PUBLISH,
-        CAMERA,
+    return UnverifiedAdvertisement(
+        subject=CAMERA,
+        right=Right.PUBLISH,
         rtcert=RtCert.make(ROBOT, CLOUD_SWITCH.name, DAY),
         sequence=sequence,
         incarnation=7,
-        lease_s=60.0,
+        lease_ms=60_000,
         is_global=is_global,
-        chain=[adcert()],
-    )
+        chain=(adcert(),),
+    ).signed(ROBOT)
 
 
 def altered(change: dict[str, object]) -> bytes:
@@ -461,7 +459,7 @@ def test_a_switch_that_relays_an_old_advertisement_of_a_node_that_moved_hears_wh
     tell(at_rib, advertisement(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY), sequence=2), OTHER_SWITCH)
     letters = tell(at_rib, advertisement())
     assert [each.refused for each in acks(letters)] == [DropReason.STALE]
-    assert [parse(each.advertisement).fields.uint("seq") for each in answers(letters)] == [2]
+    assert [parse(each.advertisement).fields["seq"] for each in answers(letters)] == [2]
 
 
 def test_a_switch_whose_node_is_withdrawn_elsewhere_is_informed() -> None:

@@ -153,7 +153,7 @@ def test_another_owners_equal_name_takes_the_place_of_a_withdrawn_one(
 def test_only_the_sender_of_an_offer_withdraws_it(site: Site, robot: Machine, server: Machine) -> None:
     robot.sharing.expose(robot.exposing(TOPIC, "server", type_name=STRING), site.now_s)
     server.sharing.accept(importing(TOPIC), site.now_s)
-    wire = Exposure(server.held[0].name, False).to_wire()
+    wire = Exposure(server.held[0].name, False).to_cbor()
     site.directory.of("stranger").send(load_card(server.folder / "proxy" / CARD).name, MailKind.EXPOSURE.value, wire)
     (problem,) = server.sharing.work(site.now_s).problems
     assert problem.startswith("mail from stranger is not taken: news of ")
@@ -163,10 +163,10 @@ def test_only_the_sender_of_an_offer_withdraws_it(site: Site, robot: Machine, se
 @given(st.binary(max_size=64))
 def test_a_mail_that_is_not_of_the_form_is_refused(wire: bytes) -> None:
     with pytest.raises(StatementError):
-        Exposure.from_wire(wire)
+        Exposure.from_cbor(wire)
 
 
 @given(st.binary(min_size=32, max_size=32).filter(any).map(Name), st.booleans())
 def test_what_is_sent_arrives(name: Name, is_exposed: bool) -> None:
     stated = Exposure(name, is_exposed)
-    assert Exposure.from_wire(stated.to_wire()) == stated
+    assert Exposure.from_cbor(stated.to_cbor()) == stated

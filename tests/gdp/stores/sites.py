@@ -31,7 +31,7 @@ from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_link import ClusterLink
 from gdp.stores.snapshot import Snapshot
-from gdp.trust.advertisement import sign_advertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
@@ -68,16 +68,15 @@ class Site:
         return Subject.of(Metadata({"kind": "topic", "name": name}), self.robot.key.public.compressed)
 
     def relay(self, name: str, sequence: int, lease_s: float = 60.0) -> bytes:
-        wire = sign_advertisement(
-            self.robot,
-            Right.PUBLISH,
-            self.subject(name),
+        wire = UnverifiedAdvertisement(
+            subject=self.subject(name),
+            right=Right.PUBLISH,
             rtcert=self.rtcert,
             sequence=sequence,
             incarnation=1,
-            lease_s=lease_s,
+            lease_ms=round(lease_s * 1_000),
             is_global=False,
-        )
+        ).signed(self.robot)
         return self.relayed(wire)
 
     def withdrawal(self, name: str, sequence: int) -> bytes:

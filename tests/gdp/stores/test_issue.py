@@ -37,7 +37,7 @@ from gdp.stores.keyring import (
     load_root,
     save_delegation,
 )
-from gdp.trust.advertisement import sign_advertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
@@ -87,17 +87,16 @@ def test_a_delegation_leads_to_an_advertisement_that_is_accepted(keys: Path) -> 
     install_delegation(keys / "robot", given, unix_s=NOW)
     (found,) = load_delegations(keys / "robot" / "delegations")
     identity = load_identity(keys / "robot", NOW)
-    advertisement = sign_advertisement(
-        identity,
-        Right.PUBLISH,
-        found.subject,
+    advertisement = UnverifiedAdvertisement(
+        subject=found.subject,
+        right=Right.PUBLISH,
         rtcert=delegate_route(keys / "robot", Name(b"s" * 32), days=1, unix_s=NOW),
         sequence=1,
         incarnation=1,
-        lease_s=60,
+        lease_ms=60_000,
         is_global=False,
         chain=found.chain,
-    )
+    ).signed(identity)
     policy = Policy(load_root(keys / "school" / "root.crt"))
     assert AdvertisementVerifier(policy).verify(advertisement, NOW).name == CAMERA.name(
         load_owner(keys / "lab").key.public.compressed

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import Statement, StatementType, parse, sign
-from gdp.crypto.subject import Subject
+from gdp.crypto.subject import SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
 from gdp.metadata import Metadata
@@ -64,7 +64,7 @@ def test_a_revocation_by_another_key_is_refused() -> None:
 
 
 def test_a_revocation_in_anothers_name_is_refused() -> None:
-    body = {**ROBOT.subject.to_fields(), "cert": bytes(32), "until": NOW}
+    body = {**SUBJECT.to_fields(ROBOT.subject), "cert": bytes(32), "until": NOW}
     with pytest.raises(StatementError) as caught:
         Revocation.from_statement(parse(sign(StatementType.REVOKE, body, CAMERA.name, ROBOT.key)))
     assert caught.value.reason is DropReason.WRONG_NAME
@@ -81,7 +81,7 @@ def test_new_revocations_are_distinguished_from_known_ones(make: Callable[..., S
     assert take(revoked, statement) is not None
     assert take(revoked, statement) is None
     assert len(revoked) == 1
-    assert revoked.has(fingerprint(1), statement.fields.bytes_("owner"))
+    assert revoked.has(fingerprint(1), Revocation.read(statement).issuer.owner_key)
     assert not revoked.has(fingerprint(1), ROBOT.key.public.compressed)
 
 
@@ -89,11 +89,11 @@ def test_new_revocations_are_distinguished_from_known_ones(make: Callable[..., S
 def test_a_statement_comes_out_as_it_went_in(make: Callable[..., Statement]) -> None:
     revoked, statement = Revocations(ROOTS), make(1)
     take(revoked, statement)
-    assert revoked.wire(statement.fields.bytes_("owner"), fingerprint(1)) == statement.wire
+    assert revoked.wire(Revocation.read(statement).issuer.owner_key, fingerprint(1)) == statement.wire
 
 
 def test_a_statement_of_a_later_form_comes_out_whole() -> None:
-    body = {**SCHOOL.root.subject.to_fields(), "cert": fingerprint(1), "until": NOW + 100, "why": "stolen"}
+    body = {**SUBJECT.to_fields(SCHOOL.root.subject), "cert": fingerprint(1), "until": NOW + 100, "why": "stolen"}
     statement = parse(sign(StatementType.REVOKE, body, SCHOOL.root.domain, SCHOOL.key))
     revoked = Revocations(ROOTS)
     take(revoked, statement)
@@ -210,7 +210,7 @@ def test_forged_ones_use_up_the_rate_of_their_origin() -> None:
     revoked = Revocations(ROOTS)
     verified = 0
     for number in range(200):
-        body = {**SCHOOL.root.subject.to_fields(), "cert": fingerprint(number), "until": NOW + 100}
+        body = {**SUBJECT.to_fields(SCHOOL.root.subject), "cert": fingerprint(number), "until": NOW + 100}
         forged = parse(sign(StatementType.REVOKE, body, SCHOOL.root.domain, OTHER))
         verified += refusal(revoked, forged) is DropReason.BAD_SIGNATURE
     assert verified < 70

@@ -13,7 +13,7 @@ BODY = {"n": CAMERA.name, "right": "publish", "s": 1}
 
 def test_a_withdrawal_is_read_as_it_was_written() -> None:
     withdrawal = Withdrawal(CAMERA.name, Right.PUBLISH, 7)
-    assert Withdrawal.from_statement(parse(withdrawal.to_wire(ROBOT.name, ROBOT.key)), NOW) == withdrawal
+    assert Withdrawal.received(parse(withdrawal.to_wire(ROBOT.name, ROBOT.key)), NOW) == withdrawal
 
 
 @pytest.mark.parametrize(
@@ -27,5 +27,5 @@ def test_a_withdrawal_is_read_as_it_was_written() -> None:
 def test_a_withdrawal_out_of_its_bounds_is_refused(change: dict[str, object], reason: DropReason) -> None:
     wire = sign(StatementType.WITHDRAW, {**BODY, **change}, ROBOT.name, ROBOT.key)
     with pytest.raises(StatementError) as refused:
-        Withdrawal.from_statement(parse(wire), NOW)
+        Withdrawal.received(parse(wire), NOW)
     assert refused.value.reason is reason

@@ -12,7 +12,7 @@ from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.trust.adcert import AdCert
-from gdp.trust.advertisement import sign_advertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
@@ -68,17 +68,16 @@ def advertisement(
     lease_s: float = 60.0,
 ) -> bytes:
     """Return a valid advertisement; by default the robot's, to publish the camera."""
-    return sign_advertisement(
-        node,
-        right,
-        subject,
+    return UnverifiedAdvertisement(
+        subject=subject,
+        right=right,
         rtcert=RtCert.make(node, SWITCH.name, DAY) if rtcert is None else rtcert,
         sequence=sequence,
         incarnation=7,
-        lease_s=lease_s,
+        lease_ms=round(lease_s * 1_000),
         is_global=True,
-        chain=[adcert(node)] if chain is None else chain,
-    )
+        chain=(adcert(node),) if chain is None else tuple(chain),
+    ).signed(node)
 
 
 def verifier(*, allow_unowned: bool = False) -> AdvertisementVerifier:

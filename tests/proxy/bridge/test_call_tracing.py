@@ -19,10 +19,10 @@ from opentelemetry.trace import SpanKind, StatusCode
 from pydantic import ValidationError
 
 from gdp.names import Name
+from gdp.service.frames import Request
 from proxy.bridge.call_tracer import CallKey, CallTracer, trace_ids
 from proxy.config.config import Traces
 from proxy.node.otel_tracer import CALLS_MAX, OtelTracer, open_tracer
-from proxy.wire.service import Request
 from tests.proxy.bridge.known import switch, switched
 from tests.proxy.bridge.sites import Machine, Sites
 from tests.proxy.bridge.test_replicas import replicas

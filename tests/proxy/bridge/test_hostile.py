@@ -9,10 +9,11 @@ import pytest
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.errors import LocalError
+from gdp.service.frames import Answer, Outcome, Request
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel, Qos
 from proxy.wire.message import RosMessage, TopicDescription
-from proxy.wire.service import Answer, Exchange, News, Outcome, Request
+from proxy.wire.service import Exchange, News
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
@@ -140,10 +141,10 @@ def test_answers_and_news_that_are_none_do_not_stop_a_client(sites: Sites, wire:
     "description",
     [
         b"nonsense",
-        Exchange("json", (SERVICE, SERVICE)).to_wire(),
-        Exchange("json", (replace(SERVICE, type_name="other_srvs/srv/Other"),)).to_wire(),
-        Exchange("json", (replace(SERVICE, request=known.channel(known.IMAGE)),)).to_wire(),
-        Exchange("json", (replace(SERVICE, response=known.channel(known.IMAGE)),)).to_wire(),
+        Exchange("json", (SERVICE, SERVICE)).to_cbor(),
+        Exchange("json", (replace(SERVICE, type_name="other_srvs/srv/Other"),)).to_cbor(),
+        Exchange("json", (replace(SERVICE, request=known.channel(known.IMAGE)),)).to_cbor(),
+        Exchange("json", (replace(SERVICE, response=known.channel(known.IMAGE)),)).to_cbor(),
     ],
     ids=["nonsense", "two parts", "another type", "another request", "another response"],
 )
@@ -163,7 +164,7 @@ def test_a_client_that_says_it_is_something_else_is_refused_with_a_reason(sites:
     local, caller = LocalServer(server.graph), Client(client.graph)
     assert sites.run(3, caller.sees_server)
     other = replace(SERVICE, request=known.channel(known.IMAGE))
-    client.stream.describe(Exchange("json", (other,)).to_wire())
+    client.stream.describe(Exchange("json", (other,)).to_cbor())
     sites.run(1)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: len(caller.outcomes) == 1)

@@ -100,20 +100,20 @@ def test_a_client_with_too_many_calls_in_flight_gets_an_error(sites: Sites) -> N
     assert machine.faults == {"too-fast": 1}
 
 
-@pytest.mark.parametrize("description", [b"nonsense", Exchange("json", ()).to_wire()])
+@pytest.mark.parametrize("description", [b"nonsense", Exchange("json", ()).to_cbor()])
 def test_a_client_that_cannot_be_understood_is_read_once(sites: Sites, description: bytes) -> None:
     machine, local, client, caller = called(sites)
     client.stream.describe(description)
     sites.run(1)
     read: list[bytes] = []
     with pytest.MonkeyPatch.context() as patch:
-        from_wire = Exchange.from_wire
+        from_wire = Exchange.from_cbor
 
         def noted(wire: bytes) -> Exchange:
             read.append(wire)
             return from_wire(wire)
 
-        patch.setattr(Exchange, "from_wire", noted)
+        patch.setattr(Exchange, "from_cbor", noted)
         for _ in range(3):
             caller.call(switch(on=True))
         assert sites.run(1, lambda: len(caller.outcomes) == 3)

@@ -13,10 +13,10 @@ import pytest
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
 from gdp.service.dispatch import Dispatch
+from gdp.service.frames import Answer, Outcome
 from proxy.bridge.imported_service import ImportedService
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
-from proxy.wire.service import Answer, Outcome
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, TRIGGER, switch, switched
 from tests.proxy.bridge.sites import ROBOT, Ear, Machine, Sites

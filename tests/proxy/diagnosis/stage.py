@@ -184,7 +184,7 @@ class Stage:
 
     def _answer_for(self, machine: Machine) -> None:
         def gather(question: Question, _now: Timestamps) -> ProxyFacts:
-            return self._proxy(machine, question.body.text("q"), is_near=False)
+            return self._proxy(machine, str(question.body["q"]), is_near=False)
 
         member = machine.member
 

@@ -34,13 +34,13 @@ def test_a_description_comes_back_as_it_was() -> None:
         callerid="/talker",
     )
     for channel in (ros1, ros2):
-        assert Channel.from_wire(channel.to_wire()) == channel
+        assert Channel.from_cbor(channel.to_wire()) == channel
 
 
 def test_an_unknown_caller_is_not_an_empty_one() -> None:
     for callerid in (None, ""):
         channel = Channel("/b", "std_msgs/msg/String", 1, callerid=callerid)
-        assert Channel.from_wire(channel.to_wire()).callerid == callerid
+        assert Channel.from_cbor(channel.to_wire()).callerid == callerid
 
 
 def test_a_definition_too_long_for_a_reader_is_the_callers_fault() -> None:
@@ -65,13 +65,13 @@ def test_a_definition_too_long_for_a_reader_is_the_callers_fault() -> None:
 def test_a_wrong_field_is_refused(change: dict[str, object]) -> None:
     fields = {"t": "/a", "n": "a/msg/B", "r": 2, "h": "", "d": "", "f": "", "l": False}
     with pytest.raises(RemoteError) as refusal:
-        Channel.from_wire(cbor2.dumps(fields | change))
+        Channel.from_cbor(cbor2.dumps(fields | change))
     assert refusal.value.reason is DropReason.MALFORMED
 
 
 def refusal(wire: bytes) -> DropReason | None:
     try:
-        Channel.from_wire(wire)
+        Channel.from_cbor(wire)
     except RemoteError as error:
         return error.reason
     return None
@@ -101,4 +101,4 @@ def test_an_altered_description_is_one_or_refused(at: int, value: int) -> None:
 
 def test_nesting_a_thousand_deep_is_refused() -> None:
     with pytest.raises(RemoteError):
-        Channel.from_wire(b"\x81" * 100_000)
+        Channel.from_cbor(b"\x81" * 100_000)

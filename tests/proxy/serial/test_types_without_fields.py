@@ -60,7 +60,7 @@ def test_a_service_with_one_crosses_between_ros_1_and_ros_2() -> None:
 
 
 def test_it_keeps_its_definition_on_the_wire() -> None:
-    assert Channel.from_wire(ros2().to_wire()) == ros2()
+    assert Channel.from_cbor(ros2().to_wire()) == ros2()
 
 
 def test_a_recording_without_its_definition_gets_that_of_the_standard_type() -> None:

@@ -53,7 +53,7 @@ def test_a_step_that_is_unknown_here_is_refused_as_of_another_version() -> None:
 )
 def test_a_description_comes_back_as_it_was(reductions: dict[str, Any]) -> None:
     description = TopicDescription("cbor", (CHANNEL,) * 3, **reductions)
-    assert TopicDescription.from_wire(description.to_wire()) == description
+    assert TopicDescription.from_cbor(description.to_wire()) == description
 
 
 def test_more_channels_than_allowed_are_refused_at_home() -> None:
@@ -67,7 +67,7 @@ def test_more_channels_than_allowed_are_refused_at_home() -> None:
 def test_a_reduction_that_is_unknown_here_is_refused(field: dict[str, Value]) -> None:
     fields: dict[str, Value] = {"e": "cdr", "c": [CHANNEL.to_wire()], **field}
     with pytest.raises(RemoteError):
-        TopicDescription.from_wire(encode(fields))
+        TopicDescription.from_cbor(encode(fields))
 
 
 @given(st.binary(max_size=100))
@@ -80,5 +80,5 @@ def test_a_reduction_that_is_unknown_here_is_refused(field: dict[str, Value]) ->
 @example(b"\x81" * 5_000)
 def test_arbitrary_bytes_are_no_description(wire: bytes) -> None:
     with pytest.raises(RemoteError) as caught:
-        TopicDescription.from_wire(wire)
+        TopicDescription.from_cbor(wire)
     assert caught.value.reason is DropReason.MALFORMED

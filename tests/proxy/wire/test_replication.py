@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp.names import Name
+from gdp.service.frames import Answer, Outcome, Request, Stop
 from gdp.service.replication_messages import (
     AttachReplica,
     FollowerMessage,
@@ -19,7 +20,6 @@ from gdp.service.replication_messages import (
     SnapshotRequest,
 )
 from proxy.wire.replication import follower_message, is_word, sequencer_message, to_wire
-from proxy.wire.service import Answer, Outcome, Request, Stop
 
 LOG = LogId(3, 0xFFFF_FFFF)
 

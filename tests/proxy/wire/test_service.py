@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from gdp.errors import RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.service.dispatch import STOP_MAX
-from proxy.wire.service import PATIENCE_MAX_MS, Answer, Exchange, News, Outcome, Request, Stop, too_large
+from gdp.service.frames import PATIENCE_MAX_MS, Answer, Outcome, Request, Stop
+from proxy.wire.service import Exchange, News, too_large
 from tests.proxy.bridge import known
 
 SWITCH = known.services()[known.SET_BOOL]
@@ -62,7 +63,7 @@ def test_a_word_to_stop_names_at_most_so_many_as_our_side_ever_sends() -> None:
 
 
 @pytest.mark.parametrize(
-    "read", [Request.from_wire, Answer.from_wire, News.from_wire, Stop.from_wire, Exchange.from_wire]
+    "read", [Request.from_wire, Answer.from_wire, News.from_wire, Stop.from_wire, Exchange.from_cbor]
 )
 @given(wire=st.binary(max_size=64))
 def test_any_bytes_are_read_or_refused(read: Callable[[bytes], object], wire: bytes) -> None:
@@ -87,7 +88,7 @@ def test_a_reason_is_bounded_and_always_readable() -> None:
 def test_a_description_there_and_back_is_the_same() -> None:
     for is_leaving in (False, True):
         exchange = Exchange("cbor", (SWITCH, SWITCH, SWITCH), (TEXT, TEXT), is_leaving)
-        assert Exchange.from_wire(exchange.to_wire()) == exchange
+        assert Exchange.from_cbor(exchange.to_cbor()) == exchange
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_a_description_there_and_back_is_the_same() -> None:
 )
 def test_a_description_of_too_little_or_too_much_is_refused(exchange: Exchange) -> None:
     with pytest.raises(RemoteError, match="a description of a service"):
-        Exchange.from_wire(exchange.to_wire())
+        Exchange.from_cbor(exchange.to_cbor())
 
 
 def test_what_cannot_travel_has_a_reason() -> None:
