@@ -14,25 +14,22 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.client.attachment import attachment_waits
 from gdp.client.participant import Participant
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError
-from gdp.host.single_instance import run_alone
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
-from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
-from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_settings, load_member
+from gdp.nodes.node import Node
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog
-from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.ports.netdev import NetdevPlane
-from gdp.runtime.runtime import Runtime
+from gdp.runtime.runtime import Runtime, now
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
+from gdp.state.node_state import MemberState
 
 __all__ = ["SessionNode", "open_node"]
 
@@ -91,40 +88,30 @@ def open_node(config: SessionConfig) -> SessionNode:
     Raises:
         LocalError: keys, delegations or the device differ from the settings, or this node already runs.
     """
-    identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(
-        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
-    )
-    member = Participant(identity, policy, settings)
+    identity, policy = credentials = load_member(config.identity, config.domain, Role.PROXY)
+    member = Participant(identity, policy, fresh_settings(config.lease_s))
     directory = config.delegation_directory
     topics = DelegationStore(directory, identity)
     core = SessionCore(member, topics, lambda: secrets.randbits(64), str(directory))
     with ExitStack() as stack:
         stack.callback(_own(identity.name))
-        stack.enter_context(run_alone("node", identity.name))
-        revocations = load_revocations(config.state, policy.revoked, stack)
+        parts = Node(
+            "node", credentials, config.identity, config.domain, stack, is_service=False, state_folder=config.state
+        )
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.busy_poll_us / 1e6)
         labels = {topic.name: core.label(topic) for topic in topics}
-        node_log = NodeLog(
-            member.attachment.hello_protocol,
-            policy,
-            plane,
-            member.boundary,
-            lambda now_s: attachment_waits(member.attachment, now_s),
-            conflict=lambda: member.attachment.conflict_at,
-            local_name=lambda name: labels.get(name, name.short),
-        )
-        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
-        runtime.every(RECONCILE_PERIOD_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
-        revocations.start(runtime)
+        state = MemberState(identity, policy, plane, member, now().mono_s)
+        state.local_name = lambda name: labels.get(name, name.short)
+        parts.drive(state, runtime)
+        parts.begin(runtime)
         node = SessionNode(
             config=config,
             identity=identity,
             member=member,
             runtime=runtime,
             plane=plane,
-            node_log=node_log,
+            node_log=parts.node_log,
             core=core,
             _stack=stack.pop_all(),
         )

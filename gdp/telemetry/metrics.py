@@ -7,7 +7,7 @@ Source: Prometheus text exposition format, version 0.0.4.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from typing import Final
 
@@ -24,7 +24,7 @@ from gdp.telemetry.sources import (
     EntryCounts,
     Gauge,
     Histogram,
-    LinkRow,
+    NeighbourRow,
     PortRow,
     Sources,
     TopicCounts,
@@ -52,8 +52,9 @@ class Metrics(Collector):
         """Read every source."""
         of = self._sources
         yield from _counter("gdp_frames", "Frames by direction", "direction", of.frames)
-        if of.drops:
-            yield from _counter("gdp_drops", "What went no further, by reason", "reason", self._drops)
+        if (drops := of.drops) is not None:
+            by_label = lambda: {reason.label: drops().get(reason, 0) for reason in DropReason}  # noqa: E731
+            yield from _counter("gdp_drops", "What went no further, by reason", "reason", by_label)
         yield from _gauge("gdp_table_entries", "Entries of the forwarding table", of.table_entries)
         yield from _entries(of.entries)
         yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.pending_frames)
@@ -81,10 +82,6 @@ class Metrics(Collector):
             )
         if of.latency is not None:
             yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
-
-    def _drops(self) -> Mapping[str, int]:
-        lists = [source() for source in self._sources.drops]
-        return {reason.label: sum(counts[reason] for counts in lists) for reason in DropReason}
 
     def text(self) -> str:
         """Return the text of a scrape."""
@@ -139,13 +136,13 @@ def _entries(source: EntryCounts | None) -> Iterator[Metric]:
     yield sizes
 
 
-def _links(rows: Sequence[LinkRow]) -> Iterator[Metric]:
+def _links(rows: Sequence[NeighbourRow]) -> Iterator[Metric]:
     labels = ["port", "neighbour"]
     costs = GaugeMetricFamily("gdp_link_cost", "Cost of the link to a neighbour", labels=labels)
     rtts = GaugeMetricFamily("gdp_link_rtt_seconds", "Its smoothed round-trip time", labels=labels)
     losses = GaugeMetricFamily("gdp_link_loss", "Share of keepalives lost", labels=[*labels, "direction"])
     for row in rows:
-        ends = [row.port, row.neighbour]
+        ends = [row.port, row.name.short]
         costs.add_metric(ends, row.cost)
         if row.rtt_s is not None:
             rtts.add_metric(ends, row.rtt_s)

@@ -31,6 +31,7 @@ from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_st
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.name_facts import proxy_facts
 from proxy.serial.channel import Qos
+from tests.gdp.state.memory_states import rib_state, switch_state
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import Ear, Machine, Sites
 from tests.proxy.endpoints.fake import Publication
@@ -176,11 +177,13 @@ class Stage:
         world = self.sites.world
         for machine in self.sites.machines:
             self._answer_for(machine)
-        for label, switch in world.switches.items():
-            waits = partial(self._waits_of, label)
-            answer_for_switch(switch, switch._policy, waits, world.network.now.mono_s - self.uptime_s)
-        for host in world.ribs.values():
-            answer_for_rib(host, host.rib._policy, lambda _: ())
+        for label in world.switches:
+            state = switch_state(world, label, begun_s=world.network.now.mono_s - self.uptime_s)
+            edges = frozenset(self._edges(label))
+            state.unwaited = partial(frozenset, edges)
+            answer_for_switch(state)
+        for label in world.ribs:
+            answer_for_rib(rib_state(world, label))
 
     def _answer_for(self, machine: Machine) -> None:
         def gather(question: Question, _now: Timestamps) -> ProxyFacts:

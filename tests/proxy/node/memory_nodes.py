@@ -21,38 +21,27 @@ from unittest import mock
 
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from gdp.client.attachment import attachment_waits
 from gdp.crypto.keys import SoftwareKey
 from gdp.dashboard.core.readings import Reading
 from gdp.dashboard.core.scene import Scene
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
-from gdp.nodes import rib as rib_node
-from gdp.nodes import switch as switch_node
 from gdp.nodes.data_plane import Chosen
+from gdp.nodes.node import common_sources
 from gdp.nodes.node_log import NodeLog
-from gdp.ports.plane import Counters, Port
+from gdp.nodes.rib import rib_handlers, rib_sources
+from gdp.nodes.switch import switch_handlers, switch_sources
+from gdp.ports.port_counters import PortCounters
 from gdp.runtime import runtime as runtime_module
+from gdp.runtime.runtime import now
 from gdp.sansio import Timestamps
-from gdp.state.control_status import node_status
-from gdp.state.diagnostic_control import DiagnosticCommands
-from gdp.state.link_rows import LinkRows
-from gdp.state.member_tables import rib_tables
-from gdp.state.name_lookup import rib_lookup
-from gdp.state.snapshot import node_snapshot, rib_snapshot
-from gdp.state.state_answers import answer_for_rib
+from gdp.state.node_state import NodeState
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Sources
-from gdp.trust.domain import Policy
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from proxy.bridge.bridge import Bridge
-from proxy.bridge.core.flow_fields import flow_fields
-from proxy.bridge.core.topic_rows import flow_rows
-from proxy.bridge.topic_counts import topic_counts
-from proxy.node import bridge_node
-from proxy.node import node as proxy_node
-from proxy.node.node import ProxyNode
+from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 from proxy.node.state_answer import answer_for_proxy
+from tests.gdp.state.memory_states import plane_of, rib_state, switch_state
 from tests.insiders.oracle import signing_oracle
 from tests.proxy import rule_files
 from tests.proxy.bridge import sites as sites_module
@@ -73,15 +62,6 @@ _LINE: Final = Topology(
 )
 _MEMBER_TABLES: Final = ("neighbors", "links", "names", "peers", "drops")
 _SWITCH_TABLES: Final = (*_MEMBER_TABLES, "routes", "trees", "tunnels")
-
-
-class MemoryPlane:
-    """Plane of a simulated node: its ports, and counts that tests set."""
-
-    def __init__(self, ports: Mapping[int, Port]) -> None:
-        self.ports = ports
-        self.counters = Counters(frames_in=120, frames_out=110, forwarded=90, punted=30)
-        self.counters.drops[3] = 2
 
 
 class MemoryRuntime:
@@ -118,9 +98,7 @@ class _Network:
         self._stack = stack
         self.sites = sites = Sites(folder, topology=_LINE)
         clock = SimpleNamespace(monotonic=lambda: sites.now_s, time=lambda: sites.world.network.now.unix_s)
-        for module in (runtime_module, proxy_node, bridge_node):
-            if hasattr(module, "time"):
-                stack.enter_context(mock.patch.object(module, "time", clock))
+        stack.enter_context(mock.patch.object(runtime_module, "time", clock))
         self.robot = sites.add(ROBOT, expose=[_CHATTER, _SWITCH, _BEST_EFFORT])
         self.server = sites.add(SERVER, imports=[_CHATTER, _SWITCH, _BEST_EFFORT, _UNDELEGATED], holds=_HELD)
         self.runtimes: dict[str, MemoryRuntime] = {}
@@ -151,11 +129,10 @@ class _Network:
     def read(self) -> dict[str, object]:
         """Return what each command reads of each node."""
         world = self.sites.world
-        now = world.network.now
         found: dict[str, object] = {}
         topic = self.robot.stream.topic if len(self.robot.member.publishers()) == 1 else self._topic()
         for label, handlers in self.handlers.items():
-            self.runtimes[label].tick(now)
+            self.runtimes[label].tick(world.network.now)
             shown: dict[str, object] = {"status": handlers.status(), "snapshot": handlers.snapshot()}
             for what in _SWITCH_TABLES if label in world.switches else _MEMBER_TABLES:
                 with contextlib.suppress(Exception):
@@ -218,104 +195,34 @@ class _Network:
                 break
         return dict(replies[-1])
 
-    def _plane(self, node: str) -> Any:
-        ports = self.sites.world.network._nodes[node].ports
-        return MemoryPlane(
-            {
-                index: Port(index, f"to-{far.node.replace('/', '-')}", own.mac, link.mtu, up=True)
-                for index, (link, own, far) in ports.items()
-            }
-        )
-
     def _add_switch(self, label: str) -> None:
-        world = self.sites.world
-        switch, identity, plane = world.switches[label], world.identities[label], self._plane(label)
-        policy, runtime, chosen = switch._policy, cast(Any, MemoryRuntime()), Chosen(plane, "raw", "no kernel here")
-        node_log = NodeLog(
-            switch.hello_protocol, policy, plane, switch.boundary, lambda now_s: switch.waits(set(), now_s),
-            rib=lambda: switch.rib,
-        )  # fmt: skip
-        runtime.every(0.5, node_log.log_changes)
-        sources = switch_node._sources(switch, chosen, node_log, runtime)
-        commands = switch_node._diagnostic_commands(identity, policy, switch, plane, sources, None, node_log)
-        self.handlers[label] = switch_node._control_handlers(
-            identity, switch, chosen, runtime, lambda: None, sources, None, None, commands, self._stack
-        )
-        self.runtimes[label], self.sources[label] = runtime, sources
+        state, chosen = switch_state(self.sites.world, label), Chosen(cast(Any, None), "raw")
+        node_log, runtime = self._log(label, state)
+        sources = common_sources(node_log, switch_sources(state, chosen, runtime))
+        counters = PortCounters()
+        self._stack.callback(counters.close)
+        self.handlers[label], self.sources[label] = switch_handlers(state, chosen, sources, counters), sources
 
     def _add_rib(self, label: str) -> None:
-        world = self.sites.world
-        host, identity = world.ribs[label], world.identities[f"rib:{label}"]
-        plane, runtime = self._plane(world.rib_node(label)), cast(Any, MemoryRuntime())
-        policy: Policy = host.rib._policy
-        rib, now = host.rib, runtime_module.now
-        node_log = NodeLog(
-            host.attachment.hello_protocol, policy, plane, rib.boundary,
-            lambda now_s: [*attachment_waits(host.attachment, now_s), *rib.waits(now_s)],
-        )  # fmt: skip
-        runtime.every(0.5, node_log.log_changes)
-        sources, begun_s = rib_node._sources(host, plane, node_log, runtime), now().mono_s
-        answer_for_rib(host, policy, node_log.wait_facts)
-        commands = DiagnosticCommands(
-            diagnostics=host.diagnostics,
-            policy=policy,
-            own_switch=lambda: host.attachment.switch.name if host.attachment.switch is not None else None,
-            now=now,
-            tables=rib_tables(host, rib._store, plane, policy, sources.drops),
-            role="RIB",
-        )
-        self.handlers[f"rib:{label}"] = ControlHandlers(
-            reload=lambda: None,
-            status=lambda: node_status(
-                identity, sources, uptime_s=now().mono_s - begun_s, attached=host.attachment.switch is not None
-            ),
-            snapshot=lambda: {
-                **node_snapshot(identity, sources, uptime_s=now().mono_s - begun_s),
-                **rib_snapshot(rib, None if host.attachment.switch is None else host.attachment.switch.name),
-            },
-            drain=lambda: None,
-            lookup=lambda name: rib_lookup(rib, identity.name, name, now()),
-            ask=commands.ask,
-            show=commands.show,
-        )
-        self.runtimes[f"rib:{label}"], self.sources[f"rib:{label}"] = runtime, sources
+        state = rib_state(self.sites.world, label)
+        node_log, _ = self._log(f"rib:{label}", state)
+        sources = self.sources[f"rib:{label}"] = common_sources(node_log, rib_sources(state))
+        self.handlers[f"rib:{label}"] = rib_handlers(state, sources, state.host.rib._store)
 
     def _add_proxy(self, machine: Machine) -> None:
-        world = self.sites.world
-        member, plane, runtime = machine.member, self._plane(machine.label), cast(Any, MemoryRuntime())
-        identity, policy, bridge = world.identities[machine.label], member.attachment._policy, machine.bridge
-        hello_protocol = member.attachment.hello_protocol
-        node_log = NodeLog(
-            hello_protocol, policy, plane, member.boundary, lambda now_s: attachment_waits(member.attachment, now_s),
-            conflict=lambda: member.attachment.conflict_at, local_name=lambda name: name.short,
-        )  # fmt: skip
-        links = LinkRows(hello_protocol, plane.ports)
+        world, member = self.sites.world, machine.member
+        identity, plane = world.identities[machine.label], plane_of(world, machine.label)
+        state = ProxyState(identity, member.attachment._policy, plane, member, now().mono_s, {})
+        state.context, state.bridge = machine.context, machine.bridge
+        state.has_topic_names, state.ros_domains = True, (0,)
+        node_log, _ = self._log(machine.label, state)
+        answer_for_proxy(state, machine.bridge)
+        sources = self.sources[machine.label] = common_sources(node_log, proxy_sources(state))
+        self.handlers[machine.label] = proxy_handlers(state, sources)
+
+    def _log(self, label: str, state: NodeState) -> tuple[NodeLog, Any]:
+        node_log, runtime = NodeLog(state), MemoryRuntime()
+        self.runtimes[label] = runtime
         runtime.every(0.5, node_log.log_changes)
-        runtime.every(0.5, links.refresh)
-        node = ProxyNode(
-            identity=identity, policy=policy, member=member, runtime=runtime, plane=plane, node_log=node_log,
-            credentials=cast(Any, None), links=links, local_name=lambda name: name.short,
-        )  # fmt: skip
-        node.begun_s = self.sites.now_s
-        node.traffic, node.faults = machine.context.traffic, machine.context.faults
-        answer_for_proxy(bridge, machine.context, identity, policy, node_log.wait_facts, (0,))
-        _follow(node, bridge)
-        self.handlers[machine.label] = node.control_handlers()
-        self.runtimes[machine.label], self.sources[machine.label] = runtime, node.sources()
-
-
-def _follow(node: ProxyNode, bridge: Bridge) -> None:
-    node.topic_counts = lambda: topic_counts(bridge.flows, has_names=True)
-    node.best_effort = lambda: bridge.best_effort
-    node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
-    local_name = node.local_name
-    node.local_name = lambda name: bridge_node._local_names(bridge).get(name) or local_name(name)
-    node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
-    node.undelegated = lambda: [bridge_node._described(each) for each in bridge.undelegated]
-    node.qos = lambda: [bridge_node._qos_fields(*each) for each in bridge.offered_qos]
-    node.liveliness = lambda: [each.to_fields() for each in bridge.liveliness(runtime_module.now().mono_s)]
-    node.unready = lambda: [{"local": local, "reason": reason} for local, reason in bridge.unready]
-    node.denied = lambda: [
-        {"side": "expose" if each.is_exposed else "import", "local": each.local, "pattern": each.pattern}
-        for each in bridge.denied
-    ]
+        runtime.every(0.5, state.refresh)
+        return node_log, cast(Any, runtime)
