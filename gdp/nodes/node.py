@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from gdp.config.schema import Domain, Metrics
+from gdp.config.schema import Metrics
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
@@ -30,7 +30,7 @@ from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.names import Name
 from gdp.nodes.audit import NodeAudit
-from gdp.nodes.credentials import Credentials
+from gdp.nodes.credentials import Credentials, NodeConfig
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
@@ -73,7 +73,6 @@ class Node:
     Args:
         word: for the kind of node in errors, such as ``switch``.
         member: as from ``load_member``.
-        directory: of its keys.
         stack: closes the parts.
         is_service: it may have a service manager, whose messages are its own; not in the process of a user's program.
         state_folder: keeps revocations across restarts; None: they are kept in memory only.
@@ -93,8 +92,7 @@ class Node:
         self,
         word: str,
         member: tuple[Identity, Policy],
-        directory: Path,
-        domain: Domain,
+        config: NodeConfig,
         stack: contextlib.ExitStack,
         *,
         is_service: bool = True,
@@ -111,7 +109,7 @@ class Node:
         self._revocations.restore(now())
         stack.callback(self._revocations.close)
         self._audit_log = None if audit is None else AuditLog(audit)
-        self._credentials = Credentials(directory, domain, self.identity, self.policy)
+        self._credentials = Credentials(config.identity, config.domain, self.identity, self.policy)
 
     def drive(self, state: NodeState, loop: Loop, on_wait: OnWait | None = None) -> None:
         """Log from within the loop what changes, and measure the links.

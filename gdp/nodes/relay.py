@@ -59,7 +59,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
     """
     identity, policy = member = load_member(config.identity, config.domain, Role.SWITCH)
     with contextlib.ExitStack() as stack:
-        node = Node("relay", member, config.identity, config.domain, stack, instance=_instance(identity.name))
+        node = Node("relay", member, config, stack, instance=_instance(identity.name))
         loop = RelayLoop()
         stack.callback(loop.close)
         node.follow_credentials(loop)

@@ -51,7 +51,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     identity, policy = member = load_member(config.identity, config.domain, Role.RIB)
     with contextlib.ExitStack() as stack:
         audit = audit_folder(config.audit)
-        node = Node("RIB", member, config.identity, config.domain, stack, state_folder=config.state, audit=audit)
+        node = Node("RIB", member, config, stack, state_folder=config.state, audit=audit)
         if config.sandbox:
             load_plane(config.data_plane)
             confine_rib(config)  # before the thread of the store starts; the device can still be opened

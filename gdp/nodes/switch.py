@@ -73,7 +73,7 @@ def run_switch(
     switch = SwitchCore(identity, policy, table, _settings(config))
     with contextlib.ExitStack() as stack:
         audit = audit_folder(config.audit)
-        node = Node("switch", member, config.identity, config.domain, stack, state_folder=config.state, audit=audit)
+        node = Node("switch", member, config, stack, state_folder=config.state, audit=audit)
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]

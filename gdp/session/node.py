@@ -95,9 +95,7 @@ def open_node(config: SessionConfig) -> SessionNode:
     core = SessionCore(member, topics, lambda: secrets.randbits(64), str(directory))
     with ExitStack() as stack:
         stack.callback(_own(identity.name))
-        parts = Node(
-            "node", credentials, config.identity, config.domain, stack, is_service=False, state_folder=config.state
-        )
+        parts = Node("node", credentials, config, stack, is_service=False, state_folder=config.state)
         plane = stack.enter_context(open_uplink(config.iface))
         runtime = Runtime(member, plane, spin_s=config.busy_poll_us / 1e6)
         labels = {topic.name: core.label(topic) for topic in topics}

@@ -19,7 +19,6 @@ from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
-from gdp.nodes.credentials import watched_folders
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node import Node, common_sources
@@ -27,7 +26,7 @@ from gdp.nodes.node_log import RECONCILE_PERIOD_S, OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.runtime.runtime import Runtime, now
 from proxy.bridge.bridge import Bridge
-from proxy.config.config import ProxyConfig, Record
+from proxy.config.config import ProxyConfig
 from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 
 __all__ = ["ProxyNode", "open_topics", "run_node"]
@@ -53,7 +52,7 @@ class ProxyNode(Node):
 
     def __init__(self, config: ProxyConfig, stack: contextlib.ExitStack, on_wait: OnWait | None) -> None:
         member = load_member(config.identity, config.domain, Role.PROXY)
-        super().__init__("proxy", member, config.identity, config.domain, stack, state_folder=config.state)
+        super().__init__("proxy", member, config, stack, state_folder=config.state)
         self.member = Participant(self.identity, self.policy, fresh_settings(config.lease_s))
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         self.runtime = Runtime(self.member, plane, spin_s=config.busy_poll_us / 1e6)
@@ -151,11 +150,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         )
         node.serve(runtime, handlers, config.control_socket, node.reload_on_signal)
         if config.sandbox:
-            again = watched_folders(config.identity, config.domain)
-            files = (each.path if isinstance(each, Record) else each for each in (config.record, config.control_socket))
-            kept = (*(None if each is None else each.parent for each in files), config.state)
-            written = [folder for folder in kept if folder is not None]
-            confine_proxy((*again, config.delegations), written, has_ros=bool(config.ros))
+            files = (None if config.record is None else config.record.path, config.control_socket)
+            folders = (None if each is None else each.parent for each in files)
+            confine_proxy(config, [config.delegations], [*folders, config.state], has_ros=bool(config.ros))
         node.begin(runtime, config.metrics, sources)
         log.info("proxy up name=%s iface=%s", node.identity.name.short, config.iface)
         yield node
