@@ -33,9 +33,9 @@ from gdp.nodes.audit import NodeAudit
 from gdp.nodes.credentials import Credentials, NodeConfig
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
-from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
 from gdp.ports.plane import HasFileno
+from gdp.ports.port_counters import PortCounters
 from gdp.runtime.runtime import now
 from gdp.sansio import Timestamps
 from gdp.state.control_status import node_status
@@ -108,6 +108,8 @@ class Node:
         self._revocations = RevocationUpkeep(state_folder, self.policy.revoked)
         self._revocations.restore(now())
         stack.callback(self._revocations.close)
+        self._counters = PortCounters()
+        stack.callback(self._counters.close)
         self._audit_log = None if audit is None else AuditLog(audit)
         self._credentials = Credentials(config.identity, config.domain, self.identity, self.policy)
 
@@ -118,6 +120,7 @@ class Node:
             on_wait: called with reason and text when the node reports what it waits for.
         """
         self.node_log = NodeLog(state, on_wait)
+        state.read_devices = self._counters.read
         for follow in (self.node_log.log_changes, state.refresh):
             loop.every(RECONCILE_PERIOD_S, follow)
         log_decisions(loop.every, state)
@@ -179,7 +182,7 @@ def common_sources(node_log: NodeLog, own: Sources) -> Sources:
         drops=state.drops,
         waiting=node_log.metrics,
         links=lambda: state.links,
-        ports=lambda: port_rows(state.plane.ports),
+        ports=state.ports,
         health=node_log.health,
     )
 

@@ -24,6 +24,19 @@ log = logging.getLogger(__name__)
 
 RECONCILE_PERIOD_S: Final = 0.5
 
+_TEXTS: Final = {
+    WaitReason.LINK_DOWN: "link down on {port}",
+    WaitReason.NO_NEIGHBOUR: "no neighbour on {port}: no answer there",
+    WaitReason.ONE_WAY: "neighbour {name} on {port} does not hear this node, or does not trust its domain",
+    WaitReason.NO_SWITCH: "no switch on {port}: its neighbours are RIBs or proxies",
+    WaitReason.NO_RIB: "no RIB answers the switch: start gdp-rib",
+    WaitReason.NO_UPPER_RIB: "RIB {name} above does not answer: what it gave is kept, new names of other domains are"
+    " not found",
+    WaitReason.REFUSED: "advertisement of {label} refused: {reason}",
+    WaitReason.THROUGH_LEAF: "switch {name}, maybe others, is joined by leaves only, which carry no transit",
+    WaitReason.IN_USE: "another node with this identity is attached elsewhere; this one starts when that one is gone",
+}
+
 OnWait = Callable[[str, str], None]  # reason and text
 
 
@@ -97,37 +110,18 @@ class NodeLog:
         self._neighbours = set(now)
 
     def _text(self, wait: Wait) -> str:
-        ifname = "?" if wait.port is None else self.state.ifname(wait.port)
+        port = "?" if wait.port is None else self.state.ifname(wait.port)
+        if wait.reason is WaitReason.STRANGER:
+            return _refusal(port, wait)
+        reason = "" if wait.refused is None else wait.refused.label
+        label = "" if wait.name is None else self.state.local_name(wait.name)
         name = "?" if wait.name is None else wait.name.short
-        match wait.reason:
-            case WaitReason.LINK_DOWN:
-                return f"there is no device {ifname}" if self._is_absent(wait.port) else f"link down on {ifname}"
-            case WaitReason.NO_NEIGHBOUR:
-                return f"no neighbour on {ifname}: no answer there"
-            case WaitReason.STRANGER:
-                return _refusal(ifname, wait)
-            case WaitReason.ONE_WAY:
-                return f"neighbour {name} on {ifname} does not hear this node, or does not trust its domain"
-            case WaitReason.NO_SWITCH:
-                return f"no switch on {ifname}: its neighbours are RIBs or proxies"
-            case WaitReason.NO_RIB:
-                return (
-                    "no RIB of this domain can be reached"
-                    if isinstance(self.state, SwitchState)
-                    else "no RIB answers the switch: start gdp-rib"
-                )
-            case WaitReason.NO_UPPER_RIB:
-                return (
-                    f"RIB {name} above does not answer: what it gave is kept, new names of other domains are not found"
-                )
-            case WaitReason.REFUSED:
-                reason = "" if wait.refused is None else wait.refused.label
-                label = "?" if wait.name is None else self.state.local_name(wait.name)
-                return f"advertisement of {label} refused: {reason}"
-            case WaitReason.THROUGH_LEAF:
-                return f"switch {name}, maybe others, is joined by leaves only, which carry no transit"
-            case WaitReason.IN_USE:
-                return "another node with this identity is attached elsewhere; this one starts when that one is gone"
+        text = _TEXTS[wait.reason]
+        if wait.reason is WaitReason.LINK_DOWN and self._is_absent(wait.port):
+            text = "there is no device {port}"
+        elif wait.reason is WaitReason.NO_RIB and isinstance(self.state, SwitchState):
+            text = "no RIB of this domain can be reached"
+        return text.format(port=port, name=name, label=label or "?", reason=reason)
 
     def _is_absent(self, port: int | None) -> bool:
         known = None if port is None else self.state.plane.ports.get(port)

@@ -73,7 +73,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             is_drained=lambda: runtime.has_drained,
         )
         node.serve(runtime, handlers, config.control_socket)
-        for source in upkeep.sources():
+        for source in upkeep.sources:
             runtime.watch(source, lambda: upkeep.work(now()))
         node.begin(runtime, config.metrics, sources)
         log.info("rib up name=%s iface=%s plane=%s", identity.name.short, config.iface, config.data_plane)

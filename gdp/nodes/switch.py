@@ -30,7 +30,6 @@ from gdp.nodes.node import Loop, Node, common_handlers, common_sources
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, OnWait
 from gdp.nodes.rights import confine_switch
 from gdp.ports.plane import MAC_BYTES, Plane
-from gdp.ports.port_counters import PortCounters
 from gdp.ports.rtnetlink import LinkMonitor
 from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.state.control_status import link_status
@@ -104,9 +103,7 @@ def run_switch(
             _revoke(switch, config.revocations)
 
         sources = common_sources(node.node_log, switch_sources(state, chosen, runtime))
-        counters = PortCounters()
-        stack.callback(counters.close)
-        handlers = switch_handlers(state, chosen, sources, counters, links, relay)
+        handlers = switch_handlers(state, chosen, sources, links, relay)
         handlers = replace(
             handlers,
             reload=reload,
@@ -169,7 +166,6 @@ def switch_handlers(
     state: SwitchState,
     chosen: Chosen,
     sources: Sources,
-    counters: PortCounters,
     links: TunnelLinks | None = None,
     relay: RelayPorts | None = None,
 ) -> ControlHandlers:
@@ -197,9 +193,7 @@ def switch_handlers(
         return more
 
     return replace(
-        common_handlers(
-            state, sources, switch_tables(state, tunnels), status, lambda: switch_snapshot(state, counters.read())
-        ),
+        common_handlers(state, sources, switch_tables(state, tunnels), status, lambda: switch_snapshot(state)),
         topology=lambda: topology_snapshot(switch),
         topics=lambda: rows_to_fields(switch_rows(switch.attached.all(), chosen.entry_counts), now().mono_s),
         lookup=lambda name: lookups.lookup(name, now()),

@@ -7,7 +7,7 @@ snapshots, facts, metrics and logs are projections of it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from gdp.client.attachment import Attachment, attachment_waits
@@ -25,7 +25,7 @@ from gdp.names import Name
 from gdp.ports.plane import Plane
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
-from gdp.telemetry.sources import NeighbourRow
+from gdp.telemetry.sources import DeviceCounts, NeighbourRow, PortRow
 from gdp.trust.domain import Policy
 
 __all__ = ["MemberState", "NodeState", "RibState", "SwitchState"]
@@ -50,6 +50,7 @@ class NodeState:
     Attributes:
         role: word for the kind of node in errors.
         links: neighbours that are up, as of the last ``refresh``, by port and short name; any thread may read them.
+        read_devices: returns counts by device, as ``PortCounters.read``.
         local_name: returns the user's word for a name, or another form for people.
     """
 
@@ -71,6 +72,7 @@ class NodeState:
         self.core = core
         self.begun_s = begun_s
         self.links: list[NeighbourRow] = []
+        self.read_devices: Callable[[], Mapping[str, Sequence[int]]] = dict
         self.local_name: Callable[[Name], str] = lambda name: name.short
 
     def waits(self, now_s: float) -> list[Wait]:
@@ -86,6 +88,19 @@ class NodeState:
     def conflict_at(self) -> Name | None:
         """Return the switch that refused another node with this identity; None: there was none."""
         return None
+
+    def devices(self) -> dict[str, DeviceCounts]:
+        """Return what the kernel counted at each device; any thread may ask."""
+        return {device: DeviceCounts(*counts) for device, counts in self.read_devices().items()}
+
+    def ports(self) -> list[PortRow]:
+        """Return the ports by device; one whose device is absent has no counts. Any thread may ask."""
+        devices = self.devices()
+        rows = [
+            PortRow(port.ifname, port.up, port.mtu, devices.get(port.ifname))
+            for port in list(self.plane.ports.values())
+        ]
+        return sorted(rows, key=lambda row: row.port)
 
     def refresh(self, _now: Timestamps) -> None:
         """Read the links again; the node's own thread calls it."""

@@ -23,11 +23,10 @@ from gdp.rib.core import RibCore
 from gdp.state.node_state import NodeState, SwitchState
 from gdp.state.tables import rounded_ms
 from gdp.switch.core import SwitchCore
-from gdp.telemetry.sources import NeighbourRow, Sources
+from gdp.telemetry.sources import DeviceCounts, NeighbourRow, Sources
 
 __all__ = [
     "ID_CHARS",
-    "PortCounts",
     "member_snapshot",
     "node_snapshot",
     "rib_snapshot",
@@ -44,7 +43,6 @@ LINKS_MAX: Final = 256
 SWITCHES_MAX: Final = 512  # of a topology
 _FAN_OUT_MAX: Final = 64  # branches of one tree
 
-PortCounts = Mapping[str, tuple[int, int]]  # device to bytes in and bytes out
 _T = TypeVar("_T")
 
 
@@ -71,15 +69,11 @@ def node_snapshot(state: NodeState, sources: Sources, now_s: float) -> dict[str,
     }
 
 
-def switch_snapshot(state: SwitchState, ports: PortCounts) -> dict[str, object]:
-    """Return the fields of a switch.
-
-    Args:
-        ports: bytes that crossed each device since it exists.
-    """
-    switch, up = state.switch, list(state.neighbours(is_up=True))
+def switch_snapshot(state: SwitchState) -> dict[str, object]:
+    """Return the fields of a switch."""
+    switch, up, devices = state.switch, list(state.neighbours(is_up=True)), state.devices()
     advertisements, trees = switch.attached.all(), switch.multicast.trees
-    links = [_link(row, *ports.get(row.port, (0, 0))) for row in up[:LINKS_MAX]]
+    links = [_link(row, devices.get(row.port)) for row in up[:LINKS_MAX]]
     names = [
         [short_id(one.name), short_id(one.node), one.right.value]
         for one in (each.advertisement for each in advertisements[:NAMES_MAX])
@@ -106,7 +100,7 @@ def switch_snapshot(state: SwitchState, ports: PortCounts) -> dict[str, object]:
     }
 
 
-def _link(row: NeighbourRow, bytes_in: int, bytes_out: int) -> dict[str, object]:
+def _link(row: NeighbourRow, counts: DeviceCounts | None) -> dict[str, object]:
     return {
         "port": row.port,
         "to": short_id(row.name),
@@ -117,8 +111,8 @@ def _link(row: NeighbourRow, bytes_in: int, bytes_out: int) -> dict[str, object]
         "loss": max(row.loss_in, row.loss_out),
         "cost": row.cost,
         "mtu": row.mtu,
-        "bytes_in": bytes_in,
-        "bytes_out": bytes_out,
+        "bytes_in": 0 if counts is None else counts.bytes_in,
+        "bytes_out": 0 if counts is None else counts.bytes_out,
     }
 
 

@@ -48,3 +48,13 @@ def test_drops_of_plane_and_core_are_added() -> None:
     state = switch_state(paired(), "one")
     core = dict(state.core.drops())
     assert sum(state.drops().values()) == 2 + sum(core.values())
+
+
+def test_a_port_has_the_counts_of_its_device_and_an_absent_one_has_none() -> None:
+    state = switch_state(paired(), "one")
+    assert [each.counts for each in state.ports()] == [None]
+    state.read_devices = lambda: {"to-two": tuple(range(8))}
+    (port,) = state.ports()
+    assert (port.port, port.is_up, port.mtu) == ("to-two", True, 1_500)
+    assert port.counts is not None
+    assert (port.counts.frames_in, port.counts.bytes_in, port.counts.drops_out) == (0, 2, 7)

@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 from gdp.control.link_state import Scope
-from gdp.ports.port_counters import PortCounters
 from gdp.state.snapshot import (
     ID_CHARS,
     member_snapshot,
@@ -31,7 +30,7 @@ def ends_of(flow: Flow) -> tuple[str, str, str]:
 
 def snapshots(world: Simulation) -> dict[str, Any]:
     """Return the snapshot of every switch, by its label."""
-    return {label: json.loads(json.dumps(switch_snapshot(switch_state(world, label), {}))) for label in world.switches}
+    return {label: json.loads(json.dumps(switch_snapshot(switch_state(world, label)))) for label in world.switches}
 
 
 def test_the_trees_of_all_switches_lead_from_the_publisher_to_the_reader() -> None:
@@ -118,12 +117,3 @@ def test_a_rib_shows_how_many_routes_it_has() -> None:
         assert shown["routes"] == host.rib.names
         assert shown["switch"] is None
     flow.outlive()
-
-
-def test_byte_counters_of_devices_are_read_again_and_again() -> None:
-    counters = PortCounters()
-    first = counters.read()
-    assert all(after[0] >= first[device][0] for device, after in counters.read().items() if device in first)
-    assert "lo" in first
-    counters.close()
-    assert counters.read() == {}

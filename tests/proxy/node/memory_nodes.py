@@ -31,7 +31,6 @@ from gdp.nodes.node import common_sources
 from gdp.nodes.node_log import NodeLog
 from gdp.nodes.rib import rib_handlers, rib_sources
 from gdp.nodes.switch import switch_handlers, switch_sources
-from gdp.ports.port_counters import PortCounters
 from gdp.runtime import runtime as runtime_module
 from gdp.runtime.runtime import now
 from gdp.sansio import Timestamps
@@ -95,7 +94,6 @@ def outputs(folder: Path) -> dict[str, object]:
 
 class _Network:
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
-        self._stack = stack
         self.sites = sites = Sites(folder, topology=_LINE)
         clock = SimpleNamespace(monotonic=lambda: sites.now_s, time=lambda: sites.world.network.now.unix_s)
         stack.enter_context(mock.patch.object(runtime_module, "time", clock))
@@ -199,9 +197,7 @@ class _Network:
         state, chosen = switch_state(self.sites.world, label), Chosen(cast(Any, None), "raw")
         node_log, runtime = self._log(label, state)
         sources = common_sources(node_log, switch_sources(state, chosen, runtime))
-        counters = PortCounters()
-        self._stack.callback(counters.close)
-        self.handlers[label], self.sources[label] = switch_handlers(state, chosen, sources, counters), sources
+        self.handlers[label], self.sources[label] = switch_handlers(state, chosen, sources), sources
 
     def _add_rib(self, label: str) -> None:
         state = rib_state(self.sites.world, label)
