@@ -20,12 +20,13 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 from gdp.config.schema import Metrics
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
+from gdp.links.relay_loop import RelayLoop
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.names import Name
@@ -34,10 +35,8 @@ from gdp.nodes.credentials import Credentials, NodeConfig
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
-from gdp.ports.plane import HasFileno
 from gdp.ports.port_counters import PortCounters
-from gdp.runtime.runtime import now
-from gdp.sansio import Timestamps
+from gdp.runtime.runtime import Runtime, now
 from gdp.state.control_status import node_status
 from gdp.state.diagnostic_control import DiagnosticCommands, TableSource
 from gdp.state.node_state import NodeState
@@ -51,20 +50,7 @@ __all__ = ["Loop", "Node", "common_handlers", "common_sources"]
 log = logging.getLogger(__name__)
 
 
-class Loop(Protocol):
-    """Loop of a node, which calls what its parts registered."""
-
-    def every(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
-        """Call a function each so many seconds, the first time at once."""
-
-    def watch(self, source: HasFileno, ready: Callable[[], None]) -> None:
-        """Call a function whenever a source is readable."""
-
-    def unwatch(self, source: HasFileno) -> None:
-        """Undo ``watch``, before the source is closed."""
-
-    def signals(self, reload: Callable[[], None]) -> contextlib.AbstractContextManager[None]:
-        """End the loop on SIGINT and SIGTERM, and reload on SIGHUP, until the context ends."""
+Loop: TypeAlias = Runtime | RelayLoop
 
 
 class Node:

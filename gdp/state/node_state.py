@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from gdp.client.attachment import Attachment, attachment_waits
 from gdp.client.participant import Participant
-from gdp.client.rib_host import RibHost
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.diagnostics import Diagnostics
 from gdp.control.neighbour import Neighbour, NeighbourState
@@ -24,9 +23,12 @@ from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import Plane
 from gdp.sansio import Timestamps
-from gdp.switch.core import SwitchCore
 from gdp.telemetry.sources import DeviceCounts, NeighbourRow, PortRow
 from gdp.trust.domain import Policy
+
+if TYPE_CHECKING:  # a node loads its own core alone, which makes the start of a library short
+    from gdp.client.rib_host import RibHost
+    from gdp.switch.core import SwitchCore
 
 __all__ = ["MemberState", "NodeState", "RibState", "SwitchState"]
 

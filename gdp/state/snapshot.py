@@ -14,16 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from itertools import islice
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from gdp.client.participant import Participant
 from gdp.control.link_state import Scope
 from gdp.names import Name
-from gdp.rib.core import RibCore
 from gdp.state.node_state import NodeState, SwitchState
 from gdp.state.tables import rounded_ms
-from gdp.switch.core import SwitchCore
 from gdp.telemetry.sources import DeviceCounts, NeighbourRow, Sources
+
+if TYPE_CHECKING:  # a node loads its own core alone
+    from gdp.rib.core import RibCore
+    from gdp.switch.core import SwitchCore
 
 __all__ = [
     "ID_CHARS",
