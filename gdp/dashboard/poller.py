@@ -74,7 +74,7 @@ class _Socket:
         """Return a node's answer; it blocks. Raises ``GdpError``: there is no such node, or it refused."""
         if self.connection is None:
             self.connection = NodeConnection(self.path, _TIMEOUT_S)
-        self.connection.send(Request(command))
+        self.connection.send_request(Request(command))
         return self.connection.read_result()
 
 

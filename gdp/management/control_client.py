@@ -101,7 +101,7 @@ def request_control(path: Path, command: Command, timeout_s: float, name: Name |
         ControlRequestError: the response cannot be read.
     """
     with NodeConnection(path, timeout_s) as connection:
-        connection.send(Request(command, {} if name is None else {"name": name.to_text()}))
+        connection.send_request(Request(command, {} if name is None else {"name": name.to_text()}))
         yield from connection.responses()
 
 
@@ -175,7 +175,7 @@ class NodeConnection:
             arguments: ``target`` and ``name`` (hex), ``body``, ``hops``, ``timeout_s``, ``reply_bytes``.
         """
         self._last_id += 1
-        self.send(Request(Command.ASK, {"id": self._last_id, "ask": ask, **arguments}))
+        self.send_request(Request(Command.ASK, {"id": self._last_id, "ask": ask, **arguments}))
         return self._last_id
 
     def ask(self, ask: str, **arguments: object) -> Mapping[str, object]:
@@ -197,7 +197,7 @@ class NodeConnection:
 
     def status(self) -> Mapping[str, object]:
         """Return the status of the node."""
-        self.send(Request(Command.STATUS))
+        self.send_request(Request(Command.STATUS))
         return self.read_result()
 
     def show(self, what: str) -> list[Mapping[str, object]]:
@@ -209,7 +209,7 @@ class NodeConnection:
         rows: list[Mapping[str, object]] = []
         at: object = 0
         while at is not None:
-            self.send(Request(Command.SHOW, {"what": what, "from": at}))
+            self.send_request(Request(Command.SHOW, {"what": what, "from": at}))
             page = self.read_result()
             some, at = page.get("rows"), page.get("next")
             if not isinstance(some, list) or not all(isinstance(row, dict) for row in some):
@@ -250,7 +250,7 @@ class NodeConnection:
                 self._received += map(decode_response, self._lines.receive_bytes(data))
             yield self._received.popleft()
 
-    def send(self, request: Request) -> None:
+    def send_request(self, request: Request) -> None:
         """Send a request, whose responses ``responses`` yields."""
         try:
             self._socket.settimeout(self._timeout_s)

@@ -2,11 +2,11 @@
 
 I/O. The kinds differ in the core, the plane and what clients may ask; the rest is here::
 
-    Node      identity and policy, lock of the identity, service manager, revocations of earlier runs, audit folder
-    drive     log of neighbours and waits, measured links, credentials: periodic calls of the loop
-    serve     signals, watchdog, control socket
-    confine   the rights that are no longer needed
-    begin     what writes from now on: audit log, revocations; metrics
+    Node            identity and policy, lock of the identity, service manager, stored revocations, audit folder
+    drive           log of neighbours and waits, measured links, credentials: periodic calls of the loop
+    follow_clients  signals, watchdog, control socket
+    confine         the rights that are no longer needed
+    begin           what writes from now on: audit log, revocations; metrics
 
 ``confine`` drops rights of the present thread and of those that start later, so all that starts threads comes after
 it. A RIB confines itself before ``drive``, because its store starts threads when it opens; its device can be opened
@@ -120,7 +120,7 @@ class Node:
         """Read certificates and roots again, where they changed."""
         self._credentials.reload_changed(now())
 
-    def serve(
+    def follow_clients(
         self,
         loop: Loop,
         handlers: ControlHandlers,

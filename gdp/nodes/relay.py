@@ -71,7 +71,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
             relay.check_members()
 
         handlers = ControlHandlers(reload=reload, status=relay.status, drain=loop.stop)
-        node.serve(loop, handlers, config.control_socket)
+        node.follow_clients(loop, handlers, config.control_socket)
         if config.sandbox:
             confine_relay(config)
         node.begin(loop, config.metrics, relay.sources())

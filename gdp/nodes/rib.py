@@ -72,7 +72,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             drain=lambda: runtime.drain(lambda: True, DRAIN_MAX_S),
             is_drained=lambda: runtime.has_drained,
         )
-        node.serve(runtime, handlers, config.control_socket)
+        node.follow_clients(runtime, handlers, config.control_socket)
         for source in upkeep.sources:
             runtime.watch(source, lambda: upkeep.work(now()))
         node.begin(runtime, config.metrics, sources)

@@ -110,7 +110,7 @@ def run_switch(
             drain=lambda: runtime.drain(lambda: not switch.resolver.pending_frames, DRAIN_MAX_S),
             is_drained=lambda: runtime.has_drained,
         )
-        node.serve(runtime, handlers, config.control_socket)
+        node.follow_clients(runtime, handlers, config.control_socket)
         _revoke(switch, config.revocations)
         if config.sandbox:
             confine_switch(config, chosen.name)

@@ -148,7 +148,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
             drain=node.drain,
             is_drained=lambda: node.has_drained,
         )
-        node.serve(runtime, handlers, config.control_socket, node.reload_on_signal)
+        node.follow_clients(runtime, handlers, config.control_socket, node.reload_on_signal)
         if config.sandbox:
             files = (None if config.record is None else config.record.path, config.control_socket)
             folders = (None if each is None else each.parent for each in files)
