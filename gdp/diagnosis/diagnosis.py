@@ -17,7 +17,8 @@ __all__ = ["RULES", "SETTLE_S", "diagnose"]
 
 SETTLE_S: Final = 5.0  # a node or flow that is younger may still be finding its way
 
-RULES: Final[Mapping[Cause, Rule]] = network_rules.RULES | name_rules.RULES | right_rules.RULES | stream_rules.RULES
+_RULES: Final = network_rules.RULES | name_rules.RULES | right_rules.RULES | stream_rules.RULES
+RULES: Final[Mapping[Cause, Rule]] = {cause: _RULES[cause] for cause in Cause if cause in _RULES}
 _MAY_SETTLE: Final = frozenset(
     {
         Cause.LINK_SILENT,
@@ -45,8 +46,8 @@ def diagnose(facts: Facts) -> Answer:
     """Return the first cause of the table that holds, or that the facts do not suffice."""
     view = View(facts)
     unknown = tuple(f"{each.role} {each.where}: {each.why}" for each in facts.unreachable)
-    for cause in filter(RULES.__contains__, Cause):
-        found = next(RULES[cause](view), None)
+    for cause, rule in RULES.items():
+        found = next(rule(view), None)
         if found is not None:
             if cause in _MAY_SETTLE and _is_fresh(view):
                 return _starting(view, unknown)

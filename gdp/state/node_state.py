@@ -6,6 +6,7 @@ snapshots, facts, metrics and logs are projections of it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
@@ -43,7 +44,7 @@ class Core(Protocol):
         """Return what the core dropped, by reason."""
 
 
-class NodeState:
+class NodeState(ABC):
     """State of one node.
 
     Args:
@@ -77,14 +78,14 @@ class NodeState:
         self.read_devices: Callable[[], Mapping[str, Sequence[int]]] = dict
         self.local_name: Callable[[Name], str] = lambda name: name.short
 
+    @abstractmethod
     def waits(self, now_s: float) -> list[Wait]:
         """Return what the node waits for at a monotonic second."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def own_switch(self) -> Name | None:
         """Return the switch that the node is attached to, or None; a switch returns its own name."""
-        raise NotImplementedError
 
     @property
     def conflict_at(self) -> Name | None:

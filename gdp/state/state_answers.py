@@ -17,6 +17,7 @@ from gdp.errors import StoreError
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.state.node_state import RibState, SwitchState
+from gdp.state.switch_facts import switch_facts
 from gdp.trust.domain import Policy
 
 __all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state"]
@@ -62,10 +63,8 @@ def answer_for_switch(
     switch = state.switch
 
     def gather(question: Question, now: Timestamps) -> SwitchFacts:
-        known = switch.name_facts(question.name, now, state.wait_facts(now.mono_s))
         rows = () if tunnels is None else tunnels(now)
-        uptime_s = state.uptime_s(now.mono_s)
-        return replace(known, uptime_s=uptime_s, tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
+        return replace(switch_facts(state, question.name, now), tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
 
     def holders(name: Name, now_s: float) -> set[Name]:
         attached = {each.advertisement.node for each in switch.attached.named(name)}

@@ -27,7 +27,9 @@ from gdp.diagnosis.fields import from_fields, to_fields
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.state.node_state import SwitchState
 from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state
+from gdp.state.switch_facts import switch_facts
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.name_facts import proxy_facts
 from proxy.serial.channel import Qos
@@ -178,10 +180,7 @@ class Stage:
         for machine in self.sites.machines:
             self._answer_for(machine)
         for label in world.switches:
-            state = switch_state(world, label, begun_s=world.network.now.mono_s - self.uptime_s)
-            edges = frozenset(self._edges(label))
-            state.unwaited = partial(frozenset, edges)
-            answer_for_switch(state)
+            answer_for_switch(self._state_of(label))
         for label in world.ribs:
             answer_for_rib(rib_state(world, label))
 
@@ -196,9 +195,10 @@ class Stage:
 
         answer_state(member.diagnostics, member.attachment._policy, gather, holders)
 
-    def _waits_of(self, label: str, now_s: float) -> tuple[WaitFact, ...]:
-        switch = self.sites.world.switches[label]
-        return tuple(wait_fact(wait, _port(wait.port)) for wait in switch.waits(self._edges(label), now_s))
+    def _state_of(self, label: str) -> SwitchState:
+        state = switch_state(self.sites.world, label, begun_s=self.sites.now_s - self.uptime_s)
+        state.unwaited = partial(frozenset, self._edges(label))
+        return state
 
     def facts(self, asked: str, at: str) -> Facts:
         """Return the facts of all nodes that run, through their JSON form."""
@@ -229,8 +229,7 @@ class Stage:
         return replace(from_fields(ProxyFacts, to_fields(known)), is_near=is_near)
 
     def _switch(self, label: str, name: Name, at: str) -> SwitchFacts:
-        switch, now = self.sites.world.switches[label], self.sites.world.network.now
-        known = switch.name_facts(name, now, self._waits_of(label, now.mono_s))
+        known = switch_facts(self._state_of(label), name, self.sites.world.network.now)
         return replace(from_fields(SwitchFacts, to_fields(known)), is_near=at.startswith(f"{label}/"))
 
     def _edges(self, label: str) -> list[int]:
@@ -241,10 +240,6 @@ class Stage:
     def _rib(self, label: str, name: Name) -> RibFacts:
         known = self.sites.world.ribs[label].rib.name_facts(name, self.sites.world.network.now)
         return from_fields(RibFacts, to_fields(known))
-
-
-def _port(port: int | None) -> str:
-    return "" if port is None else f"eth{port}"
 
 
 def unreachable(role: str, where: str) -> tuple[Unreachable, ...]:
