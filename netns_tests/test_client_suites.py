@@ -31,7 +31,6 @@ from lab.debian import cache_folder
 from lab.process import calling
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.context import BridgeContext
 from proxy.config.rule import Rule
 from proxy.doors.rules import DoorRules
 from proxy.endpoints.core.qos import default
@@ -211,7 +210,7 @@ def serve(node_directory: str) -> None:
         action = Rule.model_validate({"kind": "action", "name": "/fibonacci", "type": FIBONACCI, "owner": owner})
         service = Rule.model_validate({"kind": "service", "name": "/switch", "type": known.SET_BOOL, "owner": owner})
         rules = DoorRules([action, service], [])
-        bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), rules, [endpoint], held)
+        bridge = Bridge(node.state.context, rules, [endpoint], held)
         node.runtime.watch(endpoint)
         is_ready = False
         while not node.runtime.is_stopped:

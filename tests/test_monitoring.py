@@ -15,9 +15,10 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from gdp.errors import DropReason
+from gdp.names import Name
 from gdp.telemetry.health import Health
 from gdp.telemetry.metrics import Metrics
-from gdp.telemetry.sources import DeviceCounts, Histogram, LinkRow, PortRow, Sources, TopicCounts
+from gdp.telemetry.sources import DeviceCounts, Histogram, NeighbourRow, PortRow, Sources, TopicCounts
 from tests.pages import ROOT
 
 FOLDER: Final = ROOT / "examples" / "monitoring"
@@ -35,9 +36,9 @@ def exported() -> dict[str, set[str]]:
     sources: Any = {
         **dict.fromkeys((*counts, *more), one),
         **dict.fromkeys(("table_entries", "pending_frames", "clashes"), lambda: 1.0),
-        "drops": [lambda: [1] * len(DropReason)],
+        "drops": lambda: dict.fromkeys(DropReason, 1),
         "entries": lambda: {bytes(64): (1, 2)},
-        "links": lambda: [LinkRow("eth0", "75e…0fc", 0.1, 0.0, 0.0, 0.0, 10)],
+        "links": lambda: [NeighbourRow(port="eth0", name=Name(bytes(32)), rtt_s=0.1, cost=10)],
         "latency": lambda: seen,
         "ports": lambda: [PortRow("eth0", is_up=True, mtu=1500, counts=DeviceCounts(1, 1, 1, 1, 1, 1, 1, 1))],
         "topics": lambda: [TopicCounts("75e…0fc", "out", 1, 1, 1, 1)],

@@ -15,13 +15,12 @@ from typing import Final
 
 from gdp.client.participant import Participant
 from gdp.config.schema import Domain
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
-from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
@@ -85,11 +84,7 @@ class Watch:
     def _watch(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
         identity, policy = load_member(self._identity, domain, Role.PROXY)
-        member = Participant(
-            identity,
-            policy,
-            NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes),
-        )
+        member = Participant(identity, policy, fresh_settings())
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)

@@ -40,6 +40,7 @@ class RibHost:
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=True)
         self.attachment = Attachment(identity, policy, settings)
         self.rib = rib
+        self.boundary = rib.boundary
         self.diagnostics = Diagnostics(
             identity,
             policy,

@@ -17,9 +17,15 @@ from typing import Final
 
 from gdp.dashboard.core.readings import Fields, Reading, text_of
 from gdp.errors import GdpError
-from gdp.management.control_client import control_sockets, find_control_socket
-from gdp.management.control_socket import CONTROL_SOCKET, connect_control
-from gdp.state.control_protocol import RESPONSE_MAX_BYTES, Command, Request, decode_response, encode_request
+from gdp.management.control_client import (
+    NodeConnection,
+    NodeEndedError,
+    NotRunningError,
+    control_sockets,
+    find_control_socket,
+)
+from gdp.management.control_socket import CONTROL_SOCKET
+from gdp.state.control_protocol import Command, Request
 
 __all__ = ["Poller", "found_sockets", "supervisor_state"]
 
@@ -53,37 +59,23 @@ def found_sockets(nodes: Sequence[Path] = (), states: Sequence[Path] = ()) -> li
 @dataclass(slots=True)
 class _Socket:
     path: Path
-    reader: asyncio.StreamReader | None = None
-    writer: asyncio.StreamWriter | None = None
+    connection: NodeConnection | None = None
     fields: Fields = field(default_factory=dict)
     topology: Fields = field(default_factory=dict)
     retry_at_s: float = 0.0
 
     def close(self) -> None:
         """Close the connection."""
-        if self.writer is not None:
-            self.writer.close()
-        self.reader = self.writer = None
+        if self.connection is not None:
+            self.connection.close()
+            self.connection = None
 
-    async def ask(self, command: Command) -> Fields:
-        """Return a node's answer.
-
-        Raises:
-            GdpError: it refused, or its answer cannot be read.
-            OSError: there is no such node.
-        """
-        if self.reader is None or self.writer is None:
-            made = connect_control(self.path, _TIMEOUT_S)
-            made.setblocking(False)
-            self.reader, self.writer = await asyncio.open_unix_connection(sock=made, limit=RESPONSE_MAX_BYTES + 1)
-        self.writer.write(encode_request(Request(command)))
-        line = await asyncio.wait_for(self.reader.readline(), _TIMEOUT_S)
-        if not line:
-            raise ConnectionResetError("the node closed the connection")
-        response = decode_response(line)
-        if response.error:
-            raise GdpError(response.error)
-        return response.result
+    def ask(self, command: Command) -> Fields:
+        """Return a node's answer; it blocks. Raises ``GdpError``: there is no such node, or it refused."""
+        if self.connection is None:
+            self.connection = NodeConnection(self.path, _TIMEOUT_S)
+        self.connection.send_request(Request(command))
+        return self.connection.read_result()
 
 
 class Poller:
@@ -134,10 +126,10 @@ class Poller:
 
     async def _answer(self, each: _Socket, command: Command) -> Fields:
         try:
-            return await each.ask(command)
-        except (ConnectionError, FileNotFoundError) as error:  # it ended, and may start again at any time
+            return await asyncio.to_thread(each.ask, command)
+        except (NotRunningError, NodeEndedError) as error:  # it may start again at any time
             log.info("node gone path=%s reason=%s", each.path, error)
-        except (OSError, GdpError, ValueError, asyncio.TimeoutError) as error:
+        except GdpError as error:
             log.info("node not read path=%s reason=%s", each.path, error)
             each.retry_at_s = time.monotonic() + _RETRY_S
         each.close()

@@ -6,8 +6,10 @@ An unknown key is ignored and an absent one has its default, so that versions ma
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
+from enum import Enum
+from functools import cache
 from types import UnionType
 from typing import Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -35,13 +37,18 @@ def from_fields(kind: type[_T], given: Mapping[str, object]) -> _T:
     Raises:
         StatementError: MALFORMED, a value of another type, or a collection above the limit.
     """
-    hints = get_type_hints(kind)
+    hints = _hints(kind)  # type: ignore[arg-type]  # a class can be hashed
     assert is_dataclass(kind)
     values = {each.name: _value(hints[each.name], given[each.name]) for each in fields(kind) if each.name in given}
     try:
         return kind(**values)
     except TypeError as error:
         raise StatementError(DropReason.MALFORMED, f"facts without a field that they need: {error}") from error
+
+
+@cache
+def _hints(kind: Hashable) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def _default(each: Field[object]) -> object:
@@ -53,7 +60,7 @@ def _shown(value: object) -> object:
         return to_fields(value)
     if isinstance(value, tuple | list):
         return [_shown(each) for each in value]
-    return dict(value) if isinstance(value, Mapping) else value
+    return dict(value) if isinstance(value, Mapping) else value.value if isinstance(value, Enum) else value
 
 
 def _value(wanted: Any, value: object) -> object:
@@ -69,6 +76,8 @@ def _value(wanted: Any, value: object) -> object:
         return from_fields(wanted, {str(key): its for key, its in value.items()})
     if wanted is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
+    if isinstance(wanted, type) and issubclass(wanted, Enum) and value in [each.value for each in wanted]:
+        return wanted(value)
     if isinstance(wanted, type) and type(value) is wanted and not (isinstance(value, str) and _is_long(value)):
         return value
     raise StatementError(DropReason.MALFORMED, "facts of another form")

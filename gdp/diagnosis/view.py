@@ -5,14 +5,16 @@ Sans-I/O.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple, TypeAlias
 
 from gdp.diagnosis.facts import Facts, FlowFact, GoneFact, ProxyFacts, RibFacts, SwitchFacts, WaitFact
 
-__all__ = ["End", "Node", "View", "short"]
+__all__ = ["End", "Found", "Node", "Rule", "View", "short"]
 
 Node: TypeAlias = ProxyFacts | SwitchFacts | RibFacts
+Found: TypeAlias = tuple[str, str]  # sentence and command
+Rule: TypeAlias = Callable[["View"], Iterator[Found]]
 
 _GIVES: Final = ("publish", "serve")
 

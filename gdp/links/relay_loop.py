@@ -12,8 +12,11 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Final, Protocol
 
+from gdp.ports.plane import HasFileno
 from gdp.runtime.memory_tuning import tune_memory
+from gdp.runtime.runtime import now
 from gdp.runtime.signals import handled_signals
+from gdp.sansio import Timestamps
 
 __all__ = ["RelayLoop", "Timed"]
 
@@ -31,7 +34,7 @@ class Timed(Protocol):
 class _Periodic:
     """Function that is called once in a period, however often the timers are."""
 
-    def __init__(self, period_s: float, function: Callable[[float], None]) -> None:
+    def __init__(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
         self._period_s = period_s
         self._function = function
         self._due_s = float("-inf")
@@ -40,7 +43,7 @@ class _Periodic:
         """Call the function if it is due; return the second of the next call."""
         if now_s >= self._due_s:
             self._due_s = now_s + self._period_s
-            self._function(now_s)
+            self._function(now())
         return self._due_s
 
 
@@ -77,8 +80,16 @@ class RelayLoop:
         self._timed.append(part)
         self._due_s = 0.0
 
-    def every(self, period_s: float, function: Callable[[float], None]) -> None:
-        """Call a function with the monotonic second each ``period_s``, the first time at once."""
+    def watch(self, source: HasFileno, ready: Callable[[], None]) -> None:
+        """Call ``ready`` whenever a source is readable, until ``unwatch``."""
+        self.register(source.fileno(), select.EPOLLIN, lambda _: ready())
+
+    def unwatch(self, source: HasFileno) -> None:
+        """Undo ``watch``, before the source is closed."""
+        self.unregister(source.fileno())
+
+    def every(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
+        """Call a function each ``period_s``, the first time at once."""
         self.add_timed(_Periodic(period_s, function))
 
     def remove_timed(self, part: Timed) -> None:
@@ -117,8 +128,8 @@ class RelayLoop:
         """End ``run`` on SIGINT and SIGTERM, and call ``reload`` on SIGHUP, until the context ends."""
         tune_memory()
         with handled_signals(self.stop, reload) as (reading, drain):
-            self.register(reading.fileno(), select.EPOLLIN, lambda _: drain())
+            self.watch(reading, drain)
             try:
                 yield
             finally:
-                self.unregister(reading.fileno())
+                self.unwatch(reading)

@@ -30,6 +30,7 @@ from gdp.stores.keyring import CARD, load_card
 
 __all__ = [
     "NodeConnection",
+    "NodeEndedError",
     "NotRunningError",
     "ask_node",
     "control_path",
@@ -45,6 +46,13 @@ _ABSENT: Final = (errno.ENOENT, errno.ECONNREFUSED, errno.ENOTDIR)
 
 class NotRunningError(LocalError):
     """No process serves the control socket."""
+
+
+class NodeEndedError(LocalError):
+    """The node closed the connection before it answered."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: the node closed the connection before it answered")
 
 
 def control_path(name: Name) -> Path:
@@ -92,21 +100,17 @@ def request_control(path: Path, command: Command, timeout_s: float, name: Name |
         LocalError: the user may not reach it, or no response comes in time.
         ControlRequestError: the response cannot be read.
     """
-    try:
-        with connect_control(path, timeout_s) as connection:
-            connection.sendall(encode_request(Request(command, {} if name is None else {"name": name.to_text()})))
-            lines = LineBuffer(RESPONSE_MAX_BYTES + 1)
-            while data := connection.recv(_RECEIVE_BYTES):
-                for line in lines.receive_bytes(data):
-                    yield decode_response(line)
-    except OSError as error:
-        raise _translated(error, path, timeout_s) from error
+    with NodeConnection(path, timeout_s) as connection:
+        connection.send_request(Request(command, {} if name is None else {"name": name.to_text()}))
+        yield from connection.responses()
 
 
 def _translated(error: OSError, path: Path, timeout_s: float) -> LocalError:
     """Return the error to raise where a control socket cannot be used."""
     if isinstance(error, TimeoutError):
         return LocalError(f"{path}: no response within {timeout_s:g} s")
+    if isinstance(error, BrokenPipeError | ConnectionResetError):
+        return NodeEndedError(path)
     if error.errno in _ABSENT:
         return NotRunningError(f"{path}: no process serves this control socket; start the node first")
     return LocalError(f"{path}: {error.strerror}; run the command as the user of the node")
@@ -120,7 +124,7 @@ def ask_node(path: Path, command: Command, timeout_s: float, name: Name | None =
     """
     for response in request_control(path, command, timeout_s, name):
         return response
-    raise LocalError(f"{path}: the node closed the connection before it answered")
+    raise NodeEndedError(path)
 
 
 class NodeConnection:
@@ -171,7 +175,7 @@ class NodeConnection:
             arguments: ``target`` and ``name`` (hex), ``body``, ``hops``, ``timeout_s``, ``reply_bytes``.
         """
         self._last_id += 1
-        self._send(Request(Command.ASK, {"id": self._last_id, "ask": ask, **arguments}))
+        self.send_request(Request(Command.ASK, {"id": self._last_id, "ask": ask, **arguments}))
         return self._last_id
 
     def ask(self, ask: str, **arguments: object) -> Mapping[str, object]:
@@ -193,7 +197,7 @@ class NodeConnection:
 
     def status(self) -> Mapping[str, object]:
         """Return the status of the node."""
-        self._send(Request(Command.STATUS))
+        self.send_request(Request(Command.STATUS))
         return self.read_result()
 
     def show(self, what: str) -> list[Mapping[str, object]]:
@@ -205,7 +209,7 @@ class NodeConnection:
         rows: list[Mapping[str, object]] = []
         at: object = 0
         while at is not None:
-            self._send(Request(Command.SHOW, {"what": what, "from": at}))
+            self.send_request(Request(Command.SHOW, {"what": what, "from": at}))
             page = self.read_result()
             some, at = page.get("rows"), page.get("next")
             if not isinstance(some, list) or not all(isinstance(row, dict) for row in some):
@@ -223,25 +227,31 @@ class NodeConnection:
             TimeoutError: none came within ``timeout_s``, which was given.
             LocalError: the node refused a request, ended or is silent.
         """
-        while not self._received:
-            self._socket.settimeout(self._timeout_s if timeout_s is None else timeout_s)
-            try:
-                data = self._socket.recv(_RECEIVE_BYTES)
-            except TimeoutError as error:
-                if timeout_s is not None:
-                    raise
-                raise _translated(error, self._path, self._timeout_s) from error
-            except OSError as error:
-                raise _translated(error, self._path, self._timeout_s) from error
-            if not data:
-                raise LocalError(f"{self._path}: the node closed the connection before it answered")
-            self._received += map(decode_response, self._lines.receive_bytes(data))
-        response = self._received.popleft()
+        response = next(self.responses(timeout_s), None)
+        if response is None:
+            raise NodeEndedError(self._path)
         if not response.is_ok:
             raise LocalError(f"{self._path}: {response.error}")
         return response.result
 
-    def _send(self, request: Request) -> None:
+    def responses(self, timeout_s: float | None = None) -> Iterator[Response]:
+        """Yield each response until the node ends; ``timeout_s`` and errors as for ``read_result``."""
+        while True:
+            while not self._received:
+                self._socket.settimeout(self._timeout_s if timeout_s is None else timeout_s)
+                try:
+                    data = self._socket.recv(_RECEIVE_BYTES)
+                except OSError as error:
+                    if isinstance(error, TimeoutError) and timeout_s is not None:
+                        raise
+                    raise _translated(error, self._path, self._timeout_s) from error
+                if not data:
+                    return
+                self._received += map(decode_response, self._lines.receive_bytes(data))
+            yield self._received.popleft()
+
+    def send_request(self, request: Request) -> None:
+        """Send a request, whose responses ``responses`` yields."""
         try:
             self._socket.settimeout(self._timeout_s)
             self._socket.sendall(encode_request(request))

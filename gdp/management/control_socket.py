@@ -80,9 +80,9 @@ class ControlHandlers:
         show: return a page of a table; raises ``GdpError`` if there is no such table.
     """
 
-    reload: Callable[[], None]
     status: Callable[[], Mapping[str, object]]
-    drain: Callable[[], None]
+    reload: Callable[[], None] = lambda: None
+    drain: Callable[[], None] = lambda: None
     is_drained: Callable[[], bool] = lambda: True
     topics: Callable[[], Mapping[str, object]] | None = None
     lookup: Callable[[Name], Mapping[str, object]] | None = None

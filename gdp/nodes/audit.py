@@ -9,18 +9,15 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
-from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.audit_log import AuditLog
 from gdp.trust.audit import Action, AuditTrail
 
-__all__ = ["NodeAudit", "audit_folder", "keep_audit"]
+__all__ = ["NodeAudit", "audit_folder"]
 
 log = logging.getLogger(__name__)
 
@@ -56,13 +53,10 @@ class NodeAudit:
 
     Args:
         drops: what the node dropped, by reason; counts only rise.
-
-    Raises:
-        LocalError: the folder cannot be made.
     """
 
-    def __init__(self, folder: Path, trail: AuditTrail, drops: Callable[[], Mapping[DropReason, int]]) -> None:
-        self._log = AuditLog(folder)
+    def __init__(self, audit_log: AuditLog, trail: AuditTrail, drops: Callable[[], Mapping[DropReason, int]]) -> None:
+        self._log = audit_log
         self._trail = trail
         self._drops = drops
         self._known = dict.fromkeys(_SAID, 0)
@@ -84,23 +78,3 @@ class NodeAudit:
             if not self._has_failed:
                 log.error("audit log not written reason=%s", error)
             self._has_failed = True
-
-
-def keep_audit(
-    configured: Path | None,
-    trail: AuditTrail,
-    drops: Callable[[], Mapping[DropReason, int]],
-    runtime: Runtime,
-    stack: ExitStack,
-) -> None:
-    """Let a runtime write a node's audit log, if the node keeps one, until the stack is left.
-
-    Raises:
-        LocalError: the folder cannot be made.
-    """
-    folder = audit_folder(configured)
-    if folder is not None:
-        audit = NodeAudit(folder, trail, drops)
-        runtime.every(RECONCILE_PERIOD_S, audit.write_pending)
-        stack.callback(lambda: audit.write_pending(now()))
-        log.info("audit log path=%s", folder)

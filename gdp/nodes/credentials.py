@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from gdp.config.schema import Domain
 from gdp.crypto.certificates import Membership
@@ -21,7 +21,7 @@ from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed
 from gdp.trust.domain import Policy
 
-__all__ = ["Credentials", "watched_folders"]
+__all__ = ["Credentials", "NodeConfig", "watched_folders"]
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +30,18 @@ _SOON_S: Final = 7 * _DAY_S
 _PUBLIC: Final = (".crt", ".pem", ".cer")
 _SHARE: Final = 5  # 1/5: warn in the last fifth of a shorter validity
 _NodeState = tuple[tuple[int, int, int] | None, ...]
+
+
+class NodeConfig(Protocol):
+    """Keys that the configuration of every node has."""
+
+    @property
+    def identity(self) -> Path:
+        """Return the directory of its keys."""
+
+    @property
+    def domain(self) -> Domain:
+        """Return its domain, and those that it trusts."""
 
 
 class Credentials:

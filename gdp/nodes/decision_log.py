@@ -7,15 +7,14 @@ writes a bounded number of lines. Names appear in their short form, ports as dev
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.errors import DropReason
 from gdp.names import NAME_BYTES, Name
 from gdp.nodes.node_log import RECONCILE_PERIOD_S
-from gdp.ports.plane import Port
-from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
+from gdp.state.node_state import NodeState, SwitchState
 from gdp.switch.table import Hops, Table
 
 __all__ = ["DecisionLog", "log_decisions"]
@@ -26,29 +25,29 @@ _LINES_MAX: Final = 64  # of each kind in one look
 _ANY: Final = "any"
 
 
-def log_decisions(
-    runtime: Runtime,
-    ports: Mapping[int, Port],
-    drops: Sequence[Callable[[], Sequence[int]]],
-    table: Table | None = None,
-) -> None:
-    """Log decisions from within the loop if debug lines are wanted."""
+def log_decisions(every: Callable[[float, Callable[[Timestamps], None]], None], state: NodeState) -> None:
+    """Log decisions from within a loop, whose ``every`` is given, if debug lines are wanted."""
     if log.isEnabledFor(logging.DEBUG):
-        runtime.every(RECONCILE_PERIOD_S, DecisionLog(ports, drops, table).log_changes)
+        table = state.switch.table if isinstance(state, SwitchState) else None
+        every(RECONCILE_PERIOD_S, DecisionLog(state.ifname, state.drops, table).log_changes)
 
 
 class DecisionLog:
     """What a node decided since the last look.
 
     Args:
-        drops: lists of counts by ``DropReason``, which are added up.
+        ifname: returns the device of a port.
+        drops: returns what the node dropped; counts only rise.
         table: of a switch.
     """
 
     def __init__(
-        self, ports: Mapping[int, Port], drops: Sequence[Callable[[], Sequence[int]]], table: Table | None = None
+        self,
+        ifname: Callable[[int], str],
+        drops: Callable[[], Mapping[DropReason, int]],
+        table: Table | None = None,
     ) -> None:
-        self._ports = ports
+        self._ifname = ifname
         self._drops = drops
         self._table = table
         self._routes: dict[bytes, str] = {}
@@ -58,9 +57,7 @@ class DecisionLog:
         """Log what changed since the last call."""
         if self._table is not None:
             self._look_at_routes(self._table.entries)
-        lists = [source() for source in self._drops]
-        for reason in DropReason:
-            count = sum(counts[reason] for counts in lists)
+        for reason, count in sorted(self._drops().items()):
             if (more := count - self._dropped.get(reason, 0)) > 0:
                 log.debug("dropped reason=%s frames=%d total=%d", reason.label, more, count)
                 self._dropped[reason] = count
@@ -80,10 +77,6 @@ class DecisionLog:
 
     def _where(self, hops: Hops) -> str:
         return ",".join(self._ifname(hop[0]) for hop in hops) or "nowhere"
-
-    def _ifname(self, index: int) -> str:
-        port = self._ports.get(index)
-        return "?" if port is None else port.ifname
 
 
 def _ends(key: bytes) -> tuple[str, str]:

@@ -15,13 +15,15 @@ from pathlib import Path
 from typing import Final
 
 from gdp.config.schema import Directory, Domain
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
+from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.stores.keyring import load_identity, load_root, storage
 from gdp.trust.domain import Policy
 
-__all__ = ["fresh_bytes", "incarnation", "load_member", "load_policy", "wall_clock_ms"]
+__all__ = ["fresh_bytes", "fresh_settings", "incarnation", "load_member", "load_policy", "wall_clock_ms"]
 
 _CLOCKS: Final = struct.Struct("!qq")
 _MACHINE_IDS: Final = (Path("/proc/sys/kernel/random/boot_id"), Path("/sys/class/dmi/id/product_uuid"))
@@ -64,6 +66,13 @@ def load_policy(domain: Domain) -> Policy:
             raise LocalError(f"{key}: not a trusted domain: {', '.join(unknown)}")
     transit = None if domain.transit is None else [labels[label] for label in domain.transit]
     return Policy(own, trusted, transit, diagnostics=[labels[label] for label in domain.diagnostics])
+
+
+def fresh_settings(lease_s: float = ADVERTISEMENT_LEASE_S) -> NodeSettings:
+    """Return the settings of a node that starts now; ``lease_s``: of what it keeps at RIBs."""
+    return NodeSettings(
+        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=lease_s
+    )
 
 
 def fresh_bytes(size: int) -> bytes:

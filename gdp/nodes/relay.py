@@ -9,29 +9,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
-import select
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.errors import DROP_COUNTERS, DropReason
-from gdp.host.service_notifier import service_notifier
-from gdp.host.single_instance import run_alone
+from gdp.errors import DropReason
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_dialer import BorderDialer
 from gdp.links.relay_loop import RelayLoop
 from gdp.links.relay_ports import VIA
 from gdp.links.relay_server import BorderServer, listen_tls
 from gdp.management.control_client import control_path
-from gdp.management.control_socket import ControlHandlers, ControlServer
+from gdp.management.control_socket import ControlHandlers
 from gdp.management.switch_watch import SwitchWatch
 from gdp.names import Name
-from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
-from gdp.nodes.metrics import serve_metrics
+from gdp.nodes.node import Node
 from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.nodes.rights import confine_relay
 from gdp.ports.host_addresses import AddressMonitor
@@ -61,31 +57,24 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
     Raises:
         LocalError: keys, the port or the system's rights do not allow it, or this relay already runs.
     """
-    identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
+    identity, policy = member = load_member(config.identity, config.domain, Role.SWITCH)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(run_alone("relay", _instance(identity.name)))
-        notifier = stack.enter_context(service_notifier())
+        node = Node("relay", member, config, stack, instance=_instance(identity.name))
         loop = RelayLoop()
         stack.callback(loop.close)
-        context = RelayContext(config=config, identity=identity, policy=policy, loop=loop)
-        relay = Relay(context)
+        node.follow_credentials(loop)
+        relay = Relay(RelayContext(config=config, identity=identity, policy=policy, loop=loop))
         stack.callback(relay.close)
-        credentials = Credentials(config.identity, config.domain, identity, policy)
-        relay.every_period(lambda: credentials.reload_changed(now()))
 
         def reload() -> None:
-            credentials.reload_changed(now())
+            node.reload()
             relay.check_members()
 
-        stack.enter_context(loop.signals(reload))
-        notifier.follow(loop.every)
-        path = relay_control_path(config, identity.name)
         handlers = ControlHandlers(reload=reload, status=relay.status, drain=loop.stop)
-        stack.enter_context(_control(loop, path, handlers))
+        node.follow_clients(loop, handlers, config.control_socket)
         if config.sandbox:
             confine_relay(config)
-        if config.metrics is not None:
-            stack.callback(serve_metrics(relay.sources(), config.metrics.port))
+        node.begin(loop, config.metrics, relay.sources())
         log.info(
             "relay up name=%s role=%s server=%s", identity.name.short, identity.role.value, relay.server is not None
         )
@@ -105,7 +94,6 @@ class Relay:
         self._context = context
         self._loop = context.loop
         self._begun_s = time.monotonic()
-        self._periodic: list[Callable[[], None]] = [self.check_members]
         self._health = Health()
         self._is_closed = False
         context.load_revocations(now())
@@ -127,7 +115,7 @@ class Relay:
                 listener = opened.enter_context(listen_tls(config.server))
                 self.server = BorderServer(config, config.server, listener, context)
             opened.pop_all()
-        self._loop.register(self._monitor.fileno(), select.EPOLLIN, self._addresses_changed)
+        self._loop.watch(self._monitor, self._addresses_changed)
         self._loop.add_timed(self)
 
     def start(self) -> None:
@@ -135,14 +123,9 @@ class Relay:
         if self._watch is not None:
             self._watch.start()
 
-    def every_period(self, function: Callable[[], None]) -> None:
-        """Call ``function`` from within the loop each ``RECONCILE_PERIOD_S``, before the members are checked."""
-        self._periodic.insert(0, function)
-
     def handle_timer(self, now_s: float) -> float:
         """Look at files and memberships; return the second of the next call."""
-        for function in self._periodic:
-            function()
+        self.check_members()
         if self._watch is not None:
             for dialer in self.dialers:
                 dialer.follow_tunnel(now_s, is_up=dialer.peer.to_text() in self._watch.up)
@@ -166,7 +149,7 @@ class Relay:
         if self._watch is not None:
             self._watch.close()
         self._loop.remove_timed(self)
-        self._loop.unregister(self._monitor.fileno())
+        self._loop.unwatch(self._monitor)
         self._monitor.close()
         for dialer in self.dialers:
             dialer.close()
@@ -188,7 +171,7 @@ class Relay:
             total = self.counters()
             return {"in": total.frames_in, "out": total.frames_out}
 
-        return Sources(frames=frames, drops=[self._drops], health=lambda: self._health)
+        return Sources(frames=frames, drops=self._drops, health=lambda: self._health)
 
     def status(self) -> dict[str, object]:
         """Return the JSON fields of this relay."""
@@ -200,36 +183,19 @@ class Relay:
         uptime_s = now_s - self._begun_s
         return {**node_status(self._context.identity, self.sources(), uptime_s=uptime_s, **more), "role": "relay"}
 
-    def _addresses_changed(self, events: int) -> None:
-        del events
+    def _addresses_changed(self) -> None:
         if self._monitor.has_news():
             for dialer in self.dialers:
                 dialer.network_changed()
 
-    def _drops(self) -> list[int]:
+    def _drops(self) -> dict[DropReason, int]:
         total = self.counters()
-        drops = [0] * DROP_COUNTERS
-        drops[DropReason.BAD_ETHERTYPE] = total.foreign
-        drops[DropReason.TOO_BIG] = total.too_big
-        drops[DropReason.PORT_FULL] = total.full
-        drops[DropReason.PORT_DOWN] = total.refused
-        return drops
-
-
-@contextlib.contextmanager
-def _control(loop: RelayLoop, path: Path, handlers: ControlHandlers) -> Iterator[None]:
-    """Serve the control socket from within the loop until the context ends."""
-    if not path.parent.is_dir():  # locks are not possible here either, which was logged
-        log.warning("no control socket: no such directory path=%s", path.parent)
-        yield
-        return
-    server = ControlServer(path, handlers)
-    loop.register(server.fileno(), select.EPOLLIN, lambda _: server.handle_events())
-    try:
-        yield
-    finally:
-        loop.unregister(server.fileno())
-        server.close()
+        return {
+            DropReason.BAD_ETHERTYPE: total.foreign,
+            DropReason.TOO_BIG: total.too_big,
+            DropReason.PORT_FULL: total.full,
+            DropReason.PORT_DOWN: total.refused,
+        }
 
 
 def _instance(switch: Name) -> Name:

@@ -6,35 +6,22 @@ I/O.
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations
 
-__all__ = ["WRITE_S", "RevocationUpkeep", "load_revocations"]
+__all__ = ["WRITE_S", "RevocationUpkeep"]
 
 log = logging.getLogger(__name__)
 
 WRITE_S: Final = 0.05  # between two slices
-
-
-def load_revocations(folder: Path | None, revoked: Revocations, stack: ExitStack) -> RevocationUpkeep:
-    """Return the upkeep of a node's revocations, with the stored ones restored; ``stack`` closes it.
-
-    Raises:
-        LocalError: others may write to the folder.
-    """
-    upkeep = RevocationUpkeep(folder, revoked)
-    upkeep.restore(now())
-    stack.callback(upkeep.close)
-    return upkeep
 
 
 class RevocationUpkeep:
@@ -64,16 +51,16 @@ class RevocationUpkeep:
         self._revoked.changes = set()
         log.info("revocations read kept=%d refused=%d", len(self._revoked), refused)
 
-    def start(self, runtime: Runtime | None = None) -> None:
+    def start(self, every: Callable[[float, Callable[[Timestamps], None]], None] | None = None) -> None:
         """Begin to write; call it after the confinement of rights, which applies only to threads started later.
 
         Args:
-            runtime: calls ``work`` from now on; None: the caller does.
+            every: of a loop, which calls ``work`` from now on; None: the caller does.
         """
         if self._file is not None:
             self._file.start()
-            if runtime is not None:
-                runtime.every(WRITE_S, self.work)
+            if every is not None:
+                every(WRITE_S, self.work)
 
     def work(self, at: Timestamps) -> None:
         """Pass one slice of changes to the file, if it is ready."""

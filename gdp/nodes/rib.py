@@ -8,42 +8,32 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
-from gdp.client.attachment import attachment_waits
 from gdp.client.rib_host import RibHost
 from gdp.config.config import RibConfig
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
-from gdp.host.service_notifier import service_notifier
-from gdp.host.single_instance import run_alone
 from gdp.links.uplink import load_plane, open_uplink
-from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
-from gdp.nodes.audit import audit_folder, keep_audit
-from gdp.nodes.credentials import Credentials
-from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
-from gdp.nodes.port_rows import port_rows
-from gdp.nodes.revocation_upkeep import load_revocations
+from gdp.nodes.audit import audit_folder
+from gdp.nodes.membership import fresh_settings, load_member
+from gdp.nodes.node import Node, common_handlers, common_sources
+from gdp.nodes.node_log import OnWait
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
-from gdp.ports.plane import Plane
 from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.store import Store
 from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now
-from gdp.state.control_status import node_status
-from gdp.state.diagnostic_control import DiagnosticCommands
-from gdp.state.link_rows import LinkRows
 from gdp.state.member_tables import rib_tables
 from gdp.state.name_lookup import rib_lookup
-from gdp.state.snapshot import node_snapshot, rib_snapshot
+from gdp.state.node_state import RibState
+from gdp.state.snapshot import rib_snapshot
 from gdp.state.state_answers import answer_for_rib
-from gdp.stores.audit_log import AuditLog
-from gdp.telemetry.sources import Sources, count_list
+from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
-__all__ = ["run_rib"]
+__all__ = ["rib_handlers", "rib_sources", "run_rib"]
 
 log = logging.getLogger(__name__)
 
@@ -58,9 +48,43 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     Raises:
         LocalError: keys or the device differ from the configuration, or this RIB already runs.
     """
-    identity, policy = load_member(config.identity, config.domain, Role.RIB)
+    identity, policy = member = load_member(config.identity, config.domain, Role.RIB)
+    with contextlib.ExitStack() as stack:
+        audit = audit_folder(config.audit)
+        node = Node("RIB", member, config, stack, state_folder=config.state, audit=audit)
+        if config.sandbox:
+            load_plane(config.data_plane)
+            confine_rib(config)  # before the thread of the store starts; the device can still be opened
+        upkeep = _upkeep(config, policy)
+        stack.callback(upkeep.close)
+        rib = RibCore(identity, policy, upkeep.store, _settings(config))
+        host = RibHost(identity, policy, rib, fresh_settings(config.lease_s))
+        upkeep.begin(rib, now())
+        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
+        runtime = Runtime(host, plane)
+        runtime.every(upkeep.every_s, upkeep.work)
+        state = RibState(identity, policy, plane, host, now().mono_s)
+        node.drive(state, runtime, on_wait)
+        sources = common_sources(node.node_log, rib_sources(state))
+        handlers = replace(
+            rib_handlers(state, sources, upkeep.store),
+            reload=node.reload,
+            drain=lambda: runtime.drain(lambda: True, DRAIN_MAX_S),
+            is_drained=lambda: runtime.has_drained,
+        )
+        node.follow_clients(runtime, handlers, config.control_socket)
+        for source in upkeep.sources:
+            runtime.watch(source, lambda: upkeep.work(now()))
+        node.begin(runtime, config.metrics, sources)
+        log.info("rib up name=%s iface=%s plane=%s", identity.name.short, config.iface, config.data_plane)
+        if runtime.run(lambda: host.attachment.switch is not None):
+            ready(identity.name)
+        runtime.run()
+
+
+def _settings(config: RibConfig) -> RibSettings:
     quotas = config.quotas
-    settings = RibSettings(
+    return RibSettings(
         upper=config.upper,
         peers=config.peers,
         allow_unowned=config.allow_unowned,
@@ -68,81 +92,6 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         watches=quotas.watches,
         lease_max_s=quotas.lease_max_s,
     )
-    attachment = NodeSettings(
-        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
-    )
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(run_alone("RIB", identity.name))
-        notifier = stack.enter_context(service_notifier())
-        folder = audit_folder(config.audit)
-        if config.sandbox:
-            if folder is not None:
-                AuditLog(folder)  # makes the folder
-            load_plane(config.data_plane)
-            confine_rib(config)  # before the thread of the store starts; the device can still be opened
-        revocations = load_revocations(config.state, policy.revoked, stack)
-        upkeep = _upkeep(config, policy)
-        stack.callback(upkeep.close)
-        rib = RibCore(identity, policy, upkeep.store, settings)
-        host = RibHost(identity, policy, rib, attachment)
-        upkeep.begin(rib, now())
-        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
-        runtime = Runtime(host, plane)
-        runtime.every(upkeep.every_s, upkeep.work)
-        revocations.start(runtime)
-        keep_audit(config.audit, policy.audit, host.drops, runtime, stack)
-        node_log = NodeLog(
-            host.attachment.hello_protocol,
-            policy,
-            plane,
-            rib.boundary,
-            lambda now_s: [*attachment_waits(host.attachment, now_s), *rib.waits(now_s)],
-            on_wait=on_wait,
-        )
-        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
-        credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(RECONCILE_PERIOD_S, credentials.reload_changed)
-        stack.enter_context(runtime.signals(lambda: credentials.reload_changed(now())))
-        notifier.follow(runtime.every)
-        sources, begun_s = _sources(host, plane, node_log, runtime), now().mono_s
-        log_decisions(runtime, plane.ports, sources.drops)
-        answer_for_rib(host, policy, node_log.wait_facts)
-        commands = DiagnosticCommands(
-            diagnostics=host.diagnostics,
-            policy=policy,
-            own_switch=lambda: host.attachment.switch.name if host.attachment.switch is not None else None,
-            now=now,
-            tables=rib_tables(host, upkeep.store, plane, policy, sources.drops),
-            role="RIB",
-        )
-        handlers = ControlHandlers(
-            reload=lambda: credentials.reload_changed(now()),
-            status=lambda: node_status(
-                identity, sources, uptime_s=now().mono_s - begun_s, attached=host.attachment.switch is not None
-            ),
-            snapshot=lambda: {
-                **node_snapshot(identity, sources, uptime_s=now().mono_s - begun_s),
-                **rib_snapshot(rib, None if host.attachment.switch is None else host.attachment.switch.name),
-            },
-            drain=lambda: runtime.drain(lambda: True, DRAIN_MAX_S),
-            is_drained=lambda: runtime.has_drained,
-            lookup=lambda name: rib_lookup(rib, identity.name, name, now()),
-            ask=commands.ask,
-            show=commands.show,
-        )
-        stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
-        for source in upkeep.sources():
-            runtime.watch(source, lambda: upkeep.work(now()))
-        if config.metrics is not None:
-            from gdp.telemetry.metrics import Metrics
-
-            metrics = Metrics(sources)
-            metrics.serve(config.metrics.port)
-            stack.callback(metrics.close)
-        log.info("rib up name=%s iface=%s plane=%s", identity.name.short, config.iface, config.data_plane)
-        if runtime.run(lambda: host.attachment.switch is not None):
-            ready(identity.name)
-        runtime.run()
 
 
 def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
@@ -153,13 +102,27 @@ def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
 
 
-def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -> Sources:
-    counters, rib = plane.counters, host.rib
-    links = LinkRows(host.attachment.hello_protocol, plane.ports)
-    runtime.every(RECONCILE_PERIOD_S, links.refresh)
+def rib_handlers(state: RibState, sources: Sources, store: Store) -> ControlHandlers:
+    """Return what clients of the control socket may ask of a RIB, which also answers requests about its state."""
+    rib = state.host.rib
+    answer_for_rib(state)
+    return replace(
+        common_handlers(
+            state,
+            sources,
+            rib_tables(state, store),
+            lambda: {"attached": state.own_switch is not None},
+            lambda: rib_snapshot(rib, state.own_switch),
+        ),
+        lookup=lambda name: rib_lookup(rib, state.identity.name, name, now()),
+    )
+
+
+def rib_sources(state: RibState) -> Sources:
+    """Return the sources of metrics that a RIB adds."""
+    counters, rib = state.plane.counters, state.host.rib
     return Sources(
         frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "punted": counters.punted},
-        drops=[lambda: counters.drops, lambda: count_list(host.drops())],
         table_entries=lambda: rib.names,
         rib_answers=lambda: {
             "found": rib.answers,
@@ -168,9 +131,5 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -
             "accepted": rib.accepted,
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
-        waiting=node_log.metrics,
-        links=lambda: links.rows,
-        ports=lambda: port_rows(plane.ports),
-        health=node_log.health,
-        clashes=lambda: rib.identities.clashes + host.attachment.hello_protocol.conflicts.clashes,
+        clashes=lambda: rib.identities.clashes + state.hello_protocol.conflicts.clashes,
     )

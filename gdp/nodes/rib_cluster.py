@@ -6,13 +6,11 @@ I/O.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.ports.plane import HasFileno
+from gdp.nodes.rib_upkeep import Upkeep
 from gdp.rib.core import RibCore
-from gdp.rib.store import Store
 from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_address import ClusterAddress
@@ -28,7 +26,7 @@ KEEP_ALIVE_S: Final = 0.25
 LOAD_S: Final = 1.0  # between two attempts to load functions into a primary
 
 
-class ClusterUpkeep:
+class ClusterUpkeep(Upkeep):
     """A connection to the cluster and the store over it.
 
     Attributes:
@@ -38,34 +36,25 @@ class ClusterUpkeep:
         LocalError: the cluster is not reachable, or refuses the RIB's functions.
     """
 
+    every_s = KEEP_ALIVE_S
+
     def __init__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> None:
         self._link = ClusterLink(address)
+        self.sources = (self._link,)  # the connections that listen, as one source
         self.is_complete = load_functions(self._link)
         self._load_at_s = float("-inf")
         if not self.is_complete:
             log.warning("cluster incomplete; the RIB starts without the primaries that do not answer")
-        self._cluster = ClusterStore(self._link, AdvertisementVerifier(policy, allow_unowned=allow_unowned))
+        self.store = self._cluster = ClusterStore(
+            self._link, AdvertisementVerifier(policy, allow_unowned=allow_unowned)
+        )
         self._rib: RibCore | None = None
         self._failures = 0
-
-    @property
-    def store(self) -> Store:
-        """Return the store."""
-        return self._cluster
-
-    @property
-    def every_s(self) -> float:
-        """Return the period of the connections' upkeep, in seconds."""
-        return KEEP_ALIVE_S
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Listen for changes."""
         self._rib = rib
         self.work(now)
-
-    def sources(self) -> Sequence[HasFileno]:
-        """Return the connections that listen, as one source."""
-        return (self._link,)
 
     def work(self, now: Timestamps) -> None:
         """Report the changes of other RIBs, and maintain the connections."""

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from gdp.ports.plane import HasFileno
 from gdp.rib.core import RibCore
@@ -25,22 +25,20 @@ SNAPSHOT_S: Final = 0.1  # between two slices
 CHANGES_MAX: Final = 65_536  # that wait for disk space, or twice the number of kept routes
 
 
-class Upkeep(Protocol):
-    """Upkeep of one store."""
+class Upkeep:
+    """Upkeep of one store.
 
-    @property
-    def store(self) -> Store:
-        """Return the store."""
+    Attributes:
+        every_s: period of ``work``, in seconds.
+        sources: make ``work`` due when they are readable.
+    """
 
-    @property
-    def every_s(self) -> float:
-        """Return the period of ``work``, in seconds."""
+    store: Store
+    every_s: float
+    sources: Sequence[HasFileno] = ()
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Fill the store with what an earlier run stored."""
-
-    def sources(self) -> Sequence[HasFileno]:
-        """Return the sources that make ``work`` due when they are readable."""
 
     def work(self, now: Timestamps) -> None:
         """Do what is due."""
@@ -49,23 +47,15 @@ class Upkeep(Protocol):
         """End the upkeep."""
 
 
-class MemoryUpkeep:
-    """A store in memory, with a snapshot on disk if there is a path for it."""
+class MemoryUpkeep(Upkeep):
+    """A store in memory, with a snapshot on disk if there is a path for it; a period passes on a slice of changes."""
+
+    every_s = SNAPSHOT_S
 
     def __init__(self, path: Path | None) -> None:
-        self._memory = MemoryStore()
+        self.store = self._memory = MemoryStore()
         self._snapshot = None if path is None else Snapshot(path)
         self._rib: RibCore | None = None
-
-    @property
-    def store(self) -> Store:
-        """Return the store."""
-        return self._memory
-
-    @property
-    def every_s(self) -> float:
-        """Return the period in seconds at which a slice of changes is passed on."""
-        return SNAPSHOT_S
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
         """Load the snapshot, whose entries are verified again."""
@@ -78,10 +68,6 @@ class MemoryUpkeep:
         )
         self._memory.changes = set()
         self._snapshot.start()
-
-    def sources(self) -> Sequence[HasFileno]:
-        """Return no sources."""
-        return ()
 
     def work(self, now: Timestamps) -> None:
         """Pass one slice of changes to the snapshot, if it is ready."""

@@ -16,14 +16,16 @@ import stat
 import sys
 import tempfile
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from gdp.config.config import ClusterConfig, RibConfig, SwitchConfig
-from gdp.config.relay_config import RelayConfig
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig, RelayServer
+from gdp.config.schema import Metrics
 from gdp.host.single_instance import lock_directory
 from gdp.nodes.audit import audit_folder
-from gdp.nodes.credentials import watched_folders
+from gdp.nodes.credentials import NodeConfig, watched_folders
 from gdp.ports.sandbox import Capability, Needs, confine
 
 __all__ = ["confine_proxy", "confine_relay", "confine_rib", "confine_switch"]
@@ -45,59 +47,45 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     Args:
         plane: the name of its data plane.
     """
-    again = watched_folders(config.identity, config.domain)
-    again += () if config.revocations is None else (config.revocations,)
-    again += () if config.links is None or config.links.peers is None else (config.links.peers,)
-    state = () if config.state is None else (config.state,)
-    kept = (*state, *_folder_of(config.control_socket), *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"
-    _confine(
-        Needs(
-            capabilities=_DEVICE | (_PROGRAMS if is_kernel else frozenset()) | _past_owners(again, kept),
-            writes=(*_CHANGED, lock_directory(), *kept),
-            reads=(*_code(), *again),
-            tcp_ports=() if config.metrics is None else (config.metrics.port,),
-            spared_calls=frozenset({"bpf"} if is_kernel else ()),
-        )
+    needs = Needs(
+        capabilities=_DEVICE | (_PROGRAMS if is_kernel else frozenset()),
+        reads=(),
+        tcp_ports=_ports(config.metrics),
+        spared_calls=frozenset({"bpf"} if is_kernel else ()),
     )
+    again = (config.revocations, None if config.links is None else config.links.peers)
+    folders = (config.state, _folder_of(config.control_socket), audit_folder(config.audit), *config.token_folders)
+    _confine(config, needs, again, folders)
 
 
 def confine_rib(config: RibConfig) -> None:
-    """Drop the rights that a RIB does not need."""
-    is_shared = config.store != "memory"
-    again = watched_folders(config.identity, config.domain)
-    secrets = () if config.store == "memory" else _files_of(config.store.cluster)
-    folders = (None if config.snapshot is None else config.snapshot.parent, config.state)
-    snapshots = tuple(folder for folder in folders if folder is not None) + _folder_of(config.control_socket)
-    kept = (*snapshots, *_audits(config.audit), *config.token_folders)
-    ports = () if config.metrics is None else (config.metrics.port,)
-    _confine(
-        Needs(
-            capabilities=_DEVICE | _past_owners((*again, *secrets), kept),
-            writes=(*_CHANGED, lock_directory(), *kept),
-            reads=None if is_shared else (*_code(), *again),
-            tcp_ports=None if is_shared else ports,
-        )
+    """Drop the rights that a RIB does not need; one with a store in a cluster opens connections."""
+    store = None if config.store == "memory" else config.store.cluster
+    needs = (
+        Needs(capabilities=_DEVICE)
+        if store
+        else Needs(capabilities=_DEVICE, reads=(), tcp_ports=_ports(config.metrics))
     )
+    secrets = () if store is None else (store.password_file, store.ca, store.cert, store.key)
+    sockets = map(_folder_of, (config.snapshot, config.control_socket))
+    _confine(config, needs, secrets, (config.state, *sockets, audit_folder(config.audit), *config.token_folders))
 
 
 def confine_relay(config: RelayConfig) -> None:
     """Drop the rights that a relay does not need; it listens on its port, or opens connections to borders."""
-    again = watched_folders(config.identity, config.domain)
-    again += () if config.revocations is None else (config.revocations,)
-    kept = _folder_of(config.control_socket)
-    ports = tuple(each.port for each in (config.metrics, config.server) if each is not None)
-    _confine(
-        Needs(
-            capabilities=frozenset({Capability.NET_ADMIN}) | _past_owners(again, kept),
-            writes=(*_CHANGED, _DEVICE_SETTINGS, lock_directory(), *kept),
-            reads=(*_code(), _RESOLVER, *again, *_folder_of(config.switch_socket)),
-            tcp_ports=None if config.borders else ports,
-        )
+    needs = Needs(
+        capabilities=frozenset({Capability.NET_ADMIN}),
+        writes=(_DEVICE_SETTINGS,),
+        reads=(_RESOLVER, *_given(_folder_of(config.switch_socket))),
+        tcp_ports=None if config.borders else _ports(config.metrics, config.server),
     )
+    _confine(config, needs, (config.revocations,), (_folder_of(config.control_socket),))
 
 
-def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: bool) -> None:
+def confine_proxy(
+    config: NodeConfig, reads: Iterable[Path | None], writes: Iterable[Path | None], *, has_ros: bool
+) -> None:
     """Drop the rights that a proxy does not need.
 
     Args:
@@ -106,20 +94,40 @@ def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: boo
         has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
             nodes of other users: CAP_DAC_OVERRIDE is kept for that.
     """
-    written = tuple(writes)
-    changed = [*_CHANGED, lock_directory(), Path(tempfile.gettempdir()), *written]
-    kept = _DEVICE | _past_owners(reads, written)
-    if has_ros:
-        changed += _ros_folders()
-        kept |= {Capability.DAC_OVERRIDE}
-    _confine(Needs(capabilities=kept, writes=tuple(changed), starts_programs=has_ros))
+    needs = Needs(
+        capabilities=_DEVICE | ({Capability.DAC_OVERRIDE} if has_ros else frozenset()),
+        writes=(Path(tempfile.gettempdir()), *(_ros_folders() if has_ros else ())),
+        starts_programs=has_ros,
+    )
+    _confine(config, needs, reads, writes)
 
 
-def _confine(needs: Needs) -> None:
+def _confine(config: NodeConfig, needs: Needs, reads: Iterable[Path | None], writes: Iterable[Path | None]) -> None:
+    """Drop all rights but these, and those on files of the operator.
+
+    Args:
+        reads: what the node reads again, apart from its certificates; they may belong to another user.
+        writes: folders that it changes; likewise.
+    """
+    again, kept = (*watched_folders(config.identity, config.domain), *_given(*reads)), _given(*writes)
+    needs = replace(
+        needs,
+        capabilities=needs.capabilities | _past_owners(again, kept),
+        writes=(*_CHANGED, lock_directory(), *needs.writes, *kept),
+        reads=None if needs.reads is None else (*_code(), *needs.reads, *again),
+    )
     log.info("rights %s", confine(needs).to_text())
 
 
-def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> frozenset[Capability]:
+def _given(*paths: Path | None) -> tuple[Path, ...]:
+    return tuple(path for path in paths if path is not None)
+
+
+def _ports(*sections: Metrics | RelayServer | None) -> tuple[int, ...]:
+    return tuple(each.port for each in sections if each is not None)
+
+
+def _past_owners(reads: Iterable[Path], writes: Iterable[Path]) -> frozenset[Capability]:
     """Return the capabilities that root needs to read or change files of another user."""
     kept = set()
     if os.geteuid() == 0:
@@ -130,18 +138,9 @@ def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> fro
     return frozenset(kept)
 
 
-def _audits(configured: Path | None) -> tuple[Path, ...]:
-    folder = audit_folder(configured)
-    return () if folder is None else (folder,)
-
-
-def _folder_of(file: Path | None) -> tuple[Path, ...]:
+def _folder_of(file: Path | None) -> Path | None:
     """Return the folder of a file that the node removes at its end."""
-    return () if file is None else (file.parent,)
-
-
-def _files_of(store: ClusterConfig) -> tuple[Path, ...]:
-    return tuple(each for each in (store.password_file, store.ca, store.cert, store.key) if each is not None)
+    return None if file is None else file.parent
 
 
 def _is_foreign(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Byte counters of the devices of this network namespace. I/O.
+"""Counters of the devices of this network namespace. I/O.
 
 Source: proc_pid_net(5), ``/proc/pid/net/dev``. The file is opened at once and read again at each call, so that a node
 that has given its rights away still reads it, and reads its own namespace.
@@ -14,7 +14,7 @@ __all__ = ["PortCounters"]
 
 _FILE: Final = Path("/proc/self/net/dev")
 _READ_BYTES: Final = 1 << 18  # about 2,000 devices
-_RECEIVED, _SENT = 0, 8  # columns
+_COLUMNS: Final = (1, 9, 0, 8, 2, 10, 3, 11)  # of packets, bytes, errors and drops, each received and sent
 
 
 class PortCounters:
@@ -26,8 +26,12 @@ class PortCounters:
         except OSError:  # a container without it: a view then shows no rates of links
             self._file = -1
 
-    def read(self) -> dict[str, tuple[int, int]]:
-        """Return by device the bytes that came in and went out since it exists."""
+    def read(self) -> dict[str, tuple[int, ...]]:
+        """Return eight counts by device since it exists: frames, bytes, errors and drops, each in and out.
+
+        All protocols count together. Drops of received frames include those that the device itself had no space for.
+        Any thread may call it.
+        """
         if self._file < 0:
             return {}
         text = os.pread(self._file, _READ_BYTES, 0).decode("ascii", "replace")
@@ -35,8 +39,8 @@ class PortCounters:
         for line in text.splitlines()[2:]:
             device, _, columns = line.partition(":")
             numbers = columns.split()
-            if len(numbers) > _SENT:
-                found[device.strip()] = int(numbers[_RECEIVED]), int(numbers[_SENT])
+            if len(numbers) > max(_COLUMNS):
+                found[device.strip()] = tuple(int(numbers[column]) for column in _COLUMNS)
         return found
 
     def close(self) -> None:

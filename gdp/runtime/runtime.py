@@ -12,10 +12,8 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from gdp.limits import COST_DEFAULT
-from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
 from gdp.runtime.memory_tuning import tune_memory
@@ -118,25 +116,6 @@ class Runtime:
                 ready()
 
         self._plane.watch(source, wake)
-
-    @contextlib.contextmanager
-    def control(self, path: Path, handlers: ControlHandlers) -> Iterator[None]:
-        """Serve a control socket from within the loop until the context ends.
-
-        Raises:
-            LocalError: the socket cannot be made.
-        """
-        if not path.parent.is_dir():  # locks are not possible here either, which was logged
-            log.warning("no control socket: no such directory path=%s", path.parent)
-            yield
-            return
-        server = ControlServer(path, handlers)
-        self.watch(server, server.handle_events)
-        try:
-            yield
-        finally:
-            self.unwatch(server)
-            server.close()
 
     def add_port(self, ifname: str, cost: int) -> int:
         """Begin to use a device, which may be missing yet; return its port index.

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from gdp.service.replication import Replication
 from gdp.session.loop_driver import LoopDriver
-from gdp.session.node import open_node
+from gdp.session.node import SessionNode
 from gdp.session.protocol.errors import ClosedError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
@@ -275,7 +275,7 @@ class _Opening:
             await self._session.__aexit__(kind, error, at)
 
     async def _open(self) -> AsyncSession:
-        node = open_node(self._config)
+        node = SessionNode(self._config)
         session = AsyncSession(node, LoopDriver(node.core, node.runtime, node.plane))
         try:
             await session.wait_until_attached(self._timeout_s)

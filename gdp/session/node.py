@@ -11,30 +11,24 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Final
 
-from gdp.client.attachment import attachment_waits
 from gdp.client.participant import Participant
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity
 from gdp.errors import GdpError
-from gdp.host.single_instance import run_alone
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
-from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
-from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog
-from gdp.nodes.revocation_upkeep import load_revocations
-from gdp.ports.netdev import NetdevPlane
-from gdp.runtime.runtime import Runtime
+from gdp.nodes.membership import fresh_settings, load_member
+from gdp.nodes.node import Node
+from gdp.nodes.node_log import RECONCILE_PERIOD_S
+from gdp.runtime.runtime import Runtime, now
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
+from gdp.state.node_state import MemberState
 
-__all__ = ["SessionNode", "open_node"]
+__all__ = ["SessionNode"]
 
 log = logging.getLogger(__name__)
 
@@ -42,18 +36,31 @@ _open_names: Final = set[Name]()  # identities in use by this process: record lo
 _open_lock: Final = threading.Lock()
 
 
-@dataclass(slots=True, kw_only=True)
-class SessionNode:
-    """The node that a driver runs; ``close`` releases all its resources."""
+class SessionNode(Node):
+    """The node that a driver runs; ``close`` releases all its resources.
 
-    config: SessionConfig
-    identity: Identity
-    member: Participant
-    runtime: Runtime
-    plane: NetdevPlane
-    node_log: NodeLog
-    core: SessionCore
-    _stack: ExitStack
+    Raises:
+        LocalError: keys, delegations or the device differ from the settings, or this node already runs.
+    """
+
+    def __init__(self, config: SessionConfig) -> None:
+        identity, policy = member = load_member(config.identity, config.domain, Role.PROXY)
+        self._directory = config.delegation_directory
+        self.member = Participant(identity, policy, fresh_settings(config.lease_s))
+        topics = DelegationStore(self._directory, identity)
+        self.core = SessionCore(self.member, topics, lambda: secrets.randbits(64), str(self._directory))
+        with ExitStack() as stack:
+            stack.callback(_own(identity.name))
+            super().__init__("node", member, config, stack, is_service=False, state_folder=config.state)
+            self.plane = stack.enter_context(open_uplink(config.iface))
+            self.runtime = Runtime(self.member, self.plane, spin_s=config.busy_poll_us / 1e6)
+            labels = {topic.name: self.core.label(topic) for topic in topics}
+            state = MemberState(identity, policy, self.plane, self.member, now().mono_s)
+            state.local_name = lambda name: labels.get(name, name.short)
+            self.drive(state, self.runtime)
+            self.begin(self.runtime)
+            self.runtime.every(RECONCILE_PERIOD_S, EpochTimer(self.reload_for_epoch).handle_timer)
+            self._opened = stack.pop_all()
 
     def waiting_for(self) -> str:
         """Return what prevents the node from being attached, as a sentence."""
@@ -66,12 +73,13 @@ class SessionNode:
         return next((each.refused.label for each in advertisements if each.refused is not None), "")
 
     def reload(self) -> None:
-        """Read the delegations again.
+        """Read the certificates and the delegations again.
 
         Raises:
             LocalError: a file is malformed, or readable for others.
         """
-        self.core.renew(DelegationStore(self.config.delegation_directory, self.identity))
+        super().reload()
+        self.core.renew(DelegationStore(self._directory, self.identity))
 
     def reload_for_epoch(self) -> None:
         """Read the delegations again, because an epoch begins; an error is logged."""
@@ -82,54 +90,7 @@ class SessionNode:
 
     def close(self) -> None:
         """Close the device and release the identity."""
-        self._stack.close()
-
-
-def open_node(config: SessionConfig) -> SessionNode:
-    """Open everything that a session needs.
-
-    Raises:
-        LocalError: keys, delegations or the device differ from the settings, or this node already runs.
-    """
-    identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(
-        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
-    )
-    member = Participant(identity, policy, settings)
-    directory = config.delegation_directory
-    topics = DelegationStore(directory, identity)
-    core = SessionCore(member, topics, lambda: secrets.randbits(64), str(directory))
-    with ExitStack() as stack:
-        stack.callback(_own(identity.name))
-        stack.enter_context(run_alone("node", identity.name))
-        revocations = load_revocations(config.state, policy.revoked, stack)
-        plane = stack.enter_context(open_uplink(config.iface))
-        runtime = Runtime(member, plane, spin_s=config.busy_poll_us / 1e6)
-        labels = {topic.name: core.label(topic) for topic in topics}
-        node_log = NodeLog(
-            member.attachment.hello_protocol,
-            policy,
-            plane,
-            member.boundary,
-            lambda now_s: attachment_waits(member.attachment, now_s),
-            conflict=lambda: member.attachment.conflict_at,
-            local_name=lambda name: labels.get(name, name.short),
-        )
-        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
-        runtime.every(RECONCILE_PERIOD_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
-        revocations.start(runtime)
-        node = SessionNode(
-            config=config,
-            identity=identity,
-            member=member,
-            runtime=runtime,
-            plane=plane,
-            node_log=node_log,
-            core=core,
-            _stack=stack.pop_all(),
-        )
-        runtime.every(RECONCILE_PERIOD_S, EpochTimer(node.reload_for_epoch).handle_timer)
-        return node
+        self._opened.close()
 
 
 def _own(name: Name) -> Callable[[], None]:

@@ -17,7 +17,7 @@ from typing import Final, TypeVar
 
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
-from gdp.session.node import SessionNode, open_node
+from gdp.session.node import SessionNode
 from gdp.session.protocol.errors import ClosedError, SessionTimeoutError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
@@ -344,7 +344,7 @@ def open_session(
         lease_s=lease_s,
         busy_poll_us=busy_poll_us,
     )
-    made: SessionNode = open_node(config)
+    made = SessionNode(config)
     session = Session(made, ThreadDriver(made.core, made.runtime))
     try:
         session.wait_until_attached(timeout_s)

@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.diagnostics import Diagnostics, Reply
+from gdp.control.diagnostics import Reply
 from gdp.errors import LocalError
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.state.control_protocol import Respond, Response
-from gdp.trust.domain import Policy
+from gdp.state.node_state import NodeState
 
 __all__ = ["DiagnosticCommands", "Row", "TableSource", "as_json"]
 
@@ -30,19 +30,11 @@ _PAGE_ROWS: Final = 200  # each below 500 bytes: the socket's buffer holds a pag
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiagnosticCommands:
-    """Handlers of ``ask`` and ``show`` for one node.
+    """Handlers of ``ask`` and ``show`` for one node."""
 
-    Args:
-        own_switch: returns the switch that the node is attached to, or None; a switch returns its own name.
-        role: word for the node in errors.
-    """
-
-    diagnostics: Diagnostics
-    policy: Policy
-    own_switch: Callable[[], Name | None]
+    state: NodeState
     now: Callable[[], Timestamps]
     tables: Mapping[str, TableSource]
-    role: str
 
     def ask(self, arguments: Mapping[str, object], respond: Respond) -> None:
         """Send a diagnostic request, and respond when its reply has come, or its time is over.
@@ -51,7 +43,7 @@ class DiagnosticCommands:
             LocalError: an argument is wrong, or the node has no switch.
         """
         ask = _text(arguments, "ask")
-        target = _name(arguments, "target") or self.own_switch()
+        target = _name(arguments, "target") or self.state.own_switch
         if target is None:
             raise LocalError("this node is attached to no switch now")
         body = arguments.get("body", {})
@@ -63,7 +55,7 @@ class DiagnosticCommands:
             fields: dict[str, object] = {"id": request_id, "rtt_ms": round(1e3 * rtt_s, 3)}
             respond(Response(fields | (self._described(reply) if reply is not None else {"state": "silent"})))
 
-        self.diagnostics.ask(
+        self.state.core.diagnostics.ask(
             target,
             ask,
             now=self.now(),
@@ -84,7 +76,9 @@ class DiagnosticCommands:
         what = _text(arguments, "what")
         source = self.tables.get(what)
         if source is None:
-            raise LocalError(f"a {self.role} keeps no table {what[:40]!r}; it keeps {', '.join(sorted(self.tables))}")
+            raise LocalError(
+                f"a {self.state.role} keeps no table {what[:40]!r}; it keeps {', '.join(sorted(self.tables))}"
+            )
         first = int(_number(arguments, "from", 0, 0, math.inf))
         rows = source(self.now())
         page = [{key: as_json(value) for key, value in row.items()} for row in rows[first : first + _PAGE_ROWS]]
@@ -93,7 +87,7 @@ class DiagnosticCommands:
 
     def _described(self, reply: Reply) -> dict[str, object]:
         member = reply.member
-        root = self.policy.roots.get(member.domain)
+        root = self.state.policy.roots.get(member.domain)
         return {
             "state": "answered",
             "node": member.name.to_text(),

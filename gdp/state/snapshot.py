@@ -12,23 +12,23 @@ Sans-I/O. A whole name would let every reader of a picture request the topic, so
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from itertools import islice
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from gdp.client.participant import Participant
 from gdp.control.link_state import Scope
-from gdp.crypto.identity import Identity
-from gdp.errors import DropReason
 from gdp.names import Name
-from gdp.rib.core import RibCore
-from gdp.state.link_rows import link_status
-from gdp.switch.core import SwitchCore
-from gdp.telemetry.sources import LinkRow, Sources
+from gdp.state.node_state import NodeState, SwitchState
+from gdp.state.tables import rounded_ms
+from gdp.telemetry.sources import DeviceCounts, NeighbourRow, Sources
+
+if TYPE_CHECKING:  # a node loads its own core alone
+    from gdp.rib.core import RibCore
+    from gdp.switch.core import SwitchCore
 
 __all__ = [
     "ID_CHARS",
-    "PortCounts",
     "member_snapshot",
     "node_snapshot",
     "rib_snapshot",
@@ -45,7 +45,6 @@ LINKS_MAX: Final = 256
 SWITCHES_MAX: Final = 512  # of a topology
 _FAN_OUT_MAX: Final = 64  # branches of one tree
 
-PortCounts = Mapping[str, tuple[int, int]]  # device to bytes in and bytes out
 _T = TypeVar("_T")
 
 
@@ -54,10 +53,9 @@ def short_id(name: Name) -> str:
     return name.hex()[:ID_CHARS]
 
 
-def node_snapshot(identity: Identity, sources: Sources, *, uptime_s: float) -> dict[str, object]:
-    """Return the fields that every kind of node has."""
-    drops = [source() for source in sources.drops]
-    sums = {reason.label: sum(counts[reason] for counts in drops) for reason in DropReason}
+def node_snapshot(state: NodeState, sources: Sources, now_s: float) -> dict[str, object]:
+    """Return the fields that every kind of node has, at a monotonic second."""
+    identity, drops = state.identity, state.drops()
     counts = {"frames": sources.frames, "messages": sources.messages, "bytes": sources.message_bytes}
     waiting = {} if sources.waiting is None else sources.waiting()
     return {
@@ -66,51 +64,24 @@ def node_snapshot(identity: Identity, sources: Sources, *, uptime_s: float) -> d
         "label": identity.label,
         "domain": short_id(identity.root.domain),
         "domain_label": identity.root.label,
-        "uptime_s": round(uptime_s, 1),
-        "drops": {label: count for label, count in sums.items() if count},
+        "uptime_s": state.uptime_s(now_s),
+        "drops": {reason.label: drops[reason] for reason in sorted(drops)},
         **{key: dict(source()) for key, source in counts.items() if source is not None},
         "waiting": [reason for reason, is_waiting in waiting.items() if is_waiting],
     }
 
 
-def switch_snapshot(switch: SwitchCore, rows: Sequence[LinkRow], ports: PortCounts) -> dict[str, object]:
-    """Return the fields of a switch.
-
-    Args:
-        rows: quality of the links, as last measured.
-        ports: bytes that crossed each device since it exists.
-    """
-    up = switch.hello_protocol.neighbours.all_up()
-    at = {(each.port, each.mac): short_id(each.name) for each in up}
-    quality = {(row.port, row.neighbour): row for row in rows}
-    devices = {row.neighbour: row.port for row in rows}
-    links = []
-    for each in up[:LINKS_MAX]:
-        device = devices.get(each.name.short, "")
-        row = quality.get((device, each.name.short))
-        fields = {} if row is None else link_status(row)
-        bytes_in, bytes_out = ports.get(device, (0, 0))
-        links.append(
-            {
-                "port": device or str(each.port),
-                "to": short_id(each.name),
-                "label": "" if each.member is None else each.member.label,
-                "role": each.role.value,
-                "domain": short_id(each.domain),
-                "rtt_ms": fields.get("rtt_ms"),
-                "loss": 0.0 if row is None else max(row.loss_in, row.loss_out),
-                "cost": each.cost,
-                "mtu": each.mtu,
-                "bytes_in": bytes_in,
-                "bytes_out": bytes_out,
-            }
-        )
-    advertisements = switch.attached.all()
+def switch_snapshot(state: SwitchState) -> dict[str, object]:
+    """Return the fields of a switch."""
+    switch, up, devices = state.switch, list(state.neighbours(is_up=True)), state.devices()
+    advertisements, trees = switch.attached.all(), switch.multicast.trees
+    links = [_link(row, devices.get(row.port)) for row in up[:LINKS_MAX]]
     names = [
         [short_id(one.name), short_id(one.node), one.right.value]
         for one in (each.advertisement for each in advertisements[:NAMES_MAX])
     ]
-    trees = [
+    at = {(each.port, each.mac): short_id(each.name) for each in state.hello_protocol.neighbours.all_up()}
+    shown = [
         [
             short_id(tree.topic),
             short_id(tree.publisher),
@@ -118,17 +89,32 @@ def switch_snapshot(switch: SwitchCore, rows: Sequence[LinkRow], ports: PortCoun
             "" if tree.upstream is None else at.get(tree.upstream, ""),
             sorted({at[branch] for branch in islice(tree.branches, _FAN_OUT_MAX) if branch in at}),
         ]
-        for tree in islice(switch.multicast.trees.present(), TREES_MAX)
+        for tree in islice(trees.present(), TREES_MAX)
     ]
-    left_out = len(advertisements) - len(names) + len(switch.multicast.trees) - len(trees) + len(up) - len(links)
     return {
         "links": links,
         "names": names,
-        "trees": trees,
+        "trees": shown,
         "rib": "" if switch.rib is None else short_id(switch.rib),
         "routes": len(switch.table),
         "link_states": switch.link_states,
-        "left_out": left_out,
+        "left_out": len(advertisements) - len(names) + len(trees) - len(shown) + len(up) - len(links),
+    }
+
+
+def _link(row: NeighbourRow, counts: DeviceCounts | None) -> dict[str, object]:
+    return {
+        "port": row.port,
+        "to": short_id(row.name),
+        "label": row.label,
+        "role": row.role,
+        "domain": short_id(row.domain),
+        "rtt_ms": rounded_ms(row.rtt_s),
+        "loss": max(row.loss_in, row.loss_out),
+        "cost": row.cost,
+        "mtu": row.mtu,
+        "bytes_in": 0 if counts is None else counts.bytes_in,
+        "bytes_out": 0 if counts is None else counts.bytes_out,
     }
 
 

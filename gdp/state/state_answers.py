@@ -10,22 +10,20 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from gdp.client.rib_host import RibHost
 from gdp.control.diagnostics import Diagnostics, Question
-from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact, WaitFact
+from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact
 from gdp.diagnosis.fields import to_fields
 from gdp.errors import StoreError
 from gdp.names import Name
 from gdp.sansio import Timestamps
-from gdp.switch.core import SwitchCore
+from gdp.state.node_state import RibState, SwitchState
+from gdp.state.switch_facts import switch_facts
 from gdp.trust.domain import Policy
 
 __all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state"]
 
 ASK: Final = "state"
 _TUNNELS_MAX: Final = 32
-
-Waits = Callable[[float], tuple[WaitFact, ...]]
 
 
 def answer_state(
@@ -55,39 +53,35 @@ def answer_state(
 
 
 def answer_for_switch(
-    switch: SwitchCore,
-    policy: Policy,
-    waits: Waits,
-    begun_s: float,
-    tunnels: Callable[[Timestamps], Sequence[Mapping[str, object]]] | None = None,
+    state: SwitchState, tunnels: Callable[[Timestamps], Sequence[Mapping[str, object]]] | None = None
 ) -> None:
     """Answer ``state`` for a switch.
 
     Args:
-        begun_s: monotonic second of its start.
         tunnels: returns a row for each tunnel, as ``TunnelLinks.status``; None: the switch has none.
     """
+    switch = state.switch
 
     def gather(question: Question, now: Timestamps) -> SwitchFacts:
-        known = switch.name_facts(question.name, now, waits(now.mono_s))
         rows = () if tunnels is None else tunnels(now)
-        return replace(known, uptime_s=round(now.mono_s - begun_s, 1), tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
+        return replace(switch_facts(state, question.name, now), tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
 
     def holders(name: Name, now_s: float) -> set[Name]:
         attached = {each.advertisement.node for each in switch.attached.named(name)}
         return attached | {place.advertiser for place in switch.resolver.cache.of(name, now_s)}
 
-    answer_state(switch.diagnostics, policy, gather, holders)
+    answer_state(switch.diagnostics, state.policy, gather, holders)
 
 
-def answer_for_rib(host: RibHost, policy: Policy, waits: Waits) -> None:
+def answer_for_rib(state: RibState) -> None:
     """Answer ``state`` for a RIB."""
+    rib = state.host.rib
 
     def gather(question: Question, now: Timestamps) -> RibFacts:
-        known = host.rib.name_facts(question.name, now)
-        return replace(known, waits=waits(now.mono_s), is_attached=host.attachment.switch is not None)
+        known = rib.name_facts(question.name, now)
+        return replace(known, waits=state.wait_facts(now.mono_s), is_attached=state.own_switch is not None)
 
-    answer_state(host.diagnostics, policy, gather, host.rib.parties)
+    answer_state(state.core.diagnostics, state.policy, gather, rib.parties)
 
 
 def _tunnel(row: Mapping[str, object]) -> TunnelFact:

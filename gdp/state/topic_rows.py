@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.client.participant import Topic
+from gdp.diagnosis.fields import from_fields
 from gdp.errors import DropReason, RemoteError
 
 __all__ = ["ROWS_MAX", "Direction", "TopicRow", "held_row", "rows_from_fields", "rows_to_fields"]
@@ -61,29 +62,6 @@ class TopicRow:
         """Return the row as JSON fields."""
         return {**asdict(self), "direction": self.direction.value}
 
-    @classmethod
-    def from_fields(cls, fields: object) -> TopicRow:
-        """Read JSON fields; unknown keys of a later version are ignored. Raises ``RemoteError``: they are no row."""
-        if not isinstance(fields, dict):
-            raise RemoteError(DropReason.MALFORMED, "a row that is no object")
-        try:
-            return cls(
-                name=_text(fields.get("name")),
-                direction=Direction(fields.get("direction")),
-                topic=_text(fields.get("topic", "")),
-                kind=_text(fields.get("kind", "")),
-                type=_text(fields.get("type", "")),
-                messages=_count(fields.get("messages")),
-                bytes=_count(fields.get("bytes")),
-                lost=_count(fields.get("lost")),
-                late=_count(fields.get("late")),
-                publishers=_count(fields.get("publishers")),
-                readers=_count(fields.get("readers")),
-                rights=_text(fields.get("rights", "")),
-            )
-        except ValueError as error:
-            raise RemoteError(DropReason.MALFORMED, f"a row of another form: {error}") from error
-
 
 def held_row(topic: Topic) -> TopicRow:
     """Return the row of a delegation whose name is not in use."""
@@ -118,16 +96,4 @@ def rows_from_fields(fields: Mapping[str, object]) -> tuple[float, list[TopicRow
     mono_s, rows, left_out = fields.get("mono_s"), fields.get("topics"), fields.get("left_out")
     if not isinstance(mono_s, int | float) or not isinstance(rows, list) or not isinstance(left_out, int):
         raise RemoteError(DropReason.MALFORMED, "a response about topics")
-    return float(mono_s), [TopicRow.from_fields(row) for row in rows], left_out
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"a text was expected, not {value!r:.40}")
-    return value
-
-
-def _count(value: object) -> int | None:
-    if value is None or (isinstance(value, int) and not isinstance(value, bool)):
-        return value
-    raise ValueError(f"a count was expected, not {value!r:.40}")
+    return float(mono_s), [from_fields(TopicRow, row if isinstance(row, dict) else {}) for row in rows], left_out

@@ -34,7 +34,6 @@ from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
-from gdp.diagnosis.facts import SwitchFacts, WaitFact
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -51,7 +50,6 @@ from gdp.switch.flooding import Flooding
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_facts import location_facts, reached_switches, trees_facts
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
 from gdp.switch.path_updates import PathUpdates
@@ -211,37 +209,6 @@ class SwitchCore:
         if self.rib is None:
             waits.append(Wait(WaitReason.NO_RIB))
         return waits
-
-    def name_facts(self, name: Name, now: Timestamps, waits: tuple[WaitFact, ...] = ()) -> SwitchFacts:
-        """Return what this switch knows about a name, for a diagnosis."""
-        member = self._identity.member
-        readers, branches, is_joined = trees_facts(self.multicast, name)
-        return SwitchFacts(
-            name=self.name.to_text(),
-            domain=member.domain.to_text(),
-            unix_s=now.unix_s,
-            valid_from_unix_s=float(member.not_before_unix_s),
-            valid_until_unix_s=float(member.not_after_unix_s),
-            rib="" if self.rib is None else self.rib.to_text(),
-            is_rib_silent=self.resolver.cache.serves_stale,
-            waits=waits,
-            neighbours=tuple(each.name.to_text() for each in self.hello_protocol.neighbours.all_up()),
-            proxies=tuple(
-                each.name.to_text() for each in self.hello_protocol.neighbours.all_up() if each.role is Role.PROXY
-            ),
-            reaches=reached_switches(self._paths, self._policy, self.name),
-            attached=tuple(
-                f"{each.advertisement.node.to_text()} {each.advertisement.right.value}"
-                for each in self.attached.named(name)
-            ),
-            locations=location_facts(self.resolver.cache, self._paths, self._policy, self.name, name, now.mono_s),
-            is_negative=self.resolver.cache.is_negative(name, now.mono_s),
-            readers=readers,
-            branches=branches,
-            is_joined=is_joined,
-            drops={reason.label: count for reason, count in self.drops().items() if count},
-            pending=self.resolver.pending_frames,
-        )
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""

@@ -7,9 +7,9 @@ Source: Prometheus text exposition format, version 0.0.4.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
-from typing import Final
+from typing import Final, TypeVar
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
@@ -24,7 +24,7 @@ from gdp.telemetry.sources import (
     EntryCounts,
     Gauge,
     Histogram,
-    LinkRow,
+    NeighbourRow,
     PortRow,
     Sources,
     TopicCounts,
@@ -33,6 +33,13 @@ from gdp.telemetry.sources import (
 __all__ = ["Metrics"]
 
 _ANY: Final = "any"  # an entry for every source
+_DEVICE_COUNTS: Final = {
+    "frames": "Frames at the device, of all protocols",
+    "bytes": "Their bytes",
+    "errors": "Frames with errors at the device",
+    "drops": "Frames that the device or its queue dropped",
+}
+_Family = TypeVar("_Family", CounterMetricFamily, GaugeMetricFamily)
 
 
 class Metrics(Collector):
@@ -52,8 +59,9 @@ class Metrics(Collector):
         """Read every source."""
         of = self._sources
         yield from _counter("gdp_frames", "Frames by direction", "direction", of.frames)
-        if of.drops:
-            yield from _counter("gdp_drops", "What went no further, by reason", "reason", self._drops)
+        if (drops := of.drops) is not None:
+            by_label = lambda: {reason.label: drops().get(reason, 0) for reason in DropReason}  # noqa: E731
+            yield from _counter("gdp_drops", "What went no further, by reason", "reason", by_label)
         yield from _gauge("gdp_table_entries", "Entries of the forwarding table", of.table_entries)
         yield from _entries(of.entries)
         yield from _gauge("gdp_parked_frames", "Frames waiting for an answer", of.pending_frames)
@@ -82,10 +90,6 @@ class Metrics(Collector):
         if of.latency is not None:
             yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
 
-    def _drops(self) -> Mapping[str, int]:
-        lists = [source() for source in self._sources.drops]
-        return {reason.label: sum(counts[reason] for counts in lists) for reason in DropReason}
-
     def text(self) -> str:
         """Return the text of a scrape."""
         return generate_latest(self._registry).decode()
@@ -112,87 +116,67 @@ class Metrics(Collector):
         self._server = None
 
 
+def _family(
+    kind: type[_Family], name: str, text: str, labels: Sequence[str], samples: Iterable[tuple[Sequence[str], float]]
+) -> _Family:
+    """Return a metric with its samples, each as label values and number."""
+    family = kind(name, text, labels=labels)
+    for values, number in samples:
+        family.add_metric(values, number)
+    return family
+
+
 def _counter(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:
     if source is not None:
-        family = CounterMetricFamily(name, text, labels=[label])
-        for value, count in list(source().items()):  # a copy, because the node continues to count
-            family.add_metric([value], count)
-        yield family
+        counts = list(source().items())  # a copy, because the node continues to count
+        yield _family(CounterMetricFamily, name, text, [label], (([value], count) for value, count in counts))
 
 
 def _entries(source: EntryCounts | None) -> Iterator[Metric]:
     """Return entries under short names: a whole name would let every reader of a graph request the topic."""
     if source is None:
         return
-    labels = ["destination", "source"]
-    frames = CounterMetricFamily("gdp_entry_frames", "Frames forwarded by the busiest entries", labels=labels)
-    sizes = CounterMetricFamily("gdp_entry_bytes", "Their bytes", labels=labels)
     sums: dict[tuple[str, str], tuple[int, int]] = {}
     for key, (count, size) in source().items():
         names = Name(key[:NAME_BYTES]).short, Name(key[NAME_BYTES:]).short if len(key) > NAME_BYTES else _ANY
         before = sums.get(names, (0, 0))
         sums[names] = before[0] + count, before[1] + size
-    for names, (count, size) in sums.items():
-        frames.add_metric(names, count)
-        sizes.add_metric(names, size)
-    yield frames
-    yield sizes
+    labels, text = ["destination", "source"], "Frames forwarded by the busiest entries"
+    for name, help_text, at in (("gdp_entry_frames", text, 0), ("gdp_entry_bytes", "Their bytes", 1)):
+        yield _family(CounterMetricFamily, name, help_text, labels, ((ends, sums[ends][at]) for ends in sums))
 
 
-def _links(rows: Sequence[LinkRow]) -> Iterator[Metric]:
-    labels = ["port", "neighbour"]
-    costs = GaugeMetricFamily("gdp_link_cost", "Cost of the link to a neighbour", labels=labels)
-    rtts = GaugeMetricFamily("gdp_link_rtt_seconds", "Its smoothed round-trip time", labels=labels)
-    losses = GaugeMetricFamily("gdp_link_loss", "Share of keepalives lost", labels=[*labels, "direction"])
-    for row in rows:
-        ends = [row.port, row.neighbour]
-        costs.add_metric(ends, row.cost)
-        if row.rtt_s is not None:
-            rtts.add_metric(ends, row.rtt_s)
-        losses.add_metric([*ends, "in"], row.loss_in)
-        losses.add_metric([*ends, "out"], row.loss_out)
-    yield costs
-    yield rtts
-    yield losses
+def _links(rows: Sequence[NeighbourRow]) -> Iterator[Metric]:
+    labels, ends = ["port", "neighbour"], [((row.port, row.name.short), row) for row in rows]
+    text, costs = "Cost of the link to a neighbour", [(at, row.cost) for at, row in ends]
+    yield _family(GaugeMetricFamily, "gdp_link_cost", text, labels, costs)
+    rtts = [(at, row.rtt_s) for at, row in ends if row.rtt_s is not None]
+    yield _family(GaugeMetricFamily, "gdp_link_rtt_seconds", "Its smoothed round-trip time", labels, rtts)
+    losses = [((*at, way), loss) for at, row in ends for way, loss in (("in", row.loss_in), ("out", row.loss_out))]
+    yield _family(GaugeMetricFamily, "gdp_link_loss", "Share of keepalives lost", [*labels, "direction"], losses)
 
 
 def _ports(rows: Sequence[PortRow]) -> Iterator[Metric]:
-    is_up = GaugeMetricFamily("gdp_port_up", "1: the device is on and has a carrier", labels=["port"])
-    mtus = GaugeMetricFamily("gdp_port_mtu_bytes", "Bytes of a frame after the Ethernet header", labels=["port"])
-    labels = ["port", "direction"]
-    frames = CounterMetricFamily("gdp_port_frames", "Frames at the device, of all protocols", labels=labels)
-    sizes = CounterMetricFamily("gdp_port_bytes", "Their bytes", labels=labels)
-    errors = CounterMetricFamily("gdp_port_errors", "Frames with errors at the device", labels=labels)
-    drops = CounterMetricFamily("gdp_port_drops", "Frames that the device or its queue dropped", labels=labels)
-    for row in rows:
-        is_up.add_metric([row.port], int(row.is_up))
-        mtus.add_metric([row.port], row.mtu)
-        if (counts := row.counts) is None:
-            continue
-        for family, (come, gone) in (
-            (frames, (counts.frames_in, counts.frames_out)),
-            (sizes, (counts.bytes_in, counts.bytes_out)),
-            (errors, (counts.errors_in, counts.errors_out)),
-            (drops, (counts.drops_in, counts.drops_out)),
-        ):
-            family.add_metric([row.port, "in"], come)
-            family.add_metric([row.port, "out"], gone)
-    yield from (is_up, mtus, frames, sizes, errors, drops)
+    text, up = "1: the device is on and has a carrier", [([row.port], int(row.is_up)) for row in rows]
+    yield _family(GaugeMetricFamily, "gdp_port_up", text, ["port"], up)
+    text, mtus = "Bytes of a frame after the Ethernet header", [([row.port], row.mtu) for row in rows]
+    yield _family(GaugeMetricFamily, "gdp_port_mtu_bytes", text, ["port"], mtus)
+    counted = [(row.port, row.counts) for row in rows if row.counts is not None]
+    for what, text in _DEVICE_COUNTS.items():
+        samples = [([port, way], getattr(counts, f"{what}_{way}")) for port, counts in counted for way in ("in", "out")]
+        yield _family(CounterMetricFamily, f"gdp_port_{what}", text, ["port", "direction"], samples)
 
 
 def _topics(rows: Sequence[TopicCounts]) -> Iterator[Metric]:
-    labels = ["topic", "direction"]
-    messages = CounterMetricFamily("gdp_topic_messages", "Messages of a topic that is carried now", labels=labels)
-    sizes = CounterMetricFamily("gdp_topic_bytes", "Their bytes in ROS's wire form", labels=labels)
-    lost = CounterMetricFamily("gdp_topic_lost_messages", "Messages of it that were lost", labels=labels)
-    readers = GaugeMetricFamily("gdp_topic_readers", "Its readers on the overlay", labels=["topic"])
-    for row in rows:
-        messages.add_metric([row.topic, row.direction], row.messages)
-        lost.add_metric([row.topic, row.direction], row.lost)
-        sizes.add_metric([row.topic, row.direction], row.size)
-        if row.readers is not None:
-            readers.add_metric([row.topic], row.readers)
-    yield from (messages, sizes, lost, readers)
+    for name, text, field in (
+        ("gdp_topic_messages", "Messages of a topic that is carried now", "messages"),
+        ("gdp_topic_bytes", "Their bytes in ROS's wire form", "size"),
+        ("gdp_topic_lost_messages", "Messages of it that were lost", "lost"),
+    ):
+        samples = [([row.topic, row.direction], getattr(row, field)) for row in rows]
+        yield _family(CounterMetricFamily, name, text, ["topic", "direction"], samples)
+    readers = [([row.topic], row.readers) for row in rows if row.readers is not None]
+    yield _family(GaugeMetricFamily, "gdp_topic_readers", "Its readers on the overlay", ["topic"], readers)
 
 
 def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:
@@ -202,10 +186,7 @@ def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:
 
 def _gauges(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:
     if source is not None:
-        family = GaugeMetricFamily(name, text, labels=[label])
-        for value, number in source().items():
-            family.add_metric([value], number)
-        yield family
+        yield _family(GaugeMetricFamily, name, text, [label], (([value], each) for value, each in source().items()))
 
 
 def _histogram(name: str, text: str, seen: Histogram) -> Metric:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason
+from gdp.names import ZERO, Name
 from gdp.telemetry.health import Health
 
 __all__ = [
@@ -20,11 +21,10 @@ __all__ = [
     "EntryCounts",
     "Gauge",
     "Histogram",
-    "LinkRow",
+    "NeighbourRow",
     "PortRow",
     "Sources",
     "TopicCounts",
-    "count_list",
 ]
 
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -56,26 +56,36 @@ Counts = Callable[[], Mapping[str, int]]  # label value to count
 Gauge = Callable[[], float]
 
 
-class LinkRow(NamedTuple):
-    """Link to one neighbour that is up.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NeighbourRow:
+    """One neighbour, and the link to it as it is measured now.
 
     Attributes:
         port: device name.
-        neighbour: short name.
+        label: of its membership; empty before that is known.
+        role, state: values of ``Role``, and names of ``NeighbourState`` in lower case.
+        mac: its address, 6 bytes.
+        mtu: of the link, bytes after the Ethernet header.
+        cost: what a path pays.
         rtt_s: smoothed round-trip time, seconds; None before the first measurement.
         rtt_var_s: its mean deviation.
         loss_in: share of frames lost on the way here, 0 to 1.
         loss_out: share lost on the way to the neighbour.
-        cost: what a path pays.
     """
 
     port: str
-    neighbour: str
-    rtt_s: float | None
-    rtt_var_s: float
-    loss_in: float
-    loss_out: float
-    cost: int
+    name: Name
+    label: str = ""
+    role: str = ""
+    domain: Name = ZERO
+    state: str = "up"
+    mac: bytes = b""
+    mtu: int = 0
+    cost: int = 0
+    rtt_s: float | None = None
+    rtt_var_s: float = 0.0
+    loss_in: float = 0.0
+    loss_out: float = 0.0
 
 
 class DeviceCounts(NamedTuple):
@@ -135,7 +145,7 @@ class Sources:
 
     Attributes:
         frames: by direction: in, out, forwarded, punted.
-        drops: lists of counts by ``DropReason``, added up.
+        drops: what the node dropped, by reason.
         table_entries: entries of the forwarding table.
         entries: frames and bytes forwarded by the busiest entries, by the table's key.
         pending_frames: frames that wait for a name resolution.
@@ -159,7 +169,7 @@ class Sources:
     """
 
     frames: Counts | None = None
-    drops: Sequence[Callable[[], Sequence[int]]] = ()
+    drops: Callable[[], Mapping[DropReason, int]] | None = None
     table_entries: Gauge | None = None
     entries: EntryCounts | None = None
     pending_frames: Gauge | None = None
@@ -173,15 +183,10 @@ class Sources:
     faults: Counts | None = None
     calls: Counts | None = None
     waiting: Counts | None = None
-    links: Callable[[], Sequence[LinkRow]] | None = None
+    links: Callable[[], Sequence[NeighbourRow]] | None = None
     ports: Callable[[], Sequence[PortRow]] | None = None
     topics: Callable[[], Sequence[TopicCounts]] | None = None
     health: Callable[[], Health] | None = None
     two_paths: Counts | None = None
     clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None
-
-
-def count_list(counts: Mapping[DropReason, int]) -> list[int]:
-    """Return counts by reason as a list in the order of the reasons."""
-    return [counts.get(reason, 0) for reason in DropReason]

@@ -7,31 +7,24 @@ from __future__ import annotations
 
 import logging
 import sys
-import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
-from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from gdp.errors import LocalError
-from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge, FlowChange
-from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.flow_fields import flow_fields
-from proxy.bridge.core.topic_rows import flow_rows
 from proxy.bridge.core.topic_stats import percentile
-from proxy.bridge.topic_counts import topic_counts
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
-from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
 from proxy.node.otel_tracer import open_tracer
+from proxy.node.proxy_state import described
 from proxy.node.state_answer import answer_for_proxy
-from proxy.serial.channel import Qos
 
 __all__ = ["run"]
 
@@ -54,32 +47,20 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
     """
     sys.setswitchinterval(_TURN_S)
     with run_node(settings, emit_wait if json else None) as node:
-        name = proxy_node_name(node.identity.name.to_text())
+        state, name = node.state, proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
             held = DelegationStore(settings.delegations, node.identity)
             tracer = open_tracer(settings.traces, node.identity.name, node.identity.label)
             look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
-            context = BridgeContext(node.member, node.traffic, node.faults, tracer)
-            bridge = Bridge(context, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
-            domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
-            answer_for_proxy(bridge, context, node.identity, node.policy, node.node_log.wait_facts, domains)
+            state.context = replace(state.context, tracer=tracer)
+            state.bridge = bridge = Bridge(
+                state.context, settings, endpoints, held, look_s=look_s, status_topic=settings.status
+            )
+            state.ros_domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
+            state.has_topic_names = settings.metrics is not None and settings.metrics.topic_names
+            answer_for_proxy(state, bridge)
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
-            has_names = settings.metrics is not None and settings.metrics.topic_names
-            node.topic_counts = lambda: topic_counts(bridge.flows, has_names=has_names)
-            node.best_effort = lambda: bridge.best_effort
-            node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
-            local_name = node.local_name
-            node.local_name = lambda name: _local_names(bridge).get(name) or local_name(name)
-            node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
-            node.undelegated = lambda: [_described(each) for each in bridge.undelegated]
-            node.qos = lambda: [_qos_fields(*each) for each in bridge.offered_qos]
-            node.liveliness = lambda: [each.to_fields() for each in bridge.liveliness(time.monotonic())]
-            node.unready = lambda: [{"local": local, "reason": reason} for local, reason in bridge.unready]
-            node.denied = lambda: [
-                {"side": "expose" if each.is_exposed else "import", "local": each.local, "pattern": each.pattern}
-                for each in bridge.denied
-            ]
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)
             try:
@@ -89,11 +70,11 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                     node.runtime.unwatch(endpoint)
                 tracer.close()
             best_effort = bridge.best_effort
-            say_goodbye(node, bridge)
+            node.say_goodbye(bridge)
         if json:
             sent = [stats.to_fields() for stats in best_effort]
             topics = [stats.to_fields() for stats in bridge.stats]
-            emit("done", topics=topics, best_effort_topics=sent, faults=dict(node.faults.counts))
+            emit("done", topics=topics, best_effort_topics=sent, faults=dict(state.context.faults.counts))
         else:
             for stats in bridge.stats:
                 median_ms = percentile(sorted(stats.latencies_ms), 0.5)
@@ -104,8 +85,8 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             for sent_stats in best_effort:
                 if not sent_stats.is_whole:
                     echo(f"  {sent_stats.words()}")
-            carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
-            echo(f"{carried}, {node.faults.total} faults")
+            traffic, faults = state.context.traffic, state.context.faults
+            echo(f"{traffic.messages_out} messages sent, {traffic.messages_in} received, {faults.total} faults")
 
 
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
@@ -114,11 +95,7 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
     tick_at_s = 0.0
     leave_at_s: float | None = None
     while not node.runtime.is_stopped:
-        due_s = bridge.get_timer()
-        node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
-        now_s = time.monotonic()
-        bridge.work(now_s)
-        node.member.flush(now_s)  # once for all pending messages: small ones share a seal
+        now_s = node.step(bridge, tick_at_s)
         if node.is_leaving:
             if leave_at_s is None:
                 log.info("leaving; what is under way is answered")
@@ -142,14 +119,10 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
                 _tell_progress(node, bridge)
 
 
-def _local_names(bridge: Bridge) -> dict[Name, str]:
-    return {flow_spec.name: flow_spec.local for flow_spec, _ in bridge.flows}
-
-
 def _tell_change(change: FlowChange, *, json: bool) -> None:
     """Say that a flow began or ended after the start: a node came or went, or the rules were read again."""
     text = f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}"
-    report("flow", text, json=json, change="begun" if change.is_begun else "ended", **_described(change.flow_spec))
+    report("flow", text, json=json, change="begun" if change.is_begun else "ended", **described(change.flow_spec))
 
 
 def _line(flow_spec: FlowSpec) -> str:
@@ -168,13 +141,13 @@ def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
 
 
 def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
-    stats = bridge.stats
+    stats, context = bridge.stats, node.state.context
     emit(
         "progress",
-        sent=node.traffic.messages_out,
-        received=node.traffic.messages_in,
+        sent=context.traffic.messages_out,
+        received=context.traffic.messages_in,
         flows=len(bridge.flows),
-        faults=node.faults.total,
+        faults=context.faults.total,
         lost=sum(each.lost for each in stats),
         topics=[
             {
@@ -188,24 +161,6 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
         ],
         best_effort_topics=[each.to_fields() for each in bridge.best_effort if not each.is_whole],
     )
-
-
-def _described(flow_spec: FlowSpec) -> dict[str, str]:
-    """Return the fields by which an owner recognizes a flow; metadata are left out, because a salt may be in them."""
-    return {
-        "side": "expose" if flow_spec.is_exposed else "import",
-        "kind": flow_spec.rule.kind,
-        "local": flow_spec.local,
-        "shared": flow_spec.rule.global_name_of(flow_spec.local),
-        "type": flow_spec.type_name,
-        "name": flow_spec.name.to_text(),
-    }
-
-
-def _qos_fields(flow_spec: FlowSpec, profile: Qos) -> dict[str, object]:
-    depth = min(max(profile.depth, 1), OFFERED_DEPTH_MAX)
-    policies = {"reliability": profile.reliability, "durability": profile.durability, "depth": depth}
-    return {"name": flow_spec.name.to_text(), **policies}
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -23,14 +22,10 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.flow_fields import flow_fields
-from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.doors.hub import Rights
 from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.door import DoorEndpoint
-from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
 
 __all__ = ["OpenDoor", "door_config", "run_door"]
@@ -93,7 +88,7 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
             log.warning("delegation not offered name=%s reason=%s", name, reason)
         door = open_door(lambda: state[0])
         try:
-            bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), state[0], [door], held)
+            node.state.bridge = bridge = Bridge(node.state.context, state[0], [door], held)
 
             def reload() -> None:
                 again = DelegationStore(config.delegations, node.identity)
@@ -101,30 +96,25 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
                 bridge.reload(state[0], again)
 
             node.on_reload = reload
-            node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
-            node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
             node.runtime.watch(door)
             try:
                 _work(node, bridge, door, state, json=json)
             finally:
                 node.runtime.unwatch(door)
-            say_goodbye(node, bridge)
+            node.say_goodbye(bridge)
         finally:
             door.shut_down()
-        totals = {"sent": node.traffic.messages_out, "received": node.traffic.messages_in, "dropped": door.dropped}
+        traffic = node.state.context.traffic
+        totals = {"sent": traffic.messages_out, "received": traffic.messages_in, "dropped": door.dropped}
         text = "{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals)
-        report("done", text, json=json, **totals, faults=dict(node.faults.counts))
+        report("done", text, json=json, **totals, faults=dict(node.state.context.faults.counts))
 
 
 def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorRules], *, json: bool) -> None:
     is_ready = False
     tick_at_s = 0.0
     while not node.runtime.is_stopped:
-        due_s = bridge.get_timer()
-        node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
-        now_s = time.monotonic()
-        bridge.work(now_s)
-        node.member.flush(now_s)
+        now_s = node.step(bridge, tick_at_s)
         if now_s >= tick_at_s:
             tick_at_s = now_s + _TICK_S
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:

@@ -6,7 +6,6 @@ I/O.
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Sequence
 from typing import Final
 
@@ -17,7 +16,6 @@ from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.config.config import ProxyConfig, Record
 from proxy.config.recorded import RecordedRules
-from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
 from proxy.node.recording_bridge import open_recording_bridge
 from proxy.recordings.endpoint import RecordingEndpoint
@@ -45,7 +43,7 @@ def record(settings: ProxyConfig, *, json: bool) -> bool:
         with open_recording_bridge(node, settings, rules, endpoint) as bridge:
             _work(node, bridge, writer, json=json)
             stats = bridge.stats
-            say_goodbye(node, bridge)
+            node.say_goodbye(bridge)
         unfinished = _finish(writer)
     _report(stats, writer, json=json)
     if unfinished:
@@ -90,9 +88,7 @@ def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: 
     is_ready = False
     tick_at_s = 0.0
     while not node.runtime.is_stopped:
-        due_s = bridge.get_timer()
-        node.runtime.step(max(tick_at_s if due_s is None else min(due_s, tick_at_s), time.monotonic()))
-        bridge.work(time.monotonic())
+        now_s = node.step(bridge, tick_at_s)
         if writer is not None and writer.failure:
             return
         if not is_ready and node.member.attachment.is_attached:
@@ -100,8 +96,8 @@ def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: 
             node.tell_refusals()
             name = node.member.name
             report("ready", f"proxy {name.short} is attached; Ctrl-C ends it", json=json, name=name.to_text())
-        if time.monotonic() >= tick_at_s:
-            tick_at_s = time.monotonic() + TICK_S
+        if now_s >= tick_at_s:
+            tick_at_s = now_s + TICK_S
             if writer is not None:
                 writer.flush()
             if json and is_ready:

@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from collections.abc import Iterator
 
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.node import ProxyNode, open_topics
 from proxy.node.state_answer import answer_for_proxy
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 
-__all__ = ["open_recording_bridge", "work"]
+__all__ = ["open_recording_bridge"]
 
 log = logging.getLogger(__name__)
 
@@ -36,28 +33,19 @@ def open_recording_bridge(
     """
     held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
-    context = BridgeContext(node.member, node.traffic, node.faults)
-    bridge = Bridge(context, rules, [endpoint], held)
-    answer_for_proxy(bridge, context, node.identity, node.policy, node.node_log.wait_facts)
-    node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
+    node.state.bridge = bridge = Bridge(node.state.context, rules, [endpoint], held)
+    answer_for_proxy(node.state, bridge)
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
     node.runtime.watch(endpoint)
     try:
         while bridge.get_timer() is not None:  # the first pass reads the graph, later ones the descriptions
-            work(node, bridge)
-        work(node, bridge)
+            node.work(bridge)
+        node.work(bridge)
         yield bridge
     finally:
         node.on_reload = None
         node.runtime.unwatch(endpoint)
         endpoint.shut_down()
-
-
-def work(node: ProxyNode, bridge: Bridge) -> None:
-    """Process the events of the recording and the messages of the overlay."""
-    now_s = time.monotonic()
-    bridge.work(now_s)
-    node.member.flush(now_s)
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:

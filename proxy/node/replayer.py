@@ -17,7 +17,6 @@ from proxy.bridge.bridge import Bridge
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.sent_stats import SentStats
 from proxy.node.node import ProxyNode
-from proxy.node.recording_bridge import work
 from proxy.recordings.endpoint import ReplayEndpoint
 
 __all__ = ["Pace", "Replay", "ReplayedTopic", "Unconfirmed"]
@@ -200,7 +199,7 @@ class Replay:
             if runtime.is_stopped:
                 return False
             self._endpoint.deliver(message)
-            work(self._node, self._bridge)
+            self._node.work(self._bridge)
             self._step(0.0)
         return not runtime.is_stopped
 

@@ -5,40 +5,29 @@ I/O through the bridge, which it only reads. ``gdp/state/state_answers.py`` says
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Final
 
 from gdp.control.diagnostics import Question
-from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Keyed, text
-from gdp.diagnosis.facts import ProxyFacts, WaitFact
+from gdp.diagnosis.facts import ProxyFacts
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.state.state_answers import answer_state
-from gdp.trust.domain import Policy
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.context import BridgeContext
 from proxy.bridge.name_facts import proxy_facts
+from proxy.node.proxy_state import ProxyState
 
 __all__ = ["answer_for_proxy"]
 
 _ASKED: Final = Keyed("q", text(256), absent="")
 
 
-def answer_for_proxy(
-    bridge: Bridge,
-    context: BridgeContext,
-    identity: Identity,
-    policy: Policy,
-    waits: Callable[[float], tuple[WaitFact, ...]],
-    ros_domains: tuple[int, ...] = (),
-) -> None:
+def answer_for_proxy(state: ProxyState, bridge: Bridge) -> None:
     """Answer ``state`` for a proxy.
 
     The body may have the ROS name that the asker typed (``q``). A member of another domain must state the 256-bit name.
     """
-    member, begun_s = context.member, time.monotonic()
+    member, identity, policy = state.member, state.identity, state.policy
 
     def gather(question: Question, now: Timestamps) -> ProxyFacts:
         asked = _ASKED.read(question.body)
@@ -46,14 +35,14 @@ def answer_for_proxy(
             asked = question.name.to_text() if question.name != ZERO else ""
         return proxy_facts(
             bridge,
-            context,
+            state.context,
             identity,
             asked,
             now,
-            waits=waits(now.mono_s),
-            uptime_s=max(now.mono_s - begun_s, 0.0),
+            waits=state.wait_facts(now.mono_s),
+            uptime_s=state.uptime_s(now.mono_s),
             with_known=question.asker.name == identity.name,
-            ros_domains=ros_domains,
+            ros_domains=state.ros_domains,
         )
 
     def holders(name: Name, _now_s: float) -> set[Name]:

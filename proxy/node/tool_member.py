@@ -21,14 +21,11 @@ from gdp.nodes.membership import load_member
 from gdp.stores.keyring import CARD
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
 from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.probe import Probe
 from proxy.node.door import door_config
-from proxy.node.goodbye import say_goodbye
 from proxy.node.node import run_node
 
 __all__ = ["ATTACH_S", "Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
@@ -139,10 +136,8 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
     """
     rule = access.rule if timeout_s is None else access.rule.model_copy(update={"timeout_s": timeout_s})
     with run_node(access.config) as node:
-        bridge = Bridge(
-            BridgeContext(node.member, node.traffic, node.faults), DoorRules((), [rule]), [probe], access.held
-        )
-        node.topics = lambda: flow_rows(bridge.flows, (), node.member)
+        state, bridge = node.state, Bridge(node.state.context, DoorRules((), [rule]), [probe], access.held)
+        state.bridge, state.shows_held = bridge, False
         node.on_reload = lambda: bridge.reload(
             DoorRules((), [rule]), DelegationStore(access.held.directory, node.identity)
         )
@@ -151,11 +146,7 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
         tick_at_s: float | None = attach_by_s
         try:
             while not node.runtime.is_stopped and tick_at_s is not None:
-                due_s = bridge.get_timer()
-                node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
-                now_s = time.monotonic()
-                bridge.work(now_s)
-                node.member.flush(now_s)
+                now_s = node.step(bridge, tick_at_s)
                 if node.member.attachment.is_attached:
                     tick_at_s = tick(bridge, now_s)
                 elif now_s >= attach_by_s:
@@ -163,7 +154,7 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
                     raise NoAnswerError(f"not attached on {access.config.iface} within {ATTACH_S:g} s: {waits}")
         finally:
             node.runtime.unwatch(probe)
-            say_goodbye(node, bridge)
+            node.say_goodbye(bridge)
             probe.shut_down()
 
 

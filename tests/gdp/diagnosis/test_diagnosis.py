@@ -77,7 +77,7 @@ def test_a_known_lack_is_a_fault_from_the_first_second() -> None:
     assert answer.command.startswith("gdp delegate name ")
 
 
-@pytest.mark.parametrize(("cause", "rule"), RULES, ids=lambda each: getattr(each, "value", ""))
+@pytest.mark.parametrize(("cause", "rule"), RULES.items(), ids=lambda each: getattr(each, "value", ""))
 def test_no_rule_fails_on_empty_facts(cause: Cause, rule: object) -> None:
     del rule
     answer = diagnose(Facts(asked="/a"))

@@ -119,7 +119,7 @@ def test_a_loop_beats_only_where_a_manager_listens(manager: socket.socket) -> No
 
 
 def test_the_relays_loop_calls_each_function_in_its_own_period() -> None:
-    loop, calls = RelayLoop(), list[float]()
+    loop, calls = RelayLoop(), list[object]()
     loop.every(1_000.0, calls.append)
     loop.wake_at(0.0)
     loop.step()

@@ -11,7 +11,7 @@ import pytest
 from gdp.errors import DropReason
 from gdp.nodes.audit import NodeAudit, audit_folder
 from gdp.sansio import Timestamps
-from gdp.stores.audit_log import verify_audit
+from gdp.stores.audit_log import AuditLog, verify_audit
 from gdp.trust.audit import AuditTrail
 
 
@@ -26,7 +26,7 @@ def test_a_node_audits_in_the_configured_folder_or_where_systemd_keeps_state(mon
 
 def test_refused_statements_are_counted_and_losses_on_the_way_are_not(tmp_path: Path) -> None:
     drops: Counter[DropReason] = Counter()
-    audit = NodeAudit(tmp_path / "audit", AuditTrail(), lambda: drops)
+    audit = NodeAudit(AuditLog(tmp_path / "audit"), AuditTrail(), lambda: drops)
     for second in range(5):
         drops[DropReason.BAD_SIGNATURE] += 100_000
         drops[DropReason.NO_READER] += 1
@@ -40,7 +40,7 @@ def test_a_folder_that_is_gone_is_reported_once_and_the_node_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     drops: Counter[DropReason] = Counter()
-    audit = NodeAudit(tmp_path / "audit", AuditTrail(), lambda: drops)
+    audit = NodeAudit(AuditLog(tmp_path / "audit"), AuditTrail(), lambda: drops)
     (tmp_path / "audit").rmdir()
     for second in range(3):
         drops[DropReason.REPLAYED] += 1

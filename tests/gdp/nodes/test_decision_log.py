@@ -9,19 +9,18 @@ import pytest
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.nodes.decision_log import DecisionLog
-from gdp.ports.plane import Port
 from gdp.sansio import Timestamps
 from gdp.switch.table import Table
 
 _NOW = Timestamps(1.0, 1.0)
-_PORTS = {3: Port(3, "eth0", bytes(6), 1500, up=True)}
+_IFNAMES = {3: "eth0"}
 _NAME = bytes(range(32))
 
 
 def test_routes_are_logged_when_they_change_with_device_names(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     table = Table()
-    decisions = DecisionLog(_PORTS, [], table)
+    decisions = DecisionLog(_IFNAMES.__getitem__, dict, table)
     table.install(_NAME, ((3, bytes(12)),), 10.0)
     decisions.log_changes(_NOW)
     decisions.log_changes(_NOW)
@@ -39,10 +38,10 @@ def test_routes_are_logged_when_they_change_with_device_names(caplog: pytest.Log
 
 def test_drops_are_logged_by_reason_when_there_are_more(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
-    counts = [0] * len(DropReason)
-    decisions = DecisionLog({}, [lambda: counts, lambda: counts])
+    counts = dict.fromkeys(DropReason, 0)
+    decisions = DecisionLog(_IFNAMES.__getitem__, lambda: counts)
     decisions.log_changes(_NOW)
-    counts[DropReason.WRONG_DOMAIN] = 2
+    counts[DropReason.WRONG_DOMAIN] = 4
     decisions.log_changes(_NOW)
     decisions.log_changes(_NOW)
     assert caplog.messages == ["dropped reason=wrong-domain frames=4 total=4"]

@@ -16,6 +16,7 @@ from gdp.state.control_protocol import Respond, Response
 from gdp.state.diagnostic_control import DiagnosticCommands, as_json
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
+from tests.gdp.state.memory_states import switch_state
 
 ROWS = [{"number": number, "name": bytes([number % 256]) * 32, "none": None} for number in range(450)]
 
@@ -35,12 +36,7 @@ def world() -> Simulation:
 def commands(world: Simulation) -> DiagnosticCommands:
     """Return the handlers of the switch ``one``."""
     return DiagnosticCommands(
-        diagnostics=world.switches["one"].diagnostics,
-        policy=world.policy("lab"),
-        own_switch=lambda: world.switches["one"].name,
-        now=lambda: world.network.now,
-        tables={"rows": lambda _now: ROWS},
-        role="switch",
+        state=switch_state(world, "one"), now=lambda: world.network.now, tables={"rows": lambda _now: ROWS}
     )
 
 

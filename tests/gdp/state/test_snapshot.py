@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 from gdp.control.link_state import Scope
-from gdp.ports.port_counters import PortCounters
 from gdp.state.snapshot import (
     ID_CHARS,
     member_snapshot,
@@ -19,6 +18,7 @@ from gdp.state.snapshot import (
 from gdp.telemetry.sources import Sources
 from gdp.trust.right import Right
 from lab.simulation import Simulation
+from tests.gdp.state.memory_states import member_state, switch_state
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
 
@@ -30,7 +30,7 @@ def ends_of(flow: Flow) -> tuple[str, str, str]:
 
 def snapshots(world: Simulation) -> dict[str, Any]:
     """Return the snapshot of every switch, by its label."""
-    return {label: json.loads(json.dumps(switch_snapshot(each, [], {}))) for label, each in world.switches.items()}
+    return {label: json.loads(json.dumps(switch_snapshot(switch_state(world, label)))) for label in world.switches}
 
 
 def test_the_trees_of_all_switches_lead_from_the_publisher_to_the_reader() -> None:
@@ -104,10 +104,10 @@ def test_a_snapshot_holds_no_whole_name() -> None:
 
 def test_every_node_shows_its_domain_and_its_drops_by_reason() -> None:
     world = ring()
-    identity = world.identities[ROBOT]
-    shown: Any = node_snapshot(identity, Sources(drops=[lambda: [0, 3, *[0] * 200]]), uptime_s=1.0)
-    assert (shown["role"], shown["domain_label"]) == ("proxy", identity.root.label)
-    assert list(shown["drops"].values()) == [3]
+    state = member_state(world, ROBOT)
+    shown: Any = node_snapshot(state, Sources(), state.begun_s + 1.0)
+    assert (shown["role"], shown["domain_label"], shown["uptime_s"]) == ("proxy", state.identity.root.label, 1.0)
+    assert list(shown["drops"].values()) == [2]
 
 
 def test_a_rib_shows_how_many_routes_it_has() -> None:
@@ -117,12 +117,3 @@ def test_a_rib_shows_how_many_routes_it_has() -> None:
         assert shown["routes"] == host.rib.names
         assert shown["switch"] is None
     flow.outlive()
-
-
-def test_byte_counters_of_devices_are_read_again_and_again() -> None:
-    counters = PortCounters()
-    first = counters.read()
-    assert all(after[0] >= first[device][0] for device, after in counters.read().items() if device in first)
-    assert "lo" in first
-    counters.close()
-    assert counters.read() == {}

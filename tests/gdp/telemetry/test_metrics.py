@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 from urllib.request import urlopen
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from gdp.errors import DROP_COUNTERS, DropReason, LocalError
 from gdp.names import Name
 from gdp.telemetry.metrics import Metrics
-from gdp.telemetry.sources import DeviceCounts, Histogram, LinkRow, PortRow, Sources, TopicCounts
+from gdp.telemetry.sources import DeviceCounts, Histogram, NeighbourRow, PortRow, Sources, TopicCounts
 
 
 def drops(**counts: int) -> list[int]:
@@ -34,8 +35,9 @@ def test_frames_are_counted_by_direction() -> None:
     assert 'gdp_frames_total{direction="out"} 2.0' in text
 
 
-def test_drops_of_several_lists_are_added_by_reason() -> None:
-    text = Metrics(Sources(drops=[lambda: drops(TRUNCATED=1), lambda: drops(TRUNCATED=2, NO_ROUTE=5)])).text()
+def test_drops_are_counted_by_reason_and_those_that_did_not_occur_are_zero() -> None:
+    counts = {DropReason.TRUNCATED: 3, DropReason.NO_ROUTE: 5}
+    text = Metrics(Sources(drops=lambda: counts)).text()
     assert 'gdp_drops_total{reason="truncated"} 3.0' in text
     assert 'gdp_drops_total{reason="no-route"} 5.0' in text
     assert text.count("gdp_drops_total{") == len(DropReason)
@@ -140,14 +142,16 @@ def test_entries_are_reported_by_short_names_and_those_that_look_alike_together(
 
 
 def test_each_link_shows_its_cost_its_round_trip_time_and_its_loss() -> None:
-    slow = LinkRow("wg0", "abcd", 0.02, 0.001, 0.25, 0.5, 30)
-    text = Metrics(Sources(links=lambda: [slow, slow._replace(port="wg1", rtt_s=None, cost=100)])).text()
+    slow = NeighbourRow(
+        port="wg0", name=Name(b"\xab" * 32), cost=30, rtt_s=0.02, rtt_var_s=0.001, loss_in=0.25, loss_out=0.5
+    )
+    text = Metrics(Sources(links=lambda: [slow, replace(slow, port="wg1", rtt_s=None, cost=100)])).text()
     for line in (
-        'gdp_link_cost{neighbour="abcd",port="wg0"} 30.0',
-        'gdp_link_cost{neighbour="abcd",port="wg1"} 100.0',
-        'gdp_link_rtt_seconds{neighbour="abcd",port="wg0"} 0.02',
-        'gdp_link_loss{direction="in",neighbour="abcd",port="wg0"} 0.25',
-        'gdp_link_loss{direction="out",neighbour="abcd",port="wg0"} 0.5',
+        'gdp_link_cost{neighbour="aba…bab",port="wg0"} 30.0',
+        'gdp_link_cost{neighbour="aba…bab",port="wg1"} 100.0',
+        'gdp_link_rtt_seconds{neighbour="aba…bab",port="wg0"} 0.02',
+        'gdp_link_loss{direction="in",neighbour="aba…bab",port="wg0"} 0.25',
+        'gdp_link_loss{direction="out",neighbour="aba…bab",port="wg0"} 0.5',
     ):
         assert line in text.splitlines()
     assert text.count("gdp_link_rtt_seconds{") == 1

@@ -27,10 +27,13 @@ from gdp.diagnosis.fields import from_fields, to_fields
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.state.node_state import SwitchState
 from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state
+from gdp.state.switch_facts import switch_facts
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.name_facts import proxy_facts
 from proxy.serial.channel import Qos
+from tests.gdp.state.memory_states import rib_state, switch_state
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import Ear, Machine, Sites
 from tests.proxy.endpoints.fake import Publication
@@ -176,11 +179,10 @@ class Stage:
         world = self.sites.world
         for machine in self.sites.machines:
             self._answer_for(machine)
-        for label, switch in world.switches.items():
-            waits = partial(self._waits_of, label)
-            answer_for_switch(switch, switch._policy, waits, world.network.now.mono_s - self.uptime_s)
-        for host in world.ribs.values():
-            answer_for_rib(host, host.rib._policy, lambda _: ())
+        for label in world.switches:
+            answer_for_switch(self._state_of(label))
+        for label in world.ribs:
+            answer_for_rib(rib_state(world, label))
 
     def _answer_for(self, machine: Machine) -> None:
         def gather(question: Question, _now: Timestamps) -> ProxyFacts:
@@ -193,9 +195,10 @@ class Stage:
 
         answer_state(member.diagnostics, member.attachment._policy, gather, holders)
 
-    def _waits_of(self, label: str, now_s: float) -> tuple[WaitFact, ...]:
-        switch = self.sites.world.switches[label]
-        return tuple(wait_fact(wait, _port(wait.port)) for wait in switch.waits(self._edges(label), now_s))
+    def _state_of(self, label: str) -> SwitchState:
+        state = switch_state(self.sites.world, label, begun_s=self.sites.now_s - self.uptime_s)
+        state.unwaited = partial(frozenset, self._edges(label))
+        return state
 
     def facts(self, asked: str, at: str) -> Facts:
         """Return the facts of all nodes that run, through their JSON form."""
@@ -226,8 +229,7 @@ class Stage:
         return replace(from_fields(ProxyFacts, to_fields(known)), is_near=is_near)
 
     def _switch(self, label: str, name: Name, at: str) -> SwitchFacts:
-        switch, now = self.sites.world.switches[label], self.sites.world.network.now
-        known = switch.name_facts(name, now, self._waits_of(label, now.mono_s))
+        known = switch_facts(self._state_of(label), name, self.sites.world.network.now)
         return replace(from_fields(SwitchFacts, to_fields(known)), is_near=at.startswith(f"{label}/"))
 
     def _edges(self, label: str) -> list[int]:
@@ -238,10 +240,6 @@ class Stage:
     def _rib(self, label: str, name: Name) -> RibFacts:
         known = self.sites.world.ribs[label].rib.name_facts(name, self.sites.world.network.now)
         return from_fields(RibFacts, to_fields(known))
-
-
-def _port(port: int | None) -> str:
-    return "" if port is None else f"eth{port}"
 
 
 def unreachable(role: str, where: str) -> tuple[Unreachable, ...]:

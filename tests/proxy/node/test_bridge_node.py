@@ -9,7 +9,8 @@ from typing import cast
 
 import pytest
 
-from proxy.node import bridge_node
+from gdp.runtime.runtime import Runtime
+from proxy.node import bridge_node, node
 from proxy.node.node import ProxyNode
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
@@ -29,24 +30,28 @@ class Steps:
         self.sites.run(0.01)
 
 
+class Leaving(ProxyNode):
+    """Node in virtual time that has been asked to leave."""
+
+    def __init__(self, sites: Sites, machine: Machine) -> None:
+        self.member, self.runtime = machine.member, cast(Runtime, Steps(sites))
+        self.is_leaving, self.has_drained = True, False
+
+    def tell_refusals(self) -> None:
+        """Log nothing."""
+
+
 def leave(sites: Sites, machine: Machine) -> float:
     """Run a machine's loop after a SIGUSR1; return how many seconds it took to end."""
     began_s = sites.now_s
-    node = SimpleNamespace(
-        member=machine.member,
-        runtime=Steps(sites),
-        is_leaving=True,
-        faults=machine.context.faults,
-        tell_refusals=lambda: None,
-    )
-    bridge_node._work(cast(ProxyNode, node), machine.bridge, json=True)
+    bridge_node._work(Leaving(sites, machine), machine.bridge, json=True)
     return sites.now_s - began_s
 
 
 @pytest.fixture
 def sites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sites:
     sites = Sites(tmp_path)
-    monkeypatch.setattr(bridge_node, "time", SimpleNamespace(monotonic=lambda: sites.now_s))
+    monkeypatch.setattr(node, "time", SimpleNamespace(monotonic=lambda: sites.now_s))
     monkeypatch.setattr(bridge_node, "_tell_ready", lambda *_, json: None)
     monkeypatch.setattr(bridge_node, "_tell_progress", lambda *_: None)
     return sites

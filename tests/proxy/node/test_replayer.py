@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
 from proxy.bridge.sent_stats import SentStats
 from proxy.cli.replay import _report
-from proxy.node import recording_bridge, replayer
+from proxy.node import node as proxy_node
+from proxy.node import replayer
 from proxy.node.node import ProxyNode
 from proxy.node.replayer import Pace, Replay
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
@@ -48,7 +49,7 @@ def sites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sites:
     sites = Sites(tmp_path)
     clock = SimpleNamespace(monotonic=lambda: sites.now_s)
     monkeypatch.setattr(replayer, "time", clock)
-    monkeypatch.setattr(recording_bridge, "time", clock)
+    monkeypatch.setattr(proxy_node, "time", clock)
     return sites
 
 
@@ -70,7 +71,8 @@ def replayed(sites: Sites, reader: BagReader, rule: str, loss: float = 0.0) -> t
     robot = join(sites, ROBOT, endpoint, expose=[rule])
     server = join(sites, SERVER, RecordingEndpoint(None, [("/chatter", STRING)]), imports=[CHATTER])
     assert sites.run(3, robot.is_read)
-    node = cast(ProxyNode, SimpleNamespace(member=robot.member, runtime=Runtime(sites)))
+    node = ProxyNode.__new__(ProxyNode)  # without files and devices
+    node.member, node.runtime = robot.member, cast(Any, Runtime(sites))
     replay = Replay(node, robot.bridge, endpoint, 1.0, lambda: None)
     sites.world.leads[SERVER].loss = loss
     assert replay.run()
