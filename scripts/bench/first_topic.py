@@ -26,7 +26,7 @@ from skeleton import Options, Outcome, command_line, new_run, run_bench
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 from internet.access import Access
-from internet.fresh_machine import FreshMachine, Shell, TypedCommand, typed_commands
+from internet.fresh_machine import FreshMachine, TypedCommand, typed_commands
 from internet.laboratory import Laboratory
 from lab.process import FailedError, LabProcess
 
@@ -66,14 +66,14 @@ class Tutorial:
             self._wait(command, shell)
         except LocalError as error:
             raise FailedError(f"{command.machine}: {command.text}: {error}") from error
-        self._tokens += _TOKEN.findall(shell.text)
+        self._tokens += _TOKEN.findall(shell.logged)
 
-    def _wait(self, command: TypedCommand, shell: Shell) -> None:
+    def _wait(self, command: TypedCommand, shell: LabProcess) -> None:
         done = next((words for start, words in _DONE.items() if command.text.startswith(start)), "")
         if done:
-            shell.wait_for(done, _PATIENCE_S)
+            shell.until_logged(done, patience_s=_PATIENCE_S)
         else:
-            shell.wait(_PATIENCE_S)
+            shell.output(_PATIENCE_S)
 
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
@@ -111,8 +111,7 @@ def _follow(commands: Sequence[TypedCommand], runs: RunRegistry) -> Mapping[str,
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
             settings = [_ENDPOINT, role, json.dumps({"topic": TOPIC})]
-            argv = tutorial.machines[label].command([sys.executable, *settings])
-            nodes[role] = stack.enter_context(LabProcess(run, role, argv))
+            nodes[role] = tutorial.machines[label].launch([sys.executable, *settings], role)
             nodes[role].read(_PATIENCE_S)
         begun_s = at_s = time.monotonic()
         for each in commands:

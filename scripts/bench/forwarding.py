@@ -24,15 +24,15 @@ from typing import Final
 
 from forwarding_end import SINK, SOURCE
 from plot import Panel, panel_of
-from pyroute2 import IPRoute
 from report import Rounds, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab, add_bridge, mac_addresses
 
 from gdp.frame.codec import OVERHEAD_BYTES, Header, encode
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.limits import HOPS_MAX
+from lab.machines import Lab
+from lab.namespaces import add_bridge, mac_addresses, remove_link
 from lab.process import FailedError, LabProcess, figures_of, floats_of
 from lab.topology import chain
 
@@ -103,7 +103,7 @@ class Row(Lab):
         with ExitStack() as undo:
             for node in self.topology.nodes[1:-1]:
                 self.inside(node, partial(add_bridge, _BRIDGE, self._devices(node)))
-                undo.callback(self.inside, node, _remove_bridge)
+                undo.callback(self.inside, node, partial(remove_link, _BRIDGE))
             frames = self._frames(4)
             self.round_trips(frames, _WARM_UP_PINGS)
             yield frames
@@ -146,11 +146,6 @@ class Row(Lab):
 
     def _worker(self, node: str, role: str, **settings: object) -> LabProcess:
         return self.start(node, role, ["-m", "forwarding_end", role, json.dumps(settings)], has_orders=True)
-
-
-def _remove_bridge() -> None:
-    with IPRoute() as here:
-        here.link("del", index=here.link_lookup(ifname=_BRIDGE)[0])
 
 
 def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> dict[str, float]:

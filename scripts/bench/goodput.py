@@ -16,7 +16,6 @@ from typing import Final
 
 from report import Rounds
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab
 from thin_link.conditions import LOSSES, Conditions
 from thin_link.line import thin_link_lab
 from thin_link.systems import SYSTEMS
@@ -24,6 +23,7 @@ from thin_link.traffic import CAMERA_BYTES, RELIABLE, streams
 from uplink import OURS, exchange
 
 from gdp.host.run_registry import RunRegistry
+from lab.machines import Lab
 
 GOODPUT, SHARE, LATE = "goodput, Mbit/s", "link share", "relay late p99, ms"
 ROWS: Final = (OURS, "zenoh-tls-block", "zenoh-quic-block")

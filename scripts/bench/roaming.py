@@ -45,7 +45,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         homes = [laboratory.add_site(f"home{number}", Access.PORT_RESTRICTED) for number in (1, 2)]
         robot = laboratory.add_host("robot", homes[0])
         server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-        overlay = stack.enter_context(Overlay(laboratory))
+        overlay = Overlay(laboratory)
         flow = _start(overlay, stack, (border, robot, server))
         for what, act in _events(robot, homes).items():
             silences = []

@@ -31,11 +31,12 @@ from itertools import pairwise
 from typing import Final, Literal
 
 from machine import processor_s
-from testbed import Lab, OverlayNodes, add_address, add_bridge
 
 from gdp.host.run_registry import Run
 from lab import credentials
 from lab.dds import BUFFER_BYTES, ros_environment
+from lab.machines import BenchNodes, Lab
+from lab.namespaces import add_address, add_bridge
 from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 from proxy.config.config import Encoding
@@ -112,8 +113,8 @@ class Row:
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
             self._lab.inside(self._machines[side], partial(add_address, device, _ADDRESSES[side]))
         with ExitStack() as undo:
-            self._nodes = OverlayNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
-            undo.callback(self._nodes.close)
+            nodes = BenchNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
+            self._nodes = undo.enter_context(nodes)
             proxies = []
             for side, node in self._machines.items():
                 argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]

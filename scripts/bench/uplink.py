@@ -30,7 +30,6 @@ from machine import DATA, RefusedError
 from plot import Panel, panel_of
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
@@ -40,6 +39,7 @@ from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
+from lab.machines import Lab
 from lab.process import FailedError
 
 OURS: Final = "gdp"

@@ -96,7 +96,7 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 
     Raises ``FailedError``: the second path does not come up.
     """
-    overlay = stack.enter_context(Overlay(laboratory))
+    overlay = Overlay(laboratory)
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     homes = [laboratory.add_site(each, Access.PORT_RESTRICTED) for each in UPLINKS]
     robot = laboratory.add_host("robot", homes[0], UPLINKS[0])

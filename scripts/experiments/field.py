@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from testbed import Lab, OverlayNodes
 
 from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import ros_environment
+from lab.machines import BenchNodes, Lab
 from lab.process import LabProcess
 from lab.topology import Topology, flat_topology
 
@@ -154,8 +154,7 @@ class Field:
             for machine, seconds in (delays or {}).items():
                 relay = ["-c", _RELAY, _GATE, machine, str(1e3 * seconds)]
                 undo.enter_context(self._lab.start(self._relays[machine], "relay", relay)).read_line(READY_S)
-            self._nodes = OverlayNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S)
-            undo.callback(self._nodes.close)
+            self._nodes = undo.enter_context(BenchNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S))
             self.data_plane = ", ".join(sorted(self._nodes.planes))
             argv = ["-m", "proxy.cli.proxy", "--config", self._admit(ROBOT, served)]
             robot = undo.enter_context(self.process(ROBOT, "proxy", argv))

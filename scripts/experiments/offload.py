@@ -30,10 +30,10 @@ from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
 from skeleton import Options, new_run
 
 from gdp.host.cgroups import Cgroup
+from lab.cores import CORES_HELP, cores_of
 from lab.process import LabProcess
 from lab.topology import LEFT, RIGHT, ring5
 from proxy.config.config import Encoding
-from ring.cores import CORES_HELP, cores_of
 
 CONTENDERS: Final = {CYCLONE: "cyclone", FAST: "fast", JSON: "fast", CDR: "fast"}  # with the middleware of its ends
 ENCODINGS: Final[Mapping[str, Encoding]] = {JSON: "json", CDR: "cdr"}

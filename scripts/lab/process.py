@@ -96,6 +96,7 @@ class LabProcess:
         home = Path() if run is None else run.directory
         self.log = log or home / f"{label.replace(' ', '-')}.log"
         self._unread = b""
+        self.is_silent = not heard  # it prints nothing more
         with self.log.open("ab") as errors:
             self._log_from = errors.tell()
             self._process = subprocess.Popen(
@@ -150,11 +151,17 @@ class LabProcess:
                 self._process.wait(_CLOSE_S)
 
     def reap(self, timeout_s: float | None = None) -> str:
-        """Return, when the process has ended, what it printed and nothing has read; harmless where it was called."""
-        if self._process.stdout is None or self._process.stdout.closed:
-            self._process.wait(timeout_s)
-            return ""
-        printed, _ = self._process.communicate(timeout=timeout_s)
+        """Return, when the process has ended, what it printed and nothing has read; harmless where it was called.
+
+        Raises ``FailedError``: it goes on after this time.
+        """
+        try:
+            if self._process.stdout is None or self._process.stdout.closed:
+                self._process.wait(timeout_s)
+                return ""
+            printed, _ = self._process.communicate(timeout=timeout_s)
+        except subprocess.TimeoutExpired as error:
+            raise self.failed(f"still runs after {timeout_s:g} s") from error
         return (self._unread + printed).decode(errors="replace")
 
     def output(self, patience_s: float = _FINISH_S) -> str:
@@ -197,14 +204,26 @@ class LabProcess:
 
     def has_line(self, patience_s: float) -> bool:
         """Return whether a line is ready, or arrives in time; raises as ``read`` where none can arrive."""
-        assert self._process.stdout is not None
-        descriptor = self._process.stdout.fileno()
-        if b"\n" not in self._unread and readable([descriptor], patience_s):
-            part = os.read(descriptor, 1 << 16)
+        if b"\n" not in self._unread and readable([self], patience_s):
+            part = os.read(self.fileno(), 1 << 16)
             if not part:
                 raise self.failed("ended")
             self._unread += part
         return b"\n" in self._unread
+
+    def fileno(self) -> int:
+        """Return the descriptor of what it prints."""
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def take_lines(self) -> list[str]:
+        """Return the lines that it has printed since the last call; waits for none."""
+        while not self.is_silent and readable([self], 0.0):
+            part = os.read(self.fileno(), 1 << 16)
+            self._unread += part
+            self.is_silent = not part
+        *lines, self._unread = self._unread.split(b"\n")
+        return [line.decode(errors="replace") for line in lines]
 
     def read_line(self, patience_s: float) -> bytes:
         """Return the next line that it prints, of any content; raises as ``read``."""

@@ -158,7 +158,7 @@ class Zygote:
                 return cls(pid, ours)
             environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
             theirs.set_inheritable(True)
-            words = [sys.executable, "-m", "lab.zygote", str(theirs.fileno()), _PLACE_OF_NAME]
+            words = [sys.executable, __file__, str(theirs.fileno()), _PLACE_OF_NAME]
             return cls(os.posix_spawn(sys.executable, words, environment), ours)
 
     def fork(self, request: Request, descriptors: Sequence[int]) -> int:
@@ -257,6 +257,7 @@ class Popen(subprocess.Popen):  # type: ignore[type-arg]
 def main() -> None:
     """Import the project, then fork programs until the caller closes its end of the socket."""
     path = sys.path[1:]
+    sys.path[:1] = [str(ROOT), str(ROOT / "scripts")]  # of this copy, also where the interpreter has another installed
     link = socket.socket(fileno=int(sys.argv[1]))
     for module in _PRELOADED:
         importlib.import_module(module)

@@ -7,7 +7,7 @@ Sans-I/O. All seconds count from the time at which the first message may be sent
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, cast, get_args
 
@@ -175,7 +175,7 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
     down: set[frozenset[str]] = set()
     dead: set[str] = set()
     newest: Fault | None = None
-    for fault, begins in _moments(faults):
+    for _, fault, begins in moments(faults):
         if isinstance(fault, Roam):
             if places[fault.who] == fault.to:
                 raise LocalError(f"{fault}: {fault.who} is at {fault.to} already")
@@ -201,13 +201,13 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
         )
 
 
-def _moments(faults: Iterable[Fault]) -> Iterator[tuple[Fault, bool]]:
-    """Yield the fault events in order of time, as (fault, whether it begins)."""
-    moments = [(fault.after_s, fault, True) for fault in faults]
-    moments += [
+def moments(faults: Iterable[Fault]) -> list[tuple[float, Fault, bool]]:
+    """Return the fault events in order of time, as (seconds, fault, whether it begins)."""
+    found = [(fault.after_s, fault, True) for fault in faults]
+    found += [
         (fault.until_s, fault, False) for fault in faults if not isinstance(fault, Roam) and fault.until_s is not None
     ]
-    return ((fault, begins) for _, fault, begins in sorted(moments, key=lambda each: each[0]))
+    return sorted(found, key=lambda each: each[0])
 
 
 def _reached(topology: Topology, start: str, down: set[frozenset[str]], dead: set[str]) -> set[str]:

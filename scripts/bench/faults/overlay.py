@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Final
 
 from pyroute2 import IPRoute
-from testbed import Lab, received, set_link
 
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
@@ -32,6 +31,8 @@ from gdp.stores.keyring import load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
+from lab.machines import Lab
+from lab.namespaces import received, set_link
 from lab.process import FailedError, LabProcess, end_processes
 
 READY_S: Final = 60.0
@@ -129,7 +130,7 @@ class Overlay:
             argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
-        self._processes[who] = self._lab.start(node, f"{role} {incarnation_id}", argv)
+        self._processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
 
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
@@ -145,9 +146,7 @@ class Overlay:
     def kill(self, who: str) -> None:
         """Kill a process at once (SIGKILL)."""
         self._frozen.discard(who)
-        process = self._processes.pop(who)
-        os.kill(process.pid, signal.SIGKILL)
-        process.__exit__(None, None, None)
+        self._processes.pop(who).kill_group()
 
     def is_running(self, who: str) -> bool:
         """Return whether a process was started and not killed; it may have ended by itself."""
@@ -218,7 +217,7 @@ class Overlay:
         """Yield each incarnation of a process, and its whole log."""
         for incarnation_id in range(1, self._incarnation_ids.get(who, 0) + 1):
             role, _, node = who.partition(" ")
-            path = self.directory / f"{role}-{incarnation_id}-at-{node}.log"
+            path = self.directory / f"{role}-{incarnation_id}-{node}.log"
             yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
 
     # links
@@ -268,11 +267,7 @@ class Overlay:
 
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
-        there = os.open(self.spaces[to].path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self._lab.inside(self._at[mover], partial(set_link, mover, net_ns_fd=there))
-        finally:
-            os.close(there)
+        self.spaces[self._at[mover]].move(mover, self.spaces[to])
         self._lab.inside(to, partial(set_link, mover, state="up"))
         self._at[mover] = to
 

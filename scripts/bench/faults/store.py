@@ -18,16 +18,14 @@ from pathlib import Path
 from typing import Final
 
 import yaml
-from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
-from testbed import add_address, add_bridge, set_link
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
-from lab.namespaces import Namespace, Namespaces
+from lab.namespaces import Namespace, Namespaces, add_address, add_bridge, set_link
 from lab.process import FailedError, until
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
@@ -140,11 +138,8 @@ class StoreCluster:
         return int((self._folder / str(number) / "server.pid").read_text(encoding="ascii"))
 
     def _join(self, rib: Namespace, ifname: str, address: str) -> None:
-        there = os.open(rib.path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self._namespace.inside(partial(_plug, ifname, there))
-        finally:
-            os.close(there)
+        self._namespace.join(rib, {"ifname": ifname}, {"ifname": _IFNAME})
+        self._namespace.inside(partial(set_link, ifname, state="up", master=_BRIDGE))
         rib.inside(partial(add_address, _IFNAME, address))
         rib.inside(partial(set_link, _IFNAME, state="up"))
 
@@ -165,13 +160,6 @@ def _program() -> str | None:
     """Return the server program that ``start_cluster.sh`` also starts, or None."""
     kinds = (kind for kind in _KINDS if shutil.which(f"{kind}-cli"))
     return next((program for kind in kinds if (program := shutil.which(f"{kind}-server"))), None)
-
-
-def _plug(ifname: str, namespace: int) -> None:
-    with IPRoute() as here:
-        here.link("add", kind="veth", ifname=ifname, peer={"ifname": _IFNAME, "net_ns_fd": namespace})
-        index = here.link_lookup(ifname=ifname)[0]
-        here.link("set", index=index, state="up", master=here.link_lookup(ifname=_BRIDGE)[0])
 
 
 def _port(conf: Path) -> int:

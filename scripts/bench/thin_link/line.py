@@ -14,9 +14,10 @@ from functools import partial
 from typing import Any, Final
 
 from machine import clear_offloads
-from testbed import Lab, add_address, add_neighbour, mac_addresses
 
 from gdp.host.run_registry import Run
+from lab.machines import Lab
+from lab.namespaces import add_address, add_neighbour, mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions
