@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gdp.errors import GdpError
 from gdp.host.processes import Process, end_all
@@ -32,6 +32,7 @@ _ANSWER_S: Final = 600.0
 _FINISH_S: Final = 60.0
 _PAUSE_S: Final = 0.02
 
+Event = dict[str, Any]  # a line of JSON by which a process reports
 T = TypeVar("T")
 _ProcessT = TypeVar("_ProcessT", bound="LabProcess")
 
@@ -176,14 +177,12 @@ class LabProcess:
         self.send(number)
         return self.reap(patience_s)
 
-    def read(self, patience_s: float) -> dict[str, object]:
+    def read(self, patience_s: float) -> Event:
         """Return the next line that it prints, a JSON object.
 
         Raises ``FailedError``: it ended, or printed nothing in time, or a reason why it refuses, or something else.
         """
-        said = json.loads(self.read_line(patience_s))
-        if not isinstance(said, dict):
-            raise FailedError(f"{self.label} said {said!r}")
+        said = self._event(self.read_line(patience_s))
         if "refused_because" in said:
             raise FailedError(str(said["refused_because"]))
         return said
@@ -216,14 +215,24 @@ class LabProcess:
         assert self._process.stdout is not None
         return self._process.stdout.fileno()
 
-    def take_lines(self) -> list[str]:
-        """Return the lines that it has printed since the last call; waits for none."""
+    def take_events(self) -> list[Event]:
+        """Return what it has reported since the last call; waits for nothing. Raises ``FailedError``: as ``read``."""
         while not self.is_silent and readable([self], 0.0):
             part = os.read(self.fileno(), 1 << 16)
             self._unread += part
             self.is_silent = not part
         *lines, self._unread = self._unread.split(b"\n")
-        return [line.decode(errors="replace") for line in lines]
+        return [self._event(line) for line in lines]
+
+    def _event(self, line: bytes) -> Event:
+        """Return what a line reports. Raises ``FailedError``: it is no JSON object."""
+        try:
+            said: object = json.loads(line)
+        except ValueError:
+            said = None
+        if not isinstance(said, dict):
+            raise FailedError(f"{self.label} said {line.decode(errors='replace')[:_REASON_CHARS]!r}")
+        return said
 
     def read_line(self, patience_s: float) -> bytes:
         """Return the next line that it prints, of any content; raises as ``read``."""

@@ -12,8 +12,7 @@ from collections.abc import Callable, Collection
 from typing import Final
 
 from gdp.ports.readiness import readable
-from lab.events import Event
-from lab.process import FailedError, LabProcess
+from lab.process import Event, FailedError, LabProcess
 
 READY_S: Final = 60.0
 _TAIL_LINES: Final = 12
@@ -72,7 +71,7 @@ class Supervisor:
 
         def note(_: LabProcess, event: Event) -> None:
             """Keep the event that is waited for."""
-            found.extend([event] if event.name == name else [])
+            found.extend([event] if event["event"] == name else [])
 
         if not self.follow([process], lambda: bool(found) or self.is_over(process), note, patience_s):
             raise failed(process, f"did not say {name!r} within {patience_s:g} s")
@@ -99,7 +98,7 @@ class Supervisor:
             heard = [each for each in {*sources, *self._starting} if not each.is_silent]
             descriptors = [*(each.fileno() for each in heard), *self._required.values()]
             readable(descriptors, max(wait_s, 0.0) if wait_s < math.inf else None)
-            self._events += [(each, Event.from_line(line)) for each in heard for line in each.take_lines()]
+            self._events += [(each, event) for each in heard for event in each.take_events()]
 
     def _check(self) -> float:
         """Return the seconds until a starting process is late; raises as the class says."""
@@ -118,7 +117,7 @@ class Supervisor:
         kept = []
         while self._events and not is_over():
             process, event = self._events.pop(0)
-            if process in self._starting and event.name == "ready":
+            if process in self._starting and event["event"] == "ready":
                 _, then = self._starting.pop(process)
                 self.require(process)
                 then(event)

@@ -182,7 +182,9 @@ class Zygote:
         first = Path(program.file).parent if program.file else cwd
         folders = [first, *map(Path, filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))]
         return self._place == _place() and not any(
-            (each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp") for each in folders
+            (each / "sitecustomize.py").exists()
+            or ((each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp"))
+            for each in folders
         )
 
     def close(self) -> None:

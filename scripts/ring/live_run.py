@@ -13,8 +13,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.credentials import Side
-from lab.events import Event
-from lab.process import LabProcess
+from lab.process import Event, LabProcess
 from lab.supervisor import Supervisor, failed
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
@@ -77,7 +76,7 @@ class LiveSession:
             for node in near:
                 node.send(signal.SIGUSR1)
             self._await_reports(near, seconds + ENDING_S)
-            self._answered = self._done[nodes.caller].count("answered")
+            self._answered = self._done[nodes.caller]["answered"]
             self._await_quiet()
             for node in far:
                 node.send(signal.SIGINT)
@@ -106,27 +105,27 @@ class LiveSession:
         return self._supervisor.follow(every, is_over, self._take, patience_s)
 
     def _take(self, node: LabProcess, event: Event) -> None:
-        if event.name == "done":
+        if event["event"] == "done":
             self._done[node] = event
-        elif event.name == "progress":
+        elif event["event"] == "progress":
             self._note(node, event)
 
     def _note(self, child: LabProcess, event: Event) -> None:
         now_s, silence = time.monotonic(), self.silence
         if child is self._live_nodes.listener:
-            received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
+            received = {each["topic"]: each["received"] for each in event["topics"]}
             self._has_moved |= received != self._received
             for topic, count in received.items():
                 silence.received(topic, count, now_s)
             self._received = received
-            self._latency_ms = event.number_or_none("latency_ms")
+            self._latency_ms = event.get("latency_ms")
         elif child is self._live_nodes.caller:
-            self._asked, self._answered = event.count("asked"), event.count("answered")
+            self._asked, self._answered = event["asked"], event["answered"]
             silence.sent(LAMP, self._asked, now_s)
             silence.received(LAMP, self._answered, now_s)
         else:
-            self._sent[child] = event.count("sent")
-            silence.sent(event.text("topic"), event.count("sent"), now_s)
+            self._sent[child] = event["sent"]
+            silence.sent(event["topic"], event["sent"], now_s)
         self._reporter.traffic(
             Traffic(
                 total=self._live_nodes.messages + self._live_nodes.calls,
@@ -218,7 +217,7 @@ class LiveRing:
 
     def _compare(self, heard: Heard, complaints: list[str]) -> Result:
         said = [self._finish(proxy) for proxy in self._proxies]
-        result = Result(rows(heard, said[1].parts("topics")), self.overlay.settings, complaints=tuple(complaints))
+        result = Result(rows(heard, said[1]["topics"]), self.overlay.settings, complaints=tuple(complaints))
         if result.passed:
             return result
         ends = zip(self._proxies, said, strict=True)
@@ -262,4 +261,4 @@ def _require(versions: set[int]) -> None:
 
 def _faults(done: Event) -> str:
     """Return the faults that a proxy counted; empty: none."""
-    return ", ".join(f"{count} {label}" for label, count in done.part("faults").fields.items() if count)
+    return ", ".join(f"{count} {label}" for label, count in done.get("faults", {}).items() if count)

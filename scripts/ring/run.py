@@ -13,8 +13,7 @@ from typing import Final
 from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
 from lab.credentials import Carried
-from lab.events import Event
-from lab.process import FailedError, LabProcess
+from lab.process import Event, FailedError, LabProcess
 from lab.supervisor import READY_S, Supervisor, exit_code, failed
 from proxy.config.config import Encoding
 from proxy.recordings.compare import compare
@@ -87,11 +86,11 @@ class Replay:
             complaints = injection.stop()
             self._reporter.end_traffic()
         sent, received = self._done[self._sender], self._done[self._receiver]
-        complaints += [_not_confirmed(topic) for topic in sent.parts("unconfirmed")]
+        complaints += [_not_confirmed(topic) for topic in sent["unconfirmed"]]
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
-        unread = sent.text_or_none("unread") or None
-        topics = tuple(received.parts("topics"))
+        unread = sent.get("unread") or None
+        topics = tuple(received["topics"])
         return Report(topics, unread, tuple(complaints), traffic_s, self._silence.longest_s)
 
     def _follow_unless_stalled(self) -> None:
@@ -116,21 +115,21 @@ class Replay:
         return code
 
     def _take(self, process: LabProcess, event: Event) -> None:
-        if event.name == "done":
+        if event["event"] == "done":
             self._done[process] = event
-        elif event.name == "progress":
+        elif event["event"] == "progress":
             self._follow(event)
 
     def _follow(self, event: Event) -> None:
         before, now_s = self._traffic, time.monotonic()
-        if "sent" in event.fields:
-            self._silence.sent(_ALL, event.count("sent"), now_s)
-            self._unconfirmed = ", ".join(event.part("unconfirmed").fields)
-            self._traffic = replace(before, sent=event.count("sent"))
+        if "sent" in event:
+            self._silence.sent(_ALL, event["sent"], now_s)
+            self._unconfirmed = ", ".join(event.get("unconfirmed", {}))
+            self._traffic = replace(before, sent=event["sent"])
             waiting = before.sent < before.total  # for the next stamp of the recording, which may have long pauses
         else:
-            received, lost = event.count("received"), event.count("lost")
-            latency_ms = event.number_or_none("latency_ms")
+            received, lost = event["received"], event["lost"]
+            latency_ms = event.get("latency_ms")
             self._silence.received(_ALL, received + lost, now_s)
             self._traffic = replace(before, received=received, lost=lost, latency_ms=latency_ms)
             waiting = False
@@ -140,8 +139,8 @@ class Replay:
 
 
 def _not_confirmed(topic: Event) -> str:
-    messages, confirmed = topic.count("messages"), topic.count("confirmed")
-    return f"{topic.text('topic')}: {messages - confirmed} of {messages} were never confirmed"
+    messages, confirmed = topic["messages"], topic["confirmed"]
+    return f"{topic['topic']}: {messages - confirmed} of {messages} were never confirmed"
 
 
 DEMO_S: Final = 10.0

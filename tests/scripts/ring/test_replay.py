@@ -54,7 +54,7 @@ def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = No
 
 def test_when_the_sender_has_finished_the_receiver_is_asked_for_its_report(run: Run) -> None:
     report = play(run, SENDER, RECEIVER)
-    assert [topic.text("topic") for topic in report.topics] == ["/a"]
+    assert [topic["topic"] for topic in report.topics] == ["/a"]
     assert report.complaints == ()
     assert report.unread is None
 
@@ -99,7 +99,7 @@ def test_traffic_that_stands_still_ends_the_run(run: Run, monkeypatch: pytest.Mo
 
 def test_a_line_of_a_megabyte_is_read(run: Run) -> None:
     long = RECEIVER.replace("'/a'", "'/' + 'a' * 1_000_000")
-    assert len(play(run, SENDER, long).topics[0].text("topic")) == 1_000_001
+    assert len(play(run, SENDER, long).topics[0]["topic"]) == 1_000_001
 
 
 def test_a_process_that_does_not_answer_in_time_is_reported(run: Run) -> None:
@@ -120,7 +120,7 @@ def test_faults_are_injected_at_their_seconds_and_those_that_come_too_late_are_c
 def test_a_restarted_process_is_required_once_it_is_ready(run: Run) -> None:
     supervisor, back = Supervisor(), list[str]()
     with LabProcess(run, "again", [sys.executable, "-c", HEAD + "say(event='ready'); sys.exit('no more')"]) as again:
-        supervisor.expect(again, lambda event: back.append(event.name))
+        supervisor.expect(again, lambda event: back.append(event["event"]))
         with pytest.raises(FailedError, match=r"again ended with code 1\n    no more"):
             supervisor.follow((), lambda: False, patience_s=10)
     assert back == ["ready"]
