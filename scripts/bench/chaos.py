@@ -42,11 +42,11 @@ from faults.plan import VICTIM, Oracle, Plan, random_network
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
 from report import percentile, print_table, progress
-from skeleton import Options, clean_exit, command_line, new_run
+from skeleton import Options, clean_exit, command_line
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError, until
+from lab.process import FailedError, new_run, until
 from lab.topology import ends_of
 
 SECONDS: Final = 60.0
@@ -293,7 +293,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
     return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
 
 
-def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
+def run_seed(seed: int, options: Options) -> list[str]:
     """Run one seed; print its table; return what broke.
 
     Raises ``FailedError``: the network did not come up. Raises ``GdpError``: the kernel refuses.
@@ -308,7 +308,7 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
     begun_s = time.monotonic()
     with (
-        new_run(runs) as run,
+        new_run() as run,
         Overlay(run, plan, has_clocks=True, has_disk=True, in_store=in_store, more=more) as overlay,
     ):
         overlay.start_all()
@@ -429,11 +429,10 @@ def main() -> None:
     options = parser.parse_args()
     broken: list[int] = []
     with clean_exit():
-        runs = RunRegistry()
-        runs.sweep()  # remains of a killed run
+        RunRegistry().sweep()  # remains of a killed run
         for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
             try:
-                broke = run_seed(runs, seed, options)
+                broke = run_seed(seed, options)
             except GdpError as error:
                 print(f"seed {seed}: {error}")
                 broke = [str(error)]

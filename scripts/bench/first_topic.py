@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Final
 
 from report import Rounds, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.fresh_machine import FreshMachine, TypedCommand, typed_commands
 from internet.laboratory import Laboratory
-from lab.process import FailedError, LabProcess
+from lab.process import FailedError, LabProcess, new_run
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "internet.md"
 BORDER_HOST: Final = "border.example.org"  # in the tutorial; here the border's address
@@ -76,11 +75,11 @@ class Tutorial:
             shell.output(_PATIENCE_S)
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Follow the tutorial from its beginning in each round."""
     over, commands = Rounds(), typed_commands(PAGE.read_text(encoding="utf-8"))
     for number in range(1, options.rounds + 1):
-        for what, seconds in _follow(commands, runs).items():
+        for what, seconds in _follow(commands).items():
             over.add(BASELINE, TIMES, what, seconds)
             progress(f"round {number}, {what}: {seconds:.1f} s")
     for label in _SITES:
@@ -103,10 +102,10 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     return Outcome("first_topic", "First topic between fresh machines behind two NATs", over, targets, settings)
 
 
-def _follow(commands: Sequence[TypedCommand], runs: RunRegistry) -> Mapping[str, float]:
+def _follow(commands: Sequence[TypedCommand]) -> Mapping[str, float]:
     """Return the seconds of each command, from the last one to the first image, and of all."""
     found = dict[str, float]()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         tutorial = Tutorial(laboratory, stack)
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):

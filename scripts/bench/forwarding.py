@@ -25,15 +25,15 @@ from typing import Final
 from forwarding_end import SINK, SOURCE
 from plot import Panel, panel_of
 from report import Rounds, Target, percentile
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.frame.codec import OVERHEAD_BYTES, Header, encode
 from gdp.frame.kinds import ETHERTYPE, Kind
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab
 from lab.namespaces import add_bridge, mac_addresses, remove_link
-from lab.process import FailedError, LabProcess, figures_of, floats_of
+from lab.process import FailedError, LabProcess, figures_of, floats_of, new_run
 from lab.topology import chain
 
 KERNEL, BRIDGE = "kernel", "bridge"
@@ -167,10 +167,10 @@ def targets_of(over: Rounds) -> list[Target]:
     ]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure both, round by round."""
     recorder, pings = Recorder(), int(options.pings)
-    with new_run(runs) as run, Row(run) as row:
+    with new_run() as run, Row(run) as row:
         columns = (RATE, LOSS, TRIP, TRIP_P99)
         trials = [
             Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))

@@ -34,10 +34,9 @@ from field import READY_S, Field, Served, Server, Work  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from samples import Sample, Series  # noqa: E402
-from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
+from skeleton import Options, Outcome, command_line, run_bench  # noqa: E402
 
-from gdp.host.run_registry import RunRegistry  # noqa: E402
-from lab.process import FailedError  # noqa: E402
+from lab.process import FailedError, new_run  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
 CASES: Final = {
@@ -137,8 +136,7 @@ class Kills:
 class Bench:
     """Rounds in progress. ``over``: the figures."""
 
-    def __init__(self, runs: RunRegistry, rate: float, draw: random.Random) -> None:
-        self._runs = runs
+    def __init__(self, rate: float, draw: random.Random) -> None:
         self._rate = rate
         self._draw = draw
         self.over = Rounds()
@@ -190,7 +188,7 @@ class Bench:
         work = {
             each: Work("replicate", {**(settings or {}), "services": its}, _END) for each, its in names.items() if its
         }
-        with new_run(self._runs) as run, Field(run, served, work) as here:
+        with new_run() as run, Field(run, served, work) as here:
             yield here
 
     def _add(self, case: str, who: str, figures: Mapping[str, float | None]) -> None:
@@ -224,9 +222,9 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure the parts in turn, round by round."""
-    bench = Bench(runs, options.rate, random.Random(SEED))
+    bench = Bench(options.rate, random.Random(SEED))
     parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}
     only = options.only or list(parts)
     counts = {each: options.requests or (QUICK if options.quick else REQUESTS)[each] for each in only}

@@ -18,16 +18,15 @@ from contextlib import ExitStack
 from typing import Final
 
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 from internet.site import Site
-from lab.process import until
+from lab.process import new_run, until
 
 TOPIC: Final = "flow"
 TARGET_MS: Final = 300.0
@@ -37,10 +36,10 @@ COLUMN, P99, LOST, DOUBLED = "silence, ms", "p99, ms", "lost", "doubled"
 COMMANDS: Final = "commands, ms"
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every event in turn, in one network."""
     over = Rounds()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
         homes = [laboratory.add_site(f"home{number}", Access.PORT_RESTRICTED) for number in (1, 2)]
         robot = laboratory.add_host("robot", homes[0])

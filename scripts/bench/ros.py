@@ -36,11 +36,10 @@ from typing import Final
 from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_row import READY_S, Carried, Row
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, parse, perform
+from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
-from gdp.host.run_registry import RunRegistry
 from lab.dds import BUFFER_BYTES
-from lab.process import FailedError, figures_of
+from lab.process import FailedError, figures_of, new_run
 from lab.topology import LEFT, RIGHT
 
 DIRECT, OVERLAY, SESSION = "direct", "overlay, cdr", "overlay, cdr, session"
@@ -178,13 +177,13 @@ def panels_of(over: Rounds) -> list[Panel]:
     return [panel_of(over, case, MEDIAN, names, p99=P99, ours=names[:2]) for case in over.cases()]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every case, round by round, on a row of its own for each MTU."""
     recorder = Recorder()
     with ExitStack() as stack:
         rows = {}
         for mtu in options.mtu:
-            run = stack.enter_context(new_run(runs))
+            run = stack.enter_context(new_run())
             rows[mtu] = stack.enter_context(Row(run, CARRIED, mtu=mtu))
         recorder.interleave(list(trials_of(rows, options)), options.rounds)
     over = recorder.rounds

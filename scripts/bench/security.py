@@ -22,13 +22,12 @@ from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
-from lab.process import FailedError, until
+from lab.process import FailedError, new_run, until
 from lab.topology import make_topology
 
 TARGET_MS: Final = 1_000.0
@@ -57,12 +56,12 @@ def _plan() -> Plan:
     return Plan(topology, members, flows=tuple(flows))
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Close the flows of one network in each round."""
     over = Rounds()
     for number in range(options.rounds):
         progress(f"network {number + 1} of {options.rounds}")
-        with new_run(runs) as run, Overlay(run, _plan()) as overlay:
+        with new_run() as run, Overlay(run, _plan()) as overlay:
             overlay.start_all()
             _Closing(overlay).measure(over)
     targets = []

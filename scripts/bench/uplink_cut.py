@@ -21,14 +21,13 @@ from contextlib import ExitStack
 from typing import Final, Literal
 
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
-from lab.process import until
+from lab.process import new_run, until
 
 UPLINKS: Final = ("wlan0", "wwan0")
 TOPICS: Final[dict[str, Literal[1, 2]]] = {"one": 1, "two": 2}  # by the number of paths
@@ -41,10 +40,10 @@ LATE, SILENCE, P99, LOST, DOUBLED = "late", "silence, ms", "p99, ms", "lost", "d
 _CASES: Final = {1: "paths: 1", 2: "paths: 2"}
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Cut the uplinks in turn, in one network."""
     over = Rounds()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         flows = start(laboratory, stack)
         sites = [laboratory.sites[each] for each in UPLINKS]
         time.sleep(options.settle_s)

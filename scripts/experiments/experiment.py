@@ -24,7 +24,10 @@ from field import Field, Served, Work
 from machine import MachineState, machine_state, require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
-from skeleton import Options, add_allow_load, clean_exit, new_run
+from skeleton import Options, add_allow_load, clean_exit
+
+from gdp.host.run_registry import RunRegistry
+from lab.process import new_run
 
 OUTPUT: Final = ROOT / "docs" / "experiments"
 CASES: Final = ("one server", "two replicas")
@@ -213,6 +216,7 @@ def run_experiment(
             require_writable(folder)
         if not options.quick:
             require_trust(state, allow_load=options.allow_load)
+        RunRegistry().sweep()  # remains of a killed run
         report = measure(options)
     document = report.to_dict(state)
     if options.json:

@@ -27,11 +27,11 @@ from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from report import progress
 from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
-from skeleton import Options, new_run
+from skeleton import Options
 
 from gdp.host.cgroups import Cgroup
 from lab.cores import CORES_HELP, cores_of
-from lab.process import LabProcess
+from lab.process import LabProcess, new_run
 from lab.topology import LEFT, RIGHT, ring5
 from proxy.config.config import Encoding
 
