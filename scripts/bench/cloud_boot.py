@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -67,8 +66,7 @@ def measure(options: Options) -> Outcome:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gdp-cloud-boot-")))
         software = wheelhouse(folder / "wheels")
         run = stack.enter_context(new_run())
-        stack.enter_context(Space())
-        subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+        stack.enter_context(Space()).ip("link", "set", "lo", "up")
         from lab.ec2 import DataCenter, serving_ec2  # moto, an extra
 
         logging.getLogger("werkzeug").setLevel(logging.WARNING)  # the simulation logs each request

@@ -35,11 +35,12 @@ from typing import Final
 
 from plot import Panel, panel_of
 from report import Rounds, Target
-from ros_row import READY_S, Carried, Row
+from ros_row import READY_S, Row
 from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
+from lab.credentials import Carried
 from lab.dds import BUFFER_BYTES
-from lab.process import FailedError, figures_of, new_run
+from lab.process import FailedError, new_run
 from lab.topology import LEFT, RIGHT
 
 DIRECT, OVERLAY, SESSION = "direct", "overlay, cdr", "overlay, cdr, session"
@@ -76,11 +77,14 @@ STREAMS: Final[Mapping[str, Stream]] = {
     "image": Stream("image, 921,600 B, 30/s", _IMAGE, ("/image",), 1 / 30, {1_500: 4.0, 9_000: 2.0}),
     "small": Stream("small, 100 B, 4,000/s on 20 topics", _TEXT, tuple(f"/small{at}" for at in range(20)), 0.005, {}),
 }
-CARRIED: Final = (
-    *(Carried(topic, each.type_name, "cdr") for each in STREAMS.values() for topic in each.topics),
-    Carried(SERVICES[OVERLAY], "std_srvs/srv/SetBool", "cdr", source=RIGHT, kind="service"),
-    Carried(SERVICES[SESSION], "std_srvs/srv/SetBool", "cdr", source=RIGHT, kind="service", sign="session"),
-)
+_CDR: Final = {"encoding": "cdr"}
+CARRIED: Final = {
+    LEFT: [Carried(topic, each.type_name, options=_CDR) for each in STREAMS.values() for topic in each.topics],
+    RIGHT: [
+        Carried(SERVICES[OVERLAY], "std_srvs/srv/SetBool", "service", _CDR),
+        Carried(SERVICES[SESSION], "std_srvs/srv/SetBool", "service", {**_CDR, "sign": "session"}),
+    ],
+}
 
 
 def case_of(what: str, mtu: int) -> str:
@@ -107,7 +111,7 @@ def measure_stream(row: Row, kind: str, who: str, options: Options, number: int)
         listener.read(READY_S)
         cpu_s = row.proxies_cpu_s()
         os.kill(talker.pid, signal.SIGUSR1)
-        said = figures_of(listener.read(seconds + _DONE_S))
+        said = listener.read(seconds + _DONE_S)
         used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {LOST: said["lost"], "twice": said["twice"]}
 
@@ -122,7 +126,7 @@ def measure_calls(row: Row, case: str, who: str, options: Options, _: int) -> di
         with row.node(LEFT, "ros_calls", role, direct=is_direct, seconds=seconds, **settings) as client:
             client.read(READY_S)
             cpu_s = row.proxies_cpu_s()
-            said = figures_of(client.read(seconds + _DONE_S))
+            said = client.read(seconds + _DONE_S)
             used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {"calls": said["sent"], UNANSWERED: said["lost"], WRONG: said["wrong"]}
 

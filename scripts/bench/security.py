@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import random
 import signal
-import subprocess
-import sys
 import time
 from typing import Final
 
@@ -27,7 +25,8 @@ from skeleton import Options, Outcome, command_line, run_bench
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
-from lab.process import FailedError, new_run, until
+from lab.machine import gdp
+from lab.process import new_run, until
 from lab.topology import make_topology
 
 TARGET_MS: Final = 1_000.0
@@ -120,9 +119,7 @@ class _Closing:
             domain = folder / "domains" / label
             words = ["cert", "revoke", str(node / NODE_CERTIFICATE), "--domain", str(domain), "--out", str(out)]
         begun_ns = time.monotonic_ns()
-        done = subprocess.run([sys.executable, "-m", "gdp.cli.gdp", *words], capture_output=True, check=False)
-        if done.returncode:
-            raise FailedError(f"gdp {' '.join(words)}: {done.stderr.decode(errors='replace')[-200:]}")
+        gdp(*words)
         read_public(out)
         signalled_ns = time.monotonic_ns()
         self._overlay.signal(f"switch {HANDED_IN_AT}", signal.SIGHUP)

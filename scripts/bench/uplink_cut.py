@@ -16,7 +16,6 @@ limit: twice the longest delay of the quiet seconds before the cuts, and at leas
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Final, Literal
 
@@ -109,15 +108,9 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
         publisher = sender.publisher(topic, paths=paths)
         publisher.wait_for_readers(timeout_s=PATIENCE_S)
         flows[paths] = NumberedFlow(publisher, subscription)
-    until(lambda: _has_pair(overlay.status(server)), lambda: "a second path", PATIENCE_S)
+    # The reader's switch then has two paths for the flow; both use its own uplink.
+    until(lambda: overlay.status(server)["counters"]["two_paths"]["shared"] == 1, "a second path", PATIENCE_S)
     return flows
-
-
-def _has_pair(status: Mapping[str, object]) -> bool:
-    """Return whether the reader's switch has two paths for the flow; both use its own uplink."""
-    counters = status["counters"]
-    assert isinstance(counters, dict)
-    return bool(dict(counters["two_paths"])["shared"] == 1)
 
 
 if __name__ == "__main__":

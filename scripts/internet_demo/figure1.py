@@ -82,9 +82,8 @@ class _Stage(Stage):
             graph, site = self.graphs[host.label], host.site()
             nat = f"NAT of the {site.label} network, {site.address}"
             lines.append(f"  {host.label:7} ROS {graph.ros}  {host.lease().address:15} -- {nat:44} {side}")
-        topics = ask_node(find_control_socket(drone.directory / "proxy"), Command.TOPICS, _PATIENCE_S).result["topics"]
-        assert isinstance(topics, list)
-        return [*lines, *(f"  {each['topic']:9} is {each['name']}" for each in topics)]
+        topics: Any = ask_node(find_control_socket(drone.directory / "proxy"), Command.TOPICS, _PATIENCE_S).result
+        return [*lines, *(f"  {each['topic']:9} is {each['name']}" for each in topics["topics"])]
 
 
 def _said(node: LabProcess, event: str, is_met: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:

@@ -129,9 +129,9 @@ class LabMachine:
             check=False,
         )
 
-    def output(self, *argv: str, answer: str = "") -> str:
+    def output(self, *argv: str, answer: str = "", patience_s: float = _COMMAND_S) -> str:
         """Run a command to its end, and return what it prints. Raises ``FailedError``: it fails."""
-        done = self.run(*argv, answer=answer)
+        done = self.run(*argv, answer=answer, patience_s=patience_s)
         if done.returncode:
             raise FailedError(f"{' '.join(argv)}: exit {done.returncode}: {done.stdout}{done.stderr}")
         return done.stdout

@@ -71,7 +71,7 @@ class Lab:
         self.cores = MachineCores(run, dict(cores)) if cores else None
         self._dies_with_us = dies_with_us
         path = {"PYTHONPATH": python_path(_BENCH)}
-        self._machines = {
+        self.machines = {
             node: LabMachine(run.directory, self.command(node, []), run=run, environment=path)
             for node in topology.nodes
         }
@@ -103,7 +103,7 @@ class Lab:
     ) -> LabProcess:
         """Start Python on a machine; with it ``what`` names its log, ``environment`` holds ``KEY=value``."""
         argv = [*(["env", *environment] if environment else []), sys.executable, *arguments]
-        started = self._machines[node].launch(argv, f"{what}-{node}", heard=heard, has_orders=has_orders)
+        started = self.machines[node].launch(argv, f"{what}-{node}", heard=heard, has_orders=has_orders)
         if self.cores is not None:
             self.cores.add(node, started.pid)
         return started

@@ -196,7 +196,7 @@ class LabProcess:
         except BrokenPipeError as error:
             raise self.failed("ended") from error
 
-    def ask(self, **values: object) -> dict[str, object]:
+    def ask(self, **values: object) -> Event:
         """Send a command and return the answer; raises as ``read``."""
         self.tell(**values)
         return self.read(_ANSWER_S)
@@ -316,16 +316,3 @@ def until(
         else:
             meanwhile()
     return value
-
-
-def figures_of(said: Mapping[str, object]) -> dict[str, float]:
-    """Return the figures of a report, by key."""
-    return {key: value for key, value in said.items() if isinstance(value, int | float)}
-
-
-def floats_of(said: Mapping[str, object], key: str) -> list[float]:
-    """Return a list of figures of a report. Raises ``FailedError``: it has none."""
-    values = said.get(key)
-    if not isinstance(values, list):
-        raise FailedError(f"a list {key!r} was expected, not {said}")
-    return [float(value) for value in values]
