@@ -24,7 +24,6 @@ from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.host import Host
 from internet.laboratory import Laboratory
-from internet.overlay import Overlay
 from internet.site import Site
 from lab.process import new_run, until
 
@@ -40,12 +39,9 @@ def measure(options: Options) -> Outcome:
     """Measure every event in turn, in one network."""
     over = Rounds()
     with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
-        border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
         homes = [laboratory.add_site(f"home{number}", Access.PORT_RESTRICTED) for number in (1, 2)]
         robot = laboratory.add_host("robot", homes[0])
-        server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-        overlay = Overlay(laboratory)
-        flow = _start(overlay, stack, (border, robot, server))
+        flow = _start(robot, stack)
         for what, act in _events(robot, homes).items():
             silences = []
             for number in range(options.rounds):
@@ -70,13 +66,12 @@ def measure(options: Options) -> Outcome:
     return Outcome("roaming", "Silence when a robot's address changes", over, targets, settings)
 
 
-def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host]) -> NumberedFlow:
-    _, robot, _ = hosts
-    sender, reader = open_sessions(overlay, stack, hosts, [TOPIC], has_direct=True)
+def _start(robot: Host, stack: ExitStack) -> NumberedFlow:
+    overlay, server, (sender, reader) = open_sessions(robot, stack, [TOPIC], has_direct=True)
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)
-    until(lambda: overlay.tunnels(robot).get("server", {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
+    until(lambda: overlay.tunnels(robot).get(server.label, {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
     return NumberedFlow(publisher, subscription)
 
 

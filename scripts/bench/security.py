@@ -122,7 +122,7 @@ class _Closing:
         gdp(*words)
         read_public(out)
         signalled_ns = time.monotonic_ns()
-        self._overlay.signal(f"switch {HANDED_IN_AT}", signal.SIGHUP)
+        self._overlay.processes[f"switch {HANDED_IN_AT}"].send(signal.SIGHUP)
         return begun_ns, signalled_ns
 
     def _watch(self, seconds: float) -> None:

@@ -180,7 +180,7 @@ def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
     channel = len(overlay.plan.flows) + len(overlay.plan.services) + at
     begun_ns = time.monotonic_ns()
     for who in ("member P", "member R"):
-        overlay.signal(who, signal.SIGUSR1)
+        overlay.processes[who].send(signal.SIGUSR1)
     end_s = time.monotonic() + PATIENCE_S
     while channel not in flow.first_of and time.monotonic() < end_s:
         flow.look()

@@ -25,7 +25,6 @@ from skeleton import Options, Outcome, command_line, run_bench
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.laboratory import Laboratory
-from internet.overlay import Overlay
 from lab.process import new_run, until
 
 UPLINKS: Final = ("wlan0", "wwan0")
@@ -94,14 +93,10 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 
     Raises ``FailedError``: the second path does not come up.
     """
-    overlay = Overlay(laboratory)
-    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     homes = [laboratory.add_site(each, Access.PORT_RESTRICTED) for each in UPLINKS]
     robot = laboratory.add_host("robot", homes[0], UPLINKS[0])
     robot.attach(homes[1], UPLINKS[1])
-    server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    hosts = border, robot, server
-    sender, reader = open_sessions(overlay, stack, hosts, TOPICS, has_direct=False, uplinks=UPLINKS)
+    overlay, server, (sender, reader) = open_sessions(robot, stack, TOPICS, has_direct=False, uplinks=UPLINKS)
     flows: dict[int, NumberedFlow] = {}
     for topic, paths in TOPICS.items():
         subscription = reader.subscribe(topic, paths=paths)

@@ -83,7 +83,7 @@ class Host(LabMachine):
 
     def __init__(self, laboratory: Laboratory, label: str) -> None:
         self.label = label
-        self._laboratory = laboratory
+        self.laboratory = laboratory
         self.space = IpNamespace(laboratory.run, label)
         super().__init__(laboratory.run.directory, self.space.command([]), run=laboratory.run)
         self._attachments: dict[str, _Attachment] = {}
@@ -101,9 +101,9 @@ class Host(LabMachine):
         router = site.routers[0]
         attachment = self._attachments.get(device)
         if attachment is None:
-            port = self._laboratory.next_device()
+            port = self.laboratory.next_device()
             metric = _FIRST_METRIC * (1 + len(self._attachments))
-            link = f"link add {device} index {self._laboratory.next_index()} type veth peer {port} netns {router.path}"
+            link = f"link add {device} index {self.laboratory.next_index()} type veth peer {port} netns {router.path}"
             self.space.configure([link, f"link set {device} up"])
             attachment = self._attachments[device] = _Attachment(site, site.next_host(), port, metric)
         else:

@@ -194,7 +194,7 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
                 f" (switch:{at}@10-20)"
             )
     (one, here), (other, there) = places.items()
-    if there not in _reached(topology, here, down, dead):
+    if there not in topology.reached(here, down=down, dead=dead):
         raise LocalError(
             f"after {newest} no way is left from {one} at {here} to {other} at {there}: let something come back"
             " (nuc2-nuc3@5-20)"
@@ -208,18 +208,6 @@ def moments(faults: Iterable[Fault]) -> list[tuple[float, Fault, bool]]:
         (fault.until_s, fault, False) for fault in faults if not isinstance(fault, Roam) and fault.until_s is not None
     ]
     return sorted(found, key=lambda each: each[0])
-
-
-def _reached(topology: Topology, start: str, down: set[frozenset[str]], dead: set[str]) -> set[str]:
-    reached, edge = {start}, [start]
-    while edge:
-        node = edge.pop()
-        for link in topology.links_of(node):
-            other = link.other(node)
-            if link.ends() not in down and other not in dead | reached:
-                reached.add(other)
-                edge.append(other)
-    return reached
 
 
 def _when(text: str, after: str, until: str | None) -> tuple[float, float | None]:

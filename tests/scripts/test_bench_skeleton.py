@@ -104,7 +104,7 @@ def test_a_process_that_goes_on_is_an_error_to_one_that_reaps_it(start: Callable
 def test_events_are_taken_without_waiting(start: Callable[[str], LabProcess]) -> None:
     found = list[Event]()
     with start("say(event='ready'); say(event='done')") as end:
-        until(lambda: found.extend(end.take_events()) or end.is_silent)
+        until(lambda: end.is_silent, meanwhile=lambda: found.extend(end.take_events()))
     assert [each["event"] for each in found] == ["ready", "done"]
 
 
