@@ -36,6 +36,7 @@ READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
 _MTU: Final = 1_500
 _HERE: Final = ROOT / "scripts" / "experiments"
+REPLICA: Final = _HERE / "replica.py"
 # The relay of the provider ``local`` waits on its standard input for permission to begin.
 _RELAY: Final = "import io, sys; from fog.providers.local.delay import main; sys.stdin = io.StringIO('\\n'); main()"
 _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
@@ -67,7 +68,7 @@ class Work:
 
     role: str
     settings: Mapping[str, object] = field(default_factory=dict)
-    program: Path = _HERE / "replica.py"
+    program: Path = REPLICA
 
 
 class Server:
