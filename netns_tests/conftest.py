@@ -17,8 +17,7 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.table import Table
-from internet.laboratory import Laboratory
-from internet.space import TOOLS
+from internet.laboratory import TOOLS, Laboratory
 from lab.machine import LabMachine
 from lab.namespaces import Space
 from lab.process import python_path
@@ -142,3 +141,19 @@ def laboratory() -> Iterator[Laboratory]:
             yield made
     finally:
         run.end()
+
+
+@pytest.fixture(scope="session")
+def image() -> Path:
+    """Return the image of machines; it is made outside the namespaces of tests, which have no network."""
+    from lab.debian import debian_root
+
+    return debian_root()
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with the wheels of a machine; made as ``image``."""
+    from lab.cloud_site import wheelhouse  # with extras that other tests do without
+
+    return wheelhouse(tmp_path_factory.mktemp("software") / "wheels")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from faults.link_faults import FrameFaults
-from faults.overlay import Overlay
+from faults.overlay import READY_S, Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
 from faults.store import NOT_WRITTEN, Disk, StoreCluster, has_server, snapshot_faults
@@ -105,7 +105,7 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
         until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
         overlay.kill("rib s1")
         overlay.start("rib s1")
-        overlay.await_ready("rib s1")
+        overlay.processes["rib s1"].read(READY_S)
         assert "snapshot read live=0" not in rib_log(overlay)
         assert "snapshot read live=" in rib_log(overlay)
         until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk, after the restart")
@@ -150,12 +150,12 @@ def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Ov
 
 
 def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Overlay) -> None:
-    assert Process.from_pid(overlay.pid("member P")).alive
+    assert Process.from_pid(overlay.processes["member P"].pid).alive
     overlay.kill("member P")
-    assert not overlay.is_running("member P")
+    assert "member P" not in overlay.processes
     overlay.start("member P")
-    overlay.await_ready("member P")
-    assert overlay.incarnation_id("member P") == 2
+    overlay.processes["member P"].read(READY_S)
+    assert overlay.incarnation_ids["member P"] == 2
     until(lambda: numbers(overlay, "R"), "a message of its new life")
     overlay.freeze("member R")
     overlay.thaw("member R")

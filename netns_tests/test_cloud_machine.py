@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,9 +15,9 @@ import pytest
 
 from fog.supervisor.core.record import Record
 from gdp.host.run_registry import Run, RunRegistry
-from lab.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
+from lab.cloud_site import CloudSite, launch_file, start_echo
 from lab.datacenter import Router
-from lab.debian import BootedMachine, debian_root, why_not
+from lab.debian import BootedMachine, why_not
 from lab.machine import LabMachine
 from lab.namespaces import Space
 from lab.process import calling, until
@@ -35,17 +34,6 @@ pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_
 NEAR, FAR = "us-west-1", "us-east-1"
 _MACHINE_S = 400.0  # one boots here in about 30 s; a loaded host takes much longer
 _ANSWER_S = 30.0
-
-
-@pytest.fixture(scope="module")
-def image() -> Path:
-    """Return the machines' image; it is made outside the namespaces of tests, which have no network."""
-    return debian_root()
-
-
-@pytest.fixture(scope="module")
-def software(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return wheelhouse(tmp_path_factory.mktemp("software") / "wheels")
 
 
 @pytest.fixture
@@ -82,13 +70,13 @@ def account() -> dict[str, list[str]]:
 
 @pytest.mark.nightly
 def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted(
-    image: Path, software: Path, run: Run, space: Space, tmp_path: Path
+    image: Path, wheels: Path, run: Run, space: Space, tmp_path: Path
 ) -> None:
     from lab.ec2 import DataCenter, serving_ec2
 
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    space.ip("link", "set", "lo", "up")
     endpoints = {NEAR: start_echo(0.0), FAR: start_echo(0.05)}
-    site = CloudSite(run, software, {each: f"udp://127.0.0.1:{port}" for each, port in endpoints.items()})
+    site = CloudSite(run, wheels, {each: f"udp://127.0.0.1:{port}" for each, port in endpoints.items()})
     center = DataCenter(run, image)
     try:
         with serving_ec2(center, tmp_path / "absent"):

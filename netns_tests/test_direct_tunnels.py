@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import pytest
@@ -49,22 +48,20 @@ class Sites:
 
 
 @pytest.fixture
-def make_sites(laboratory: Laboratory) -> Iterator[Callable[[Access, Access], Sites]]:
-    with ExitStack() as stack:
+def make_sites(laboratory: Laboratory) -> Callable[[Access, Access], Sites]:
+    def make(*accesses: Access) -> Sites:
+        overlay = Overlay(laboratory)
+        border = laboratory.add_host("border", laboratory.add_site("of-border", Access.PUBLIC))
+        overlay.add_switch(border, is_border=True, links={"backend": "wireguard-go"})
+        hosts = []
+        for label, access in zip(("one", "other"), accesses, strict=True):
+            hosts.append(laboratory.add_host(label, laboratory.add_site(f"of-{label}", access)))
+            overlay.add_switch(hosts[-1], borders=[border], links={"backend": "wireguard-go"})
+        overlay.start(border, *hosts)
+        overlay.start_rib(border)
+        return Sites(overlay, *hosts)
 
-        def make(*accesses: Access) -> Sites:
-            overlay = stack.enter_context(Overlay(laboratory))
-            border = laboratory.add_host("border", laboratory.add_site("of-border", Access.PUBLIC))
-            overlay.add_switch(border, is_border=True, links={"backend": "wireguard-go"})
-            hosts = []
-            for label, access in zip(("one", "other"), accesses, strict=True):
-                hosts.append(laboratory.add_host(label, laboratory.add_site(f"of-{label}", access)))
-                overlay.add_switch(hosts[-1], borders=[border], links={"backend": "wireguard-go"})
-            overlay.start(border, *hosts)
-            overlay.start_rib(border)
-            return Sites(overlay, *hosts)
-
-        yield make
+    return make
 
 
 @pytest.mark.parametrize("other", [Access.FULL_CONE])

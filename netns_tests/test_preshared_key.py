@@ -6,7 +6,6 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
@@ -68,17 +67,17 @@ class Pair:
 
 
 @pytest.fixture
-def pair(laboratory: Laboratory) -> Iterator[Pair]:
+def pair(laboratory: Laboratory) -> Pair:
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
-    with Overlay(laboratory) as overlay:
-        more = {"backend": "wireguard-go"}
-        overlay.add_switch(border, is_border=True, links=more)
-        overlay.add_switch(robot, borders=[border], links=more)
-        overlay.start(border, robot)
-        made = Pair(overlay, border, robot)
-        until(made.has_key, "no key at both ends", PATIENCE_S)
-        yield made
+    overlay = Overlay(laboratory)
+    more = {"backend": "wireguard-go"}
+    overlay.add_switch(border, is_border=True, links=more)
+    overlay.add_switch(robot, borders=[border], links=more)
+    overlay.start(border, robot)
+    made = Pair(overlay, border, robot)
+    until(made.has_key, "no key at both ends", PATIENCE_S)
+    return made
 
 
 @pytest.mark.parametrize("label", ["border", "robot"])

@@ -68,7 +68,8 @@ class Flow:
 
 @pytest.mark.nightly
 def test_a_removed_machine_has_no_tunnel_and_no_frame_passes_a_second_later(laboratory: Laboratory) -> None:
-    with Stage(laboratory, 0.0) as stage, contextlib.ExitStack() as stack:
+    stage = Stage(laboratory, 0.0)
+    with contextlib.ExitStack() as stack:
         tokens = [stage.create_domain()]
         stage.start(stage.cloud_b)
         tokens.append(stage.make_token())

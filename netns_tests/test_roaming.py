@@ -92,33 +92,33 @@ def roamer(laboratory: Laboratory, request: pytest.FixtureRequest) -> Iterator[F
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
     server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    with Overlay(laboratory) as overlay:
-        overlay.add_switch(border, is_border=True)
-        for host in (robot, server):
-            overlay.add_switch(host, borders=[border])
-        overlay.start(border)
-        overlay.start_rib(border)
-        overlay.start(robot, server)
-        rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
-        nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
-        with (
-            overlay.open_session(robot, nodes[0], lease_s) as caller,
-            overlay.open_session(server, nodes[1], lease_s) as callee,
-        ):
-            subscription = callee.subscribe(TOPIC, queue=UNREAD)
-            publisher = caller.publisher(TOPIC)
-            made = Field(laboratory, overlay, border, robot, caller, publisher, subscription)
-            callee.serve(SERVICE, made.serve)
-            made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
-            publishing = threading.Thread(target=made.publish)
-            publishing.start()
-            try:
-                made.read_one_more()
-                yield made
-            finally:
-                made.release.set()
-                made.over.set()
-                publishing.join(PATIENCE_S)
+    overlay = Overlay(laboratory)
+    overlay.add_switch(border, is_border=True)
+    for host in (robot, server):
+        overlay.add_switch(host, borders=[border])
+    overlay.start(border)
+    overlay.start_rib(border)
+    overlay.start(robot, server)
+    rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
+    nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
+    with (
+        overlay.open_session(robot, nodes[0], lease_s) as caller,
+        overlay.open_session(server, nodes[1], lease_s) as callee,
+    ):
+        subscription = callee.subscribe(TOPIC, queue=UNREAD)
+        publisher = caller.publisher(TOPIC)
+        made = Field(laboratory, overlay, border, robot, caller, publisher, subscription)
+        callee.serve(SERVICE, made.serve)
+        made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
+        publishing = threading.Thread(target=made.publish)
+        publishing.start()
+        try:
+            made.read_one_more()
+            yield made
+        finally:
+            made.release.set()
+            made.over.set()
+            publishing.join(PATIENCE_S)
 
 
 def test_a_running_call_and_a_topic_outlive_changes_of_the_address_and_a_dead_access_point(roamer: Field) -> None:

@@ -12,9 +12,8 @@ from typing import Final
 import pytest
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.cloud_site import wheelhouse
 from lab.datacenter import Router
-from lab.debian import BootedMachine, debian_root, why_not
+from lab.debian import BootedMachine, why_not
 from lab.process import until
 from tests.pages import ROOT
 
@@ -89,17 +88,6 @@ def configure(root: Path, work: Path) -> None:
     )
     (configs / "rib.yaml").write_text(own % ("rib", "rib") + "iface: rib0\n")
     (configs / "proxy.yaml").write_text(proxy.format(STATE) + f"record: {{path: {STATE}/received.mcap}}\n")
-
-
-@pytest.fixture(scope="module")
-def image() -> Path:
-    """Return the machines' image; it is made outside the namespaces of tests, which have no network."""
-    return debian_root()
-
-
-@pytest.fixture(scope="module")
-def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return wheelhouse(tmp_path_factory.mktemp("software") / "wheels")
 
 
 @pytest.fixture

@@ -15,11 +15,12 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
 
-from testbed import Lab, add_address
 
 from gdp.host.run_registry import RunRegistry
 from lab.dds import ros_environment
 from lab.machine import LabMachine
+from lab.machines import Lab
+from lab.namespaces import add_address
 from lab.process import ROOT, calling, new_run, python_path
 from lab.topology import chain
 from tests.proxy.endpoints.ros2_net import Peer, needs

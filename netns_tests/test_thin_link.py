@@ -12,10 +12,10 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
 
-from testbed import Lab
 from thin_link.conditions import Conditions, Direction
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
 
+from lab.machines import Lab
 from lab.process import new_run
 
 pytestmark = pytest.mark.netns

@@ -13,9 +13,8 @@ from typing import Any, Final
 import pytest
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.cloud_site import wheelhouse
 from lab.datacenter import Router
-from lab.debian import BootedMachine, debian_root, why_not
+from lab.debian import BootedMachine, why_not
 from lab.process import until
 from netns_tests.test_service_units import BOOT_S, PREFIX, SCRIPT, START_S, gdp, install, is_booted, shows
 
@@ -24,17 +23,6 @@ pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_
 NODES: Final = ("switch", "rib", "proxy")
 UNITS: Final = [f"gdp-robot-{each}.service" for each in NODES]
 LEFT: Final = ("/etc/systemd/system", "/run/gdp-locks", "/run/systemd/transient")
-
-
-@pytest.fixture(scope="module")
-def image() -> Path:
-    """Return the machines' image; it is made outside the namespaces of tests, which have no network."""
-    return debian_root()
-
-
-@pytest.fixture(scope="module")
-def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return wheelhouse(tmp_path_factory.mktemp("software") / "wheels")
 
 
 @pytest.fixture

@@ -51,12 +51,13 @@ class Field:
         """
         words = shlex.quote(around.format(command))
         shell = machine.type(f"unshare --mount -- sh -c {words}", self.tokens[-1])
-        assert shell.exit_code(PATIENCE_S) == 2, shell.text
-        assert len(shell.text.splitlines()) == 1, shell.text
+        shell.reap(PATIENCE_S)
+        assert shell.code == 2, shell.logged
+        assert len(shell.logged.splitlines()) == 1, shell.logged
         left = machine.type("ls -A /var/lib")
-        left.wait(PATIENCE_S)
-        assert left.text == ""
-        return shell.text
+        left.output(PATIENCE_S)
+        assert left.logged == ""
+        return shell.logged
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +77,8 @@ def site() -> Iterator[Field]:
             made = Field(border, robot, second, blocked)
             address = border.host.lease().address.partition("/")[0]
             created = border.type(f"gdp domain create lab --public {address} --tokens 2")
-            created.wait_for("listening on TCP port", PATIENCE_S)
-            made.tokens += [line for line in created.text.splitlines() if line.startswith("gdp1")]
+            created.until_logged("listening on TCP port", patience_s=PATIENCE_S)
+            made.tokens += [line for line in created.logged.splitlines() if line.startswith("gdp1")]
             yield made
     finally:
         run.end()
@@ -133,19 +134,19 @@ def test_on_a_full_disk_no_directory_is_left_and_no_token_used(site: Field, comm
 )
 def test_a_border_whose_port_is_taken_creates_no_domain(site: Field, bound: str, text: str) -> None:
     user = site.second.type(f"python -c {shlex.quote(LISTEN.format(bound))}")
-    user.wait_for("bound", PATIENCE_S)
+    user.until_logged("bound", patience_s=PATIENCE_S)
     said = site.refusal(site.second, "gdp domain create lab --public 192.0.2.1")
-    user.end()
+    user.close()
     assert text in said
     assert "end that one, or state another port with --" in said
 
 
 def test_a_machine_whose_network_lets_only_tcp_443_through_joins(site: Field) -> None:
     joined = site.blocked.type("gdp join --label blocked", site.tokens[0])
-    joined.wait_for("joined the domain lab as blocked", PATIENCE_S)
-    joined.wait_for("frames pass through TLS at the border", PATIENCE_S)
+    joined.until_logged("joined the domain lab as blocked", patience_s=PATIENCE_S)
+    joined.until_logged("frames pass through TLS at the border", patience_s=PATIENCE_S)
 
 
 def test_after_all_refusals_the_same_token_is_good(site: Field) -> None:
     joined = site.robot.type(JOIN, site.tokens[-1])
-    joined.wait_for("tunnels are up: border", PATIENCE_S)
+    joined.until_logged("tunnels are up: border", patience_s=PATIENCE_S)

@@ -9,20 +9,14 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gdp.client.participant import Participant, Topic
-from gdp.control.settings import NodeSettings
-from gdp.nodes.delegation_store import DelegationStore
-from gdp.nodes.membership import incarnation, wall_clock_ms
-from gdp.ports.raw import RawPlane
-from gdp.runtime.runtime import Runtime
-from gdp.stores.keyring import DELEGATIONS, load_identity, load_root
-from gdp.trust.domain import Policy
+from gdp.client.participant import Topic
+from gdp.config.schema import Domain
+from lab.end import End
 
 GAP_S = 0.002  # between requests
 PATIENCE_S = 30.0
@@ -31,10 +25,10 @@ PATIENCE_S = 30.0
 class Robot:
     """Client that calls on command."""
 
-    def __init__(self, member: Participant, runtime: Runtime, topic: Topic, requests: int, size: int) -> None:
-        self._member, self._runtime, self._service = member, runtime, topic.name
+    def __init__(self, end: End, topic: Topic, requests: int, size: int) -> None:
+        self._member, self._runtime, self._service = end.member, end.runtime, topic.name
         self._requests, self._body = requests, bytes(size)
-        self._stream = member.call(topic, b"requests")
+        self._stream = end.member.call(topic, b"requests")
         self._stream.bundle_bytes = 0
 
     def meet(self, peers: int) -> None:
@@ -64,28 +58,20 @@ class Robot:
 
 def main(service: str, identity_at: str, root: str, device: str, role: str, *load: str) -> None:
     """Run the replica (``role`` is ``serve``) or the robot (``call``, then requests and bytes) at a switch's device."""
-    identity = load_identity(Path(identity_at), time.time())
-    policy = Policy(load_root(Path(root)), [])
-    (topic,) = DelegationStore(Path(identity_at) / DELEGATIONS, identity)
+    end = End(Path(identity_at), Domain(root=Path(root)), device)
+    (topic,) = end.topics.values()
     assert topic.name.to_text() == service
-    member = Participant(
-        identity,
-        policy,
-        NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes),
-    )
-    plane = RawPlane([device])
-    runtime = Runtime(member, plane)
     if role == "serve":
-        member.serve(topic, b"a replica")
+        end.member.serve(topic, b"a replica")
         print("up", flush=True)
-        runtime.run(lambda: bool(member.poll_messages() and False))
+        end.runtime.run(lambda: bool(end.member.poll_messages() and False))
         return
-    robot = Robot(member, runtime, topic, *map(int, load))
+    robot = Robot(end, topic, *map(int, load))
     words = os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0)
     heard: list[object] = []
-    runtime.watch(words, lambda: heard.append(json.loads(words.readline() or "{}").get("word")))
+    end.runtime.watch(words, lambda: heard.append(json.loads(words.readline() or "{}").get("word")))
     print("up", flush=True)
-    while runtime.run(lambda: bool(heard)) and (word := heard.pop()):
+    while end.runtime.run(lambda: bool(heard)) and (word := heard.pop()):
         if word == "go":
             robot.publish()
         elif word == "ask":

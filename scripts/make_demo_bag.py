@@ -9,12 +9,13 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gdp.errors import LocalError
@@ -29,6 +30,7 @@ RADIUS_M, SPEED_M_S = 1.5, 0.6
 BEAMS: Final = 720
 RANGE_M: Final = (0.12, 6.5)
 MAP_CELL_M: Final = 0.05
+Fields = Mapping[str, Any]
 
 IMAGES: Final = "/camera/image"
 TYPES: Final = {  # topic: type, messages a second (0: one, latched)
@@ -83,45 +85,34 @@ class Drive:
         self.ground = np.tile(scene(), (2, 2, 1))
         self.seq = 0
 
-    def make(self, type_name: str, **fields: object) -> object:
-        """Return a message of a type with these fields."""
-        return self.store.types[type_name](**fields)  # type: ignore[arg-type]
+    def make(self, type_name: str, given: Fields) -> object:
+        """Return a message of a type with these fields; a number that is not given is 0."""
+        fields = dict[str, Any]()
+        for name, (kind, of) in self.store.fielddefs[type_name][1]:
+            value = given.get(name, {} if kind == Nodetype.NAME else 0)
+            if kind == Nodetype.NAME:
+                value = self.make(str(of), value)
+            elif isinstance(value, list):
+                value = [self.make(str(of[0][1]), each) for each in value]
+            fields[name] = value
+        return self.store.types[type_name](**fields)
 
     def channel(self, topic: str) -> Channel:
         """Return a topic's channel, with definition and hash."""
         type_name, rate = TYPES[topic]
         definition, md5 = self.store.generate_msgdef(type_name, ros_version=self.ros)
-        latched = rate == 0
+        common: dict[str, Any] = {"definition": definition, "definition_format": "msg", "latched": rate == 0}
         if self.ros == 1:
-            return Channel(
-                topic,
-                type_name,
-                1,
-                hash=md5,
-                definition=definition,
-                definition_format="msg",
-                latched=latched,
-                callerid="/robot",
-            )
-        durability = "transient_local" if latched else "volatile"
+            return Channel(topic, type_name, 1, hash=md5, callerid="/robot", **common)
+        durability = "volatile" if rate else "transient_local"
         never = (2_147_483_647, 4_294_967_295)
         qos = Qos(depth=10, reliability="reliable", durability=durability, deadline=never, lifespan=never, lease=never)
-        digest = self.store.hash_rihs01(type_name)
-        return Channel(
-            topic,
-            type_name,
-            2,
-            hash=digest,
-            definition=definition,
-            definition_format="msg",
-            qos=(qos,),
-            latched=latched,
-        )
+        return Channel(topic, type_name, 2, hash=self.store.hash_rihs01(type_name), qos=(qos,), **common)
 
     def raw(self, topic: str, at_ns: int) -> bytes:
         """Return the message of a topic at a moment, in wire form."""
         type_name = TYPES[topic][0]
-        message = {
+        make = {
             "/tf_static": self.static_transforms,
             "/map": self.map,
             IMAGES: self.image,
@@ -129,19 +120,17 @@ class Drive:
             "/imu": self.imu,
             "/odom": self.odometry,
             "/tf": self.transforms,
-        }[topic](at_ns)
+        }[topic]
+        message = self.make(type_name, make(at_ns))
         if self.ros == 1:
             return bytes(self.store.serialize_ros1(message, type_name))
         return bytes(self.store.serialize_cdr(message, type_name, little_endian=True))
 
-    def header(self, at_ns: int, frame: str) -> object:
+    def header(self, at_ns: int, frame: str) -> Fields:
         """Return a header; ``at_ns`` counts from the start."""
         seconds, nanoseconds = divmod(START_NS + at_ns, 1_000_000_000)
-        stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        if self.ros == 2:
-            return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-        self.seq += 1
-        return self.make("std_msgs/msg/Header", seq=self.seq, stamp=stamp, frame_id=frame)
+        self.seq += 1  # ROS 1 alone
+        return {"seq": self.seq, "stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
     def pose_at(self, at_ns: int) -> tuple[float, float, float]:
         """Return x, y in metres and the heading in radians; rounded, so that no library's last digit shows."""
@@ -149,79 +138,61 @@ class Drive:
         x, y = RADIUS_M * math.sin(turned), -RADIUS_M * math.cos(turned)
         return round(x, 9), round(y, 9), round(turned, 9)
 
-    def vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> object:
-        """Return a vector."""
-        return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-    def quaternion(self, heading: float) -> object:
+    def quaternion(self, heading: float) -> Fields:
         """Return the rotation about z; ``heading`` in radians."""
-        z, w = round(math.sin(heading / 2), 9), round(math.cos(heading / 2), 9)
-        return self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+        return {"z": round(math.sin(heading / 2), 9), "w": round(math.cos(heading / 2), 9)}
 
-    def transform(self, at_ns: int, frames: tuple[str, str], at: tuple[float, float, float], heading: float) -> object:
+    def transform(
+        self, at_ns: int, frames: tuple[str, str], at: tuple[float, float, float], heading: float = 0.0
+    ) -> Fields:
         """Return the transform between two frames; metres, ``heading`` in radians."""
-        return self.make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(at_ns, frames[0]),
-            child_frame_id=frames[1],
-            transform=self.make(
-                "geometry_msgs/msg/Transform", translation=self.vector(*at), rotation=self.quaternion(heading)
-            ),
-        )
+        transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": self.quaternion(heading)}
+        return {"header": self.header(at_ns, frames[0]), "child_frame_id": frames[1], "transform": transform}
 
-    def static_transforms(self, at_ns: int) -> object:
+    def static_transforms(self, at_ns: int) -> Fields:
         """Return the mounts of camera and laser."""
-        camera = self.transform(at_ns, ("base_link", "camera"), (0.2, 0.0, 0.3), 0.0)
-        laser = self.transform(at_ns, ("base_link", "laser"), (0.1, 0.0, 0.2), 0.0)
-        return self.make("tf2_msgs/msg/TFMessage", transforms=[camera, laser])
+        mounts = {"camera": (0.2, 0.0, 0.3), "laser": (0.1, 0.0, 0.2)}
+        return {"transforms": [self.transform(at_ns, ("base_link", each), at) for each, at in mounts.items()]}
 
-    def transforms(self, at_ns: int) -> object:
+    def transforms(self, at_ns: int) -> Fields:
         """Return the pose of the base in the odometry frame."""
         x, y, heading = self.pose_at(at_ns)
-        return self.make(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[self.transform(at_ns, ("odom", "base_link"), (x, y, 0.0), heading)],
-        )
+        return {"transforms": [self.transform(at_ns, ("odom", "base_link"), (x, y, 0.0), heading)]}
 
-    def map(self, at_ns: int) -> object:
+    def map(self, at_ns: int) -> Fields:
         """Return the occupancy grid of the walls."""
         columns, rows = (round(side / MAP_CELL_M) for side in HALL_M)
         cells = np.zeros((rows, columns), np.int8)
         cells[0] = cells[-1] = cells[:, 0] = cells[:, -1] = 100
         cells[rows // 3 : rows // 2, -1] = -1  # the door: unknown
-        origin = self.make(
-            "geometry_msgs/msg/Pose",
-            position=self.make("geometry_msgs/msg/Point", x=-HALL_M[0] / 2, y=-HALL_M[1] / 2, z=0.0),
-            orientation=self.quaternion(0.0),
-        )
-        header = self.header(at_ns, "map")
-        info = self.make(
-            "nav_msgs/msg/MapMetaData",
-            map_load_time=self.make("builtin_interfaces/msg/Time", sec=START_NS // 1_000_000_000, nanosec=0),
-            resolution=MAP_CELL_M,
-            width=columns,
-            height=rows,
-            origin=origin,
-        )
-        return self.make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=cells.reshape(-1))
+        info = {
+            "map_load_time": {"sec": START_NS // 1_000_000_000},
+            "resolution": MAP_CELL_M,
+            "width": columns,
+            "height": rows,
+            "origin": {
+                "position": {"x": -HALL_M[0] / 2, "y": -HALL_M[1] / 2},
+                "orientation": self.quaternion(0.0),
+            },
+        }
+        return {"header": self.header(at_ns, "map"), "info": info, "data": cells.reshape(-1)}
 
-    def image(self, at_ns: int) -> object:
+    def image(self, at_ns: int) -> Fields:
         """Return the image of the camera: RGB, ``HEIGHT`` x ``WIDTH`` pixels."""
         x, y, _ = self.pose_at(at_ns)
         left, top = (round(256 * value) % TEXTURE for value in (x, y))
         view = self.ground[top : top + HEIGHT, left : left + WIDTH]
-        return self.make(
-            "sensor_msgs/msg/Image",
-            header=self.header(at_ns, "camera"),
-            height=HEIGHT,
-            width=WIDTH,
-            encoding="rgb8",
-            is_bigendian=0,
-            step=3 * WIDTH,
-            data=np.ascontiguousarray(view).reshape(-1),
-        )
+        return {
+            "header": self.header(at_ns, "camera"),
+            "height": HEIGHT,
+            "width": WIDTH,
+            "encoding": "rgb8",
+            "is_bigendian": 0,
+            "step": 3 * WIDTH,
+            "data": np.ascontiguousarray(view).reshape(-1),
+        }
 
-    def scan(self, at_ns: int) -> object:
+    def scan(self, at_ns: int) -> Fields:
         """Return the laser scan: ``BEAMS`` ranges in metres."""
         x, y, heading = self.pose_at(at_ns)
         angles = -math.pi + np.arange(BEAMS) * (2 * math.pi / BEAMS)
@@ -234,58 +205,47 @@ class Drive:
         ranges[BEAMS // 2 - 2 : BEAMS // 2 + 2] = -np.inf  # too close: the robot's own bumper
         ranges[at_ns // 100_000_000 % BEAMS :: 97] = np.nan  # no return
         intensities = np.where(np.isfinite(ranges), 1000, 0).astype(np.float32)
-        return self.make(
-            "sensor_msgs/msg/LaserScan",
-            header=self.header(at_ns, "laser"),
-            angle_min=-math.pi,
-            angle_max=math.pi,
-            angle_increment=2 * math.pi / BEAMS,
-            time_increment=0.1 / BEAMS,
-            scan_time=0.1,
-            range_min=RANGE_M[0],
-            range_max=RANGE_M[1],
-            ranges=ranges,
-            intensities=intensities,
-        )
+        return {
+            "header": self.header(at_ns, "laser"),
+            "angle_min": -math.pi,
+            "angle_max": math.pi,
+            "angle_increment": 2 * math.pi / BEAMS,
+            "time_increment": 0.1 / BEAMS,
+            "scan_time": 0.1,
+            "range_min": RANGE_M[0],
+            "range_max": RANGE_M[1],
+            "ranges": ranges,
+            "intensities": intensities,
+        }
 
-    def imu(self, at_ns: int) -> object:
+    def imu(self, at_ns: int) -> Fields:
         """Return the reading of the IMU."""
         _, _, heading = self.pose_at(at_ns)
         shake = round(0.05 * math.sin(at_ns / 1e9 * 40), 9)
         unknown = np.zeros(9)
         unknown[0] = -1
-        return self.make(
-            "sensor_msgs/msg/Imu",
-            header=self.header(at_ns, "base_link"),
-            orientation=self.quaternion(heading),
-            orientation_covariance=np.diag([1e-3] * 3).reshape(-1),
-            angular_velocity=self.vector(z=SPEED_M_S / RADIUS_M),
-            angular_velocity_covariance=unknown,
-            linear_acceleration=self.vector(shake, SPEED_M_S**2 / RADIUS_M, 9.81),
-            linear_acceleration_covariance=unknown,
-        )
+        return {
+            "header": self.header(at_ns, "base_link"),
+            "orientation": self.quaternion(heading),
+            "orientation_covariance": np.diag([1e-3] * 3).reshape(-1),
+            "angular_velocity": {"z": SPEED_M_S / RADIUS_M},
+            "angular_velocity_covariance": unknown,
+            "linear_acceleration": {"x": shake, "y": SPEED_M_S**2 / RADIUS_M, "z": 9.81},
+            "linear_acceleration_covariance": unknown,
+        }
 
-    def odometry(self, at_ns: int) -> object:
+    def odometry(self, at_ns: int) -> Fields:
         """Return pose and speed of the base."""
         x, y, heading = self.pose_at(at_ns)
         spread = np.diag([1e-4] * 6).reshape(-1)
-        pose = self.make(
-            "geometry_msgs/msg/Pose",
-            position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
-            orientation=self.quaternion(heading),
-        )
-        twist = self.make(
-            "geometry_msgs/msg/Twist",
-            linear=self.vector(SPEED_M_S),
-            angular=self.vector(z=SPEED_M_S / RADIUS_M),
-        )
-        return self.make(
-            "nav_msgs/msg/Odometry",
-            header=self.header(at_ns, "odom"),
-            child_frame_id="base_link",
-            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=spread),
-            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=spread),
-        )
+        pose = {"position": {"x": x, "y": y}, "orientation": self.quaternion(heading)}
+        twist = {"linear": {"x": SPEED_M_S}, "angular": {"z": SPEED_M_S / RADIUS_M}}
+        return {
+            "header": self.header(at_ns, "odom"),
+            "child_frame_id": "base_link",
+            "pose": {"pose": pose, "covariance": spread},
+            "twist": {"twist": twist, "covariance": spread},
+        }
 
 
 def moments(seconds: float) -> Iterator[tuple[int, str]]:

@@ -9,45 +9,32 @@ from __future__ import annotations
 
 import os
 import select
-import subprocess
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
-from types import TracebackType
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Final
+
+from lab.process import LabProcess
 
 SHARE: Final = 0.5  # of each core
 LOADS: Final = {"none": (False,), "half": (True,), "both": (False, True)}  # of ``--load``: with or without, in turn
 _PERIOD_S: Final = 0.01
 
 
-class BackgroundLoad:
-    """Load on every core that this process may use, from ``__enter__`` to ``__exit__``."""
-
-    def __init__(self) -> None:
-        self._processes: list[subprocess.Popen[bytes]] = []
-
-    def __enter__(self) -> BackgroundLoad:
-        for core in sorted(os.sched_getaffinity(0)):
-            command = [sys.executable, __file__, str(core)]
-            self._processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
-        for process in self._processes:
-            assert process.stdout is not None
-            process.stdout.readline()  # it runs on its core
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        for process in self._processes:
-            process.kill()
-        for process in self._processes:
-            with process:  # waits, and closes the pipes
-                pass
-        self._processes.clear()
-
-
-def load_of(loaded: bool) -> AbstractContextManager[object]:
-    """Return a context with the load, or without."""
-    return BackgroundLoad() if loaded else nullcontext()
+@contextmanager
+def load_of(*, loaded: bool) -> Iterator[Sequence[LabProcess]]:
+    """Run the load on every core that this process may use, or none; yield its processes."""
+    with ExitStack() as stack:
+        processes = []
+        for core in sorted(os.sched_getaffinity(0)) if loaded else ():
+            argv = [sys.executable, __file__, str(core)]
+            load = LabProcess(None, f"load of core {core}", argv, log=Path(os.devnull), has_orders=True)
+            processes.append(stack.enter_context(load))
+        for each in processes:
+            each.read_until("ready")
+        yield processes
 
 
 def compute(core: int) -> None:

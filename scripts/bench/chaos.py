@@ -42,11 +42,11 @@ from faults.plan import VICTIM, Oracle, Plan, random_network
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
 from report import percentile, print_table, progress
-from skeleton import Options, clean_exit, command_line, new_run
+from skeleton import Options, clean_exit, command_line
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError, until
+from lab.process import FailedError, new_run, until
 from lab.topology import ends_of
 
 SECONDS: Final = 60.0
@@ -169,7 +169,7 @@ class Chaos:
     def _is_last_life(self, member: str, incarnation_id: int) -> bool:
         """Return whether what this incarnation of a member sends and receives continues to the end of the run."""
         is_revoked = member == VICTIM and self.revoked_ns is not None
-        return incarnation_id == self._overlay.incarnation_id(f"member {member}") and not is_revoked
+        return incarnation_id == self._overlay.incarnation_ids[f"member {member}"] and not is_revoked
 
     def _unreachable(self) -> list[str]:
         silent = self._continuity.unreached()
@@ -186,7 +186,7 @@ class Chaos:
 
     def _note(self) -> None:
         """Record what must be connected from now on."""
-        at = {mover: self._overlay.at(mover) for mover in self._plan.homes}
+        at = {mover: self._overlay.at[mover] for mover in self._plan.homes}
         broken = broken_by(self._under_way, at)
         if self.revoked_ns is not None:
             broken.members.add(VICTIM)
@@ -195,14 +195,14 @@ class Chaos:
     def _begin(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
         if kind is FaultKind.CUT:
-            overlay.cut(*targets)
+            overlay.spaces.cut(*targets)
         elif kind in FRAMES:
             overlay.disturb(targets[0], targets[1], FRAMES[kind])
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.cut(*ends_of(link))
+                overlay.spaces.cut(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
-            self._ended_lives.add((targets[0].removeprefix("member "), overlay.incarnation_id(targets[0])))
+            self._ended_lives.add((targets[0].removeprefix("member "), overlay.incarnation_ids[targets[0]]))
             overlay.kill(targets[0])
         elif kind is FaultKind.FREEZE:
             overlay.freeze(targets[0])
@@ -233,12 +233,12 @@ class Chaos:
     def _end(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
         if kind is FaultKind.CUT:
-            overlay.restore_link(*targets)
+            overlay.spaces.restore_link(*targets)
         elif kind in FRAMES:
             overlay.calm(*targets)
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.restore_link(*ends_of(link))
+                overlay.spaces.restore_link(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             overlay.start(targets[0])
             self._await(targets[0])
@@ -255,7 +255,7 @@ class Chaos:
 
     def _await(self, who: str) -> None:
         """Continue to read records while a restarted process comes up; it joins the network when it reports ready."""
-        while not self._overlay.is_ready(who):
+        while not self._overlay.processes[who].has_line(0.0):
             self._watch(time.monotonic() + LOOK_S)
 
     def _after_revocation(self) -> list[str]:
@@ -279,7 +279,7 @@ class Chaos:
             who = f"rib {node}"
             for incarnation_id, log in self._overlay.logs(who):
                 if self._overlay.keeps_snapshot(node):
-                    is_alive = incarnation_id == self._overlay.incarnation_id(who) and self._overlay.is_running(who)
+                    is_alive = incarnation_id == self._overlay.incarnation_ids[who] and who in self._overlay.processes
                     found += snapshot_faults(f"{who} (life {incarnation_id})", log, is_alive=is_alive)
         if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
@@ -293,7 +293,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
     return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
 
 
-def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
+def run_seed(seed: int, options: Options) -> list[str]:
     """Run one seed; print its table; return what broke.
 
     Raises ``FailedError``: the network did not come up. Raises ``GdpError``: the kernel refuses.
@@ -308,7 +308,7 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
     begun_s = time.monotonic()
     with (
-        new_run(runs) as run,
+        new_run() as run,
         Overlay(run, plan, has_clocks=True, has_disk=True, in_store=in_store, more=more) as overlay,
     ):
         overlay.start_all()
@@ -429,11 +429,10 @@ def main() -> None:
     options = parser.parse_args()
     broken: list[int] = []
     with clean_exit():
-        runs = RunRegistry()
-        runs.sweep()  # remains of a killed run
+        RunRegistry().sweep()  # remains of a killed run
         for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
             try:
-                broke = run_seed(runs, seed, options)
+                broke = run_seed(seed, options)
             except GdpError as error:
                 print(f"seed {seed}: {error}")
                 broke = [str(error)]

@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,12 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from report import Rounds, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
 from fog.supervisor.core.record import Record
 from gdp.enrolment.registry import Registry
-from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError
+from lab.process import FailedError, new_run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -59,7 +57,7 @@ STAGES: Final = (
 )
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Launch and end a cluster of one machine in each round, in one data centre."""
     if reason := why_not():
         raise FailedError(reason)
@@ -67,9 +65,8 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gdp-cloud-boot-")))
         software = wheelhouse(folder / "wheels")
-        run = stack.enter_context(new_run(runs))
-        stack.enter_context(Space())
-        subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+        run = stack.enter_context(new_run())
+        stack.enter_context(Space()).ip("link", "set", "lo", "up")
         from lab.ec2 import DataCenter, serving_ec2  # moto, an extra
 
         logging.getLogger("werkzeug").setLevel(logging.WARNING)  # the simulation logs each request

@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Final
 
 from report import Rounds, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
-from internet.fresh_machine import FreshMachine, Shell, TypedCommand, typed_commands
+from internet.fresh_machine import FreshMachine, TypedCommand, typed_commands
 from internet.laboratory import Laboratory
-from lab.process import FailedError, LabProcess
+from lab.process import FailedError, LabProcess, new_run
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "internet.md"
 BORDER_HOST: Final = "border.example.org"  # in the tutorial; here the border's address
@@ -66,21 +65,21 @@ class Tutorial:
             self._wait(command, shell)
         except LocalError as error:
             raise FailedError(f"{command.machine}: {command.text}: {error}") from error
-        self._tokens += _TOKEN.findall(shell.text)
+        self._tokens += _TOKEN.findall(shell.logged)
 
-    def _wait(self, command: TypedCommand, shell: Shell) -> None:
+    def _wait(self, command: TypedCommand, shell: LabProcess) -> None:
         done = next((words for start, words in _DONE.items() if command.text.startswith(start)), "")
         if done:
-            shell.wait_for(done, _PATIENCE_S)
+            shell.until_logged(done, patience_s=_PATIENCE_S)
         else:
-            shell.wait(_PATIENCE_S)
+            shell.output(_PATIENCE_S)
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Follow the tutorial from its beginning in each round."""
     over, commands = Rounds(), typed_commands(PAGE.read_text(encoding="utf-8"))
     for number in range(1, options.rounds + 1):
-        for what, seconds in _follow(commands, runs).items():
+        for what, seconds in _follow(commands).items():
             over.add(BASELINE, TIMES, what, seconds)
             progress(f"round {number}, {what}: {seconds:.1f} s")
     for label in _SITES:
@@ -103,16 +102,15 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     return Outcome("first_topic", "First topic between fresh machines behind two NATs", over, targets, settings)
 
 
-def _follow(commands: Sequence[TypedCommand], runs: RunRegistry) -> Mapping[str, float]:
+def _follow(commands: Sequence[TypedCommand]) -> Mapping[str, float]:
     """Return the seconds of each command, from the last one to the first image, and of all."""
     found = dict[str, float]()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         tutorial = Tutorial(laboratory, stack)
         nodes = {}
         for label, role in (("robot", "camera"), ("server", "viewer")):
             settings = [_ENDPOINT, role, json.dumps({"topic": TOPIC})]
-            argv = tutorial.machines[label].command([sys.executable, *settings])
-            nodes[role] = stack.enter_context(LabProcess(run, role, argv))
+            nodes[role] = tutorial.machines[label].launch([sys.executable, *settings], role)
             nodes[role].read(_PATIENCE_S)
         begun_s = at_s = time.monotonic()
         for each in commands:

@@ -24,16 +24,16 @@ from typing import Final
 
 from forwarding_end import SINK, SOURCE
 from plot import Panel, panel_of
-from pyroute2 import IPRoute
 from report import Rounds, Target, percentile
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab, add_bridge, mac_addresses
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.frame.codec import OVERHEAD_BYTES, Header, encode
 from gdp.frame.kinds import ETHERTYPE, Kind
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
-from lab.process import FailedError, LabProcess, figures_of, floats_of
+from lab.machines import Lab
+from lab.namespaces import add_bridge, mac_addresses, remove_link
+from lab.process import FailedError, LabProcess, new_run
 from lab.topology import chain
 
 KERNEL, BRIDGE = "kernel", "bridge"
@@ -93,8 +93,7 @@ class Row(Lab):
                 ways = {side: f"{at} {self._macs[at][node].hex()}" for side, at in (("left", left), ("right", right))}
                 workers.append(undo.enter_context(self._worker(node, "switch", ways=ways)))
             for worker in workers:
-                if reason := worker.read(_READY_S).get("refused_because"):
-                    raise FailedError(str(reason))
+                worker.read(_READY_S)
             yield self._frames(1)
 
     @contextmanager
@@ -103,7 +102,7 @@ class Row(Lab):
         with ExitStack() as undo:
             for node in self.topology.nodes[1:-1]:
                 self.inside(node, partial(add_bridge, _BRIDGE, self._devices(node)))
-                undo.callback(self.inside, node, _remove_bridge)
+                undo.callback(self.inside, node, partial(remove_link, _BRIDGE))
             frames = self._frames(4)
             self.round_trips(frames, _WARM_UP_PINGS)
             yield frames
@@ -111,8 +110,8 @@ class Row(Lab):
     def flat_out(self, frames: Mapping[str, str], seconds: float) -> dict[str, float]:
         """Send at full speed for a while; return rate and loss. Raises ``FailedError``: a process ended."""
         self._sink.ask(do="count")
-        sent = figures_of(self._source.ask(do="send", frame=frames["there"], seconds=seconds))
-        got = figures_of(self._sink.ask(expected=sent["sent"]))
+        sent = self._source.ask(do="send", frame=frames["there"], seconds=seconds)
+        got = self._sink.ask(expected=sent["sent"])
         late_s = max(got["last_s"] - sent["end_s"], 0.0)
         loss = 1 - got["got"] / max(sent["sent"], 1)
         holds = loss < LOSS_MAX and late_s < LATE_MAX_S
@@ -125,7 +124,7 @@ class Row(Lab):
         Raises ``FailedError``: a process ended.
         """
         self._sink.ask(do="answer", frame=frames["back"], pings=pings)
-        times = floats_of(self._source.ask(do="ping", frame=frames["there"], pings=pings), "rtt_us")
+        times: list[float] = self._source.ask(do="ping", frame=frames["there"], pings=pings)["rtt_us"]
         self._sink.read(_READY_S)
         return times
 
@@ -148,11 +147,6 @@ class Row(Lab):
         return self.start(node, role, ["-m", "forwarding_end", role, json.dumps(settings)], has_orders=True)
 
 
-def _remove_bridge() -> None:
-    with IPRoute() as here:
-        here.link("del", index=here.link_lookup(ifname=_BRIDGE)[0])
-
-
 def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> dict[str, float]:
     """Return the figures of one baseline, by column. Raises ``FailedError``: it is not available, or loses frames."""
     with row.kernel() if baseline == KERNEL else row.bridge() as frames:
@@ -172,10 +166,10 @@ def targets_of(over: Rounds) -> list[Target]:
     ]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure both, round by round."""
     recorder, pings = Recorder(), int(options.pings)
-    with new_run(runs) as run, Row(run) as row:
+    with new_run() as run, Row(run) as row:
         columns = (RATE, LOSS, TRIP, TRIP_P99)
         trials = [
             Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))

@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Final
 
 from report import Rounds
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link.conditions import LOSSES, Conditions
 from thin_link.line import thin_link_lab
 from thin_link.systems import SYSTEMS
 from thin_link.traffic import CAMERA_BYTES, RELIABLE, streams
 from uplink import OURS, exchange
 
-from gdp.host.run_registry import RunRegistry
+from lab.machines import Lab
+from lab.process import new_run
 
 GOODPUT, SHARE, LATE = "goodput, Mbit/s", "link share", "relay late p99, ms"
 ROWS: Final = (OURS, "zenoh-tls-block", "zenoh-quic-block")
@@ -41,12 +41,12 @@ def goodput(lab: Lab, link: Conditions, name: str, options: Options) -> dict[str
     }
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every system, round by round."""
     recorder = Recorder()
     link = Conditions.of(options.rate, options.rtt, options.loss, "bdp", seed=options.seed, traces=Path())
     for number in range(1, options.rounds + 1):
-        with new_run(runs) as run:
+        with new_run() as run:
             lab = thin_link_lab(run, tcp_control=options.tcp_control)
             for name in ROWS:
                 work = partial(goodput, lab, link, name, options)

@@ -32,10 +32,10 @@ from peers.exchange import ANSWER, SIZE_MIN
 from peers.systems import BASELINES, Baseline
 from plot import Panel, panel_of
 from report import Rounds, Target, percentile
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, parse, perform
+from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
-from gdp.host.run_registry import RunRegistry
 from gdp.runtime.busy_poll import SPIN_US
+from lab.process import new_run
 
 MEDIAN: Final = "RTT median, ms"
 P99: Final = "RTT p99, ms"
@@ -77,7 +77,7 @@ def count_of(size: int, options: Options) -> int:
 
 def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
     """Return the figures of one baseline in one case, by column."""
-    with load_of(loaded):
+    with load_of(loaded=loaded):
         found = baseline.measure(chain, size, count)
     times_s: Sequence[float] = found["rtt_s"]
     figures = {MEDIAN: 1e3 * percentile(times_s, 0.5), P99: 1e3 * percentile(times_s, 0.99)}
@@ -129,15 +129,13 @@ def size_of(text: str) -> int:
     return size
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every baseline in every case, round by round."""
     names, sizes = options.only or list(BASELINES), options.size or SIZES
     recorder = Recorder()
     cases: list[Case] = list(product(sizes, options.mtu or MTUS, LOADS[options.load]))
     with ExitStack() as stack:
-        chains = {
-            mtu: Chain(mtu, stack.enter_context(new_run(runs))) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)
-        }
+        chains = {mtu: Chain(mtu, stack.enter_context(new_run())) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)}
         trials = [
             Trial(
                 case_of(size, mtu, loaded=loaded),

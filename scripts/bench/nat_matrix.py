@@ -14,11 +14,12 @@ import json
 import sys
 
 from report import print_table
-from skeleton import new_run
 
+from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.laboratory import Laboratory
 from internet.matrix import Outcome, Pair, batches, measure
+from lab.process import new_run
 
 KINDS = [each.value for each in Access]
 
@@ -32,6 +33,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
     options = parser.parse_args()
     kinds = [Access(each) for each in options.kinds]
+    RunRegistry().sweep()  # remains of a killed run
     found: dict[Pair, Outcome] = {}
     for batch in batches(kinds):
         with new_run() as run, Laboratory(run) as laboratory:

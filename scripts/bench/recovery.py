@@ -29,7 +29,6 @@ from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from fog_demo.cluster import DEDICATED, ECHO, REPLICA, Cluster, requests_in
-from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
 
 PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
@@ -112,9 +111,8 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every case, round by round."""
-    del runs  # the cluster has runs of its own
     is_replica = options.gateway == REPLICA
     cases = options.only or [case for case in CASES if is_replica or case != FROZEN]
     if FROZEN in cases and not is_replica:

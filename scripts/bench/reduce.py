@@ -24,7 +24,6 @@ from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
@@ -220,9 +219,8 @@ def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]
     }
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every reduction on every case, round by round."""
-    del runs
     over = Rounds()
     every = cases(options.bags)
     for _ in range(options.rounds):

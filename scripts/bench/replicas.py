@@ -21,8 +21,8 @@ import random
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
@@ -30,13 +30,13 @@ _HERE: Final = Path(__file__).resolve().parent
 sys.path.append(str(_HERE.parent / "experiments"))
 
 from asking import Asking  # noqa: E402 - it lies with the experiments
-from field import READY_S, Field, Served, Server, Work  # noqa: E402
+from experiment import field_of, work_of  # noqa: E402
+from field import READY_S, Field, Served, Server  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from samples import Sample, Series  # noqa: E402
-from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
+from skeleton import Options, Outcome, command_line, run_bench  # noqa: E402
 
-from gdp.host.run_registry import RunRegistry  # noqa: E402
 from lab.process import FailedError  # noqa: E402
 
 KILLED, ADDED, HEDGED = "killed", "added", "hedged"
@@ -137,8 +137,7 @@ class Kills:
 class Bench:
     """Rounds in progress. ``over``: the figures."""
 
-    def __init__(self, runs: RunRegistry, rate: float, draw: random.Random) -> None:
-        self._runs = runs
+    def __init__(self, rate: float, draw: random.Random) -> None:
         self._rate = rate
         self._draw = draw
         self.over = Rounds()
@@ -146,7 +145,7 @@ class Bench:
     def killed(self, count: int) -> None:
         """Call three replicas while two of them are killed repeatedly."""
         served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
-        with self._field(served) as here, Kills(here, self._draw) as kills:
+        with _field(served) as here, Kills(here, self._draw) as kills:
             found, asking = _ask(here, ["/number"], count, lanes=_LANES, rate=self._rate, counts_answers=True)
         samples = found["/number"]
         figures: dict[str, float | None] = {
@@ -161,7 +160,7 @@ class Bench:
     def added(self, count: int) -> None:
         """Call one server and two replicas in turn; all are idle between two calls."""
         names = {ONE: "/one", TWO: "/two"}
-        with self._field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
+        with _field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
             found, _ = _ask(here, list(names.values()), count, rate=_RESTFUL)
         for who, name in names.items():
             self._add(ADDED, who, _latencies(found[name]))
@@ -176,7 +175,7 @@ class Bench:
             Served("/late", TYPE, _MACHINES[:2], imports={"replication": {"mode": "hedged", "budget": _BUDGET}}),
         ]
         turns = ["/one/m1", "/both", "/late", "/one/m2", "/both", "/late"]
-        with self._field(served, _SLOW) as here:
+        with _field(served, **_SLOW) as here:
             found, asking = _ask(here, turns, count, rate=_BRISK)
         for who, its in names.items():
             had = sum(_had(found[name]) for name in its)
@@ -184,18 +183,14 @@ class Bench:
             samples = [each for name in its for each in found[name]]
             self._add(HEDGED, who, {**_latencies(samples), EXTRA: 100 * (had / asked - 1)})
 
-    @contextmanager
-    def _field(self, served: Sequence[Served], settings: Mapping[str, object] | None = None) -> Iterator[Field]:
-        names = {each: " ".join(one.name for one in served if each in one.machines) for each in _MACHINES}
-        work = {
-            each: Work("replicate", {**(settings or {}), "services": its}, _END) for each, its in names.items() if its
-        }
-        with new_run(self._runs) as run, Field(run, served, work) as here:
-            yield here
-
     def _add(self, case: str, who: str, figures: Mapping[str, float | None]) -> None:
         for column, value in figures.items():
             self.over.add(who, CASES[case], column, value)
+
+
+def _field(served: Sequence[Served], **settings: object) -> AbstractContextManager[Field]:
+    used = (each for each in _MACHINES if any(each in one.machines for one in served))
+    return field_of(served, work_of(served, "replicate", dict.fromkeys(used, settings), _END))
 
 
 def targets_of(over: Rounds) -> list[Target]:
@@ -224,9 +219,9 @@ def panels_of(over: Rounds) -> list[Panel]:
     ]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure the parts in turn, round by round."""
-    bench = Bench(runs, options.rate, random.Random(SEED))
+    bench = Bench(options.rate, random.Random(SEED))
     parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}
     only = options.only or list(parts)
     counts = {each: options.requests or (QUICK if options.quick else REQUESTS)[each] for each in only}

@@ -18,16 +18,14 @@ from contextlib import ExitStack
 from typing import Final
 
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.host import Host
 from internet.laboratory import Laboratory
-from internet.overlay import Overlay
 from internet.site import Site
-from lab.process import until
+from lab.process import new_run, until
 
 TOPIC: Final = "flow"
 TARGET_MS: Final = 300.0
@@ -37,16 +35,13 @@ COLUMN, P99, LOST, DOUBLED = "silence, ms", "p99, ms", "lost", "doubled"
 COMMANDS: Final = "commands, ms"
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every event in turn, in one network."""
     over = Rounds()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
-        border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         homes = [laboratory.add_site(f"home{number}", Access.PORT_RESTRICTED) for number in (1, 2)]
         robot = laboratory.add_host("robot", homes[0])
-        server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-        overlay = stack.enter_context(Overlay(laboratory))
-        flow = _start(overlay, stack, (border, robot, server))
+        flow = _start(robot, stack)
         for what, act in _events(robot, homes).items():
             silences = []
             for number in range(options.rounds):
@@ -71,13 +66,12 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     return Outcome("roaming", "Silence when a robot's address changes", over, targets, settings)
 
 
-def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host]) -> NumberedFlow:
-    _, robot, _ = hosts
-    sender, reader = open_sessions(overlay, stack, hosts, [TOPIC], has_direct=True)
+def _start(robot: Host, stack: ExitStack) -> NumberedFlow:
+    overlay, server, (sender, reader) = open_sessions(robot, stack, [TOPIC], has_direct=True)
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)
-    until(lambda: overlay.tunnels(robot).get("server", {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
+    until(lambda: overlay.tunnels(robot).get(server.label, {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
     return NumberedFlow(publisher, subscription)
 
 

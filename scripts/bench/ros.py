@@ -35,12 +35,12 @@ from typing import Final
 
 from plot import Panel, panel_of
 from report import Rounds, Target
-from ros_row import READY_S, Carried, Row
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, parse, perform
+from ros_row import READY_S, Row
+from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
-from gdp.host.run_registry import RunRegistry
+from lab.credentials import Carried
 from lab.dds import BUFFER_BYTES
-from lab.process import FailedError, figures_of
+from lab.process import FailedError, new_run
 from lab.topology import LEFT, RIGHT
 
 DIRECT, OVERLAY, SESSION = "direct", "overlay, cdr", "overlay, cdr, session"
@@ -77,11 +77,14 @@ STREAMS: Final[Mapping[str, Stream]] = {
     "image": Stream("image, 921,600 B, 30/s", _IMAGE, ("/image",), 1 / 30, {1_500: 4.0, 9_000: 2.0}),
     "small": Stream("small, 100 B, 4,000/s on 20 topics", _TEXT, tuple(f"/small{at}" for at in range(20)), 0.005, {}),
 }
-CARRIED: Final = (
-    *(Carried(topic, each.type_name, "cdr") for each in STREAMS.values() for topic in each.topics),
-    Carried(SERVICES[OVERLAY], "std_srvs/srv/SetBool", "cdr", source=RIGHT, kind="service"),
-    Carried(SERVICES[SESSION], "std_srvs/srv/SetBool", "cdr", source=RIGHT, kind="service", sign="session"),
-)
+_CDR: Final = {"encoding": "cdr"}
+CARRIED: Final = {
+    LEFT: [Carried(topic, each.type_name, options=_CDR) for each in STREAMS.values() for topic in each.topics],
+    RIGHT: [
+        Carried(SERVICES[OVERLAY], "std_srvs/srv/SetBool", "service", _CDR),
+        Carried(SERVICES[SESSION], "std_srvs/srv/SetBool", "service", {**_CDR, "sign": "session"}),
+    ],
+}
 
 
 def case_of(what: str, mtu: int) -> str:
@@ -108,7 +111,7 @@ def measure_stream(row: Row, kind: str, who: str, options: Options, number: int)
         listener.read(READY_S)
         cpu_s = row.proxies_cpu_s()
         os.kill(talker.pid, signal.SIGUSR1)
-        said = figures_of(listener.read(seconds + _DONE_S))
+        said = listener.read(seconds + _DONE_S)
         used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {LOST: said["lost"], "twice": said["twice"]}
 
@@ -123,7 +126,7 @@ def measure_calls(row: Row, case: str, who: str, options: Options, _: int) -> di
         with row.node(LEFT, "ros_calls", role, direct=is_direct, seconds=seconds, **settings) as client:
             client.read(READY_S)
             cpu_s = row.proxies_cpu_s()
-            said = figures_of(client.read(seconds + _DONE_S))
+            said = client.read(seconds + _DONE_S)
             used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {"calls": said["sent"], UNANSWERED: said["lost"], WRONG: said["wrong"]}
 
@@ -178,13 +181,13 @@ def panels_of(over: Rounds) -> list[Panel]:
     return [panel_of(over, case, MEDIAN, names, p99=P99, ours=names[:2]) for case in over.cases()]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every case, round by round, on a row of its own for each MTU."""
     recorder = Recorder()
     with ExitStack() as stack:
         rows = {}
         for mtu in options.mtu:
-            run = stack.enter_context(new_run(runs))
+            run = stack.enter_context(new_run())
             rows[mtu] = stack.enter_context(Row(run, CARRIED, mtu=mtu))
         recorder.interleave(list(trials_of(rows, options)), options.rounds)
     over = recorder.rounds

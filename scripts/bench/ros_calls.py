@@ -36,7 +36,7 @@ def serve(end: End, settings: Settings) -> None:
         response.success = request.data
         return response
 
-    end.node.create_service(SetBool, str(settings["service"]), answer, qos_profile=reliable(_DEPTH))
+    end.node.create_service(SetBool, settings["service"], answer, qos_profile=reliable(_DEPTH))
     say(event="ready")
     end.run()
 
@@ -71,7 +71,7 @@ class _Calls:
 
 def _warm_clients(end: End, settings: Settings, count: int) -> list[Client]:
     """Return clients that have each called more than once."""
-    name, profile = str(settings["service"]), reliable(_DEPTH)
+    name, profile = settings["service"], reliable(_DEPTH)
     clients = [end.node.create_client(SetBool, name, qos_profile=profile) for _ in range(count)]
     turns = iter(clients * max(_WARM_UP // count, 2))
     calls = _Calls()
@@ -95,7 +95,7 @@ def _warm_clients(end: End, settings: Settings, count: int) -> list[Client]:
 def call(end: End, settings: Settings) -> None:
     """Call, one after the other, for so many seconds."""
     (client,) = _warm_clients(end, settings, 1)
-    calls, until_s = _Calls(), time.monotonic() + float(str(settings["seconds"]))
+    calls, until_s = _Calls(), time.monotonic() + settings["seconds"]
 
     def go_on() -> None:
         if time.monotonic() < until_s:
@@ -115,8 +115,8 @@ def call(end: End, settings: Settings) -> None:
 
 def load(end: End, settings: Settings) -> None:
     """Have ``clients`` call in turn, ``rate`` calls a second in all, each without waiting for the others' answers."""
-    clients = _warm_clients(end, settings, int(str(settings["clients"])))
-    calls, count, gap_s = _Calls(), int(str(settings["count"])), 1 / float(str(settings["rate"]))
+    clients = _warm_clients(end, settings, settings["clients"])
+    calls, count, gap_s = _Calls(), settings["count"], 1 / settings["rate"]
     begun_s = time.monotonic()
 
     def tick() -> None:
@@ -141,8 +141,8 @@ def replicate(end: End, settings: Settings) -> None:
     One in ``slow_in`` requests takes ``slow_s`` more; with ``threads`` it delays no other. The type is
     ``rcl_interfaces/srv/ListParameters``, because its request has content (``Number`` in ``tasks.py``).
     """
-    machine, group = str(settings["machine"]), ReentrantCallbackGroup()
-    slow_in, slow_s = int(str(settings.get("slow_in", 0))), float(str(settings.get("slow_s", 0.0)))
+    machine, group = settings["machine"], ReentrantCallbackGroup()
+    slow_in, slow_s = settings.get("slow_in", 0), settings.get("slow_s", 0.0)
     had: Counter[str] = Counter()
 
     def answer(
@@ -156,7 +156,7 @@ def replicate(end: End, settings: Settings) -> None:
         response.result.names = [str(request.depth), machine, str(had[name])]
         return response
 
-    for name in str(settings["services"]).split():
+    for name in settings["services"].split():
         end.node.create_service(
             ListParameters, name, partial(answer, name), qos_profile=reliable(_DEPTH), callback_group=group
         )

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 import rclpy
 from peers.jsonl import say
@@ -33,7 +33,7 @@ except ImportError:  # before Kilted and late Jazzy
 
 _STEP_S: Final = 60.0  # without a timeout, rclpy 7.1's EventsExecutor never checks the future
 
-Settings = Mapping[str, object]
+Settings = Mapping[str, Any]
 
 
 class End:

@@ -25,20 +25,19 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final
 
 from machine import processor_s
-from testbed import Lab, OverlayNodes, add_address, add_bridge
 
 from gdp.host.run_registry import Run
-from lab import credentials
+from lab.credentials import Carried, Side
 from lab.dds import BUFFER_BYTES, ros_environment
+from lab.machines import BenchNodes, Lab
+from lab.namespaces import add_address, add_bridge
 from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
-from proxy.config.config import Encoding
 
 READY_S: Final = 30.0
 _BRIDGES: Final = ("p1", "p2", "p3")
@@ -48,33 +47,12 @@ DIRECT_DOMAIN: Final = 143
 _BRIDGE: Final = "bridge"
 
 
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """Topic or service that the proxies carry.
-
-    ``source``: location of its publishers, or its server. ``sign``: of a service, as in its rules.
-    """
-
-    name: str
-    type_name: str
-    encoding: Encoding
-    source: str = LEFT
-    kind: credentials.Kind = "topic"
-    sign: Literal["always", "session"] = "always"
-
-    @property
-    def at_proxies(self) -> credentials.Carried:
-        """Return it as either proxy carries it."""
-        sign = {"sign": self.sign} if self.kind == "service" else {}
-        return credentials.Carried(self.name, self.type_name, self.kind, {"encoding": self.encoding, **sign})
-
-
 class Row:
     """The row with switches, RIBs and proxies running; a context manager that ends them.
 
     Args:
         run: of which the namespaces are.
-        carried: what the proxies carry.
+        carried: what the proxies carry, by the location of its publishers, or its server.
         mtu: of every device, the cable included; that of the ring is its own.
         bridged: whether the direct path leads through three bridges instead of one cable.
         ring: the overlay in place of the row: A and B are its first and its last switch.
@@ -89,7 +67,7 @@ class Row:
     def __init__(
         self,
         run: Run,
-        carried: Sequence[Carried],
+        carried: Mapping[str, Sequence[Carried]],
         *,
         mtu: int,
         bridged: bool = False,
@@ -112,8 +90,8 @@ class Row:
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
             self._lab.inside(self._machines[side], partial(add_address, device, _ADDRESSES[side]))
         with ExitStack() as undo:
-            self._nodes = OverlayNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
-            undo.callback(self._nodes.close)
+            nodes = BenchNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
+            self._nodes = undo.enter_context(nodes)
             proxies = []
             for side, node in self._machines.items():
                 argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]
@@ -147,11 +125,12 @@ class Row:
     def _environment(self, node: str, domain: int) -> list[str]:
         return ros_environment(self._nodes.files, domain, shared_memory=self._lab.has_shared_memory(node))
 
-    def _admit(self, side: str, carried: Sequence[Carried]) -> str:
+    def _admit(self, side: str, carried: Mapping[str, Sequence[Carried]]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
-        exposed = [each.at_proxies for each in carried if each.source == side]
-        imported = [each.at_proxies for each in carried if each.source != side]
-        return self._nodes.admit_proxy(self._machines[side], _DOMAINS[side], {"expose": exposed, "import": imported})
+        sides: dict[Side, Sequence[Carried]] = {
+            "expose" if source == side else "import": names for source, names in carried.items()
+        }
+        return self._nodes.admit_proxy(self._machines[side], _DOMAINS[side], sides)
 
 
 def _cyclone(side: str) -> str:

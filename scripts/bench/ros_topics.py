@@ -79,9 +79,9 @@ _KINDS: Final[Mapping[str, type[_Texts] | type[_Images]]] = {
 
 def talk(end: End, settings: Settings) -> None:
     """Publish ``count`` messages on every topic, one each ``every_s``."""
-    kind, count = str(settings["kind"]), int(str(settings["count"]))
+    kind, count = settings["kind"], settings["count"]
     source, profile = _KINDS[kind](), reliable(_DEPTHS[kind])
-    publishers = [end.node.create_publisher(source.kind, topic, profile) for topic in topics_of(settings)]
+    publishers = [end.node.create_publisher(source.kind, topic, profile) for topic in settings["topics"]]
     steps: Iterator[int] = iter(range(1, count + 1))
 
     def greet() -> None:
@@ -100,7 +100,7 @@ def talk(end: End, settings: Settings) -> None:
             publisher.publish(source.fill(number))
 
     end.every(_GREETING_S, greet)
-    end.every(float(str(settings["every_s"])), tick)
+    end.every(settings["every_s"], tick)
     end.run()
 
 
@@ -109,14 +109,14 @@ class _Listener:
 
     def __init__(self, end: End, settings: Settings) -> None:
         self._end = end
-        self._kind = _KINDS[str(settings["kind"])]
+        self._kind = _KINDS[settings["kind"]]
         self._greeted: set[str] = set()
-        self._came: dict[str, set[int]] = {topic: set() for topic in topics_of(settings)}
+        self._came: dict[str, set[int]] = {topic: set() for topic in settings["topics"]}
         self._last_s = time.monotonic()
-        self.missing = int(str(settings["count"])) * len(self._came)
+        self.missing = settings["count"] * len(self._came)
         self.twice = 0
         self.latencies_s: list[float] = []
-        profile = reliable(_DEPTHS[str(settings["kind"])])
+        profile = reliable(_DEPTHS[settings["kind"]])
         for topic in self._came:
             end.node.create_subscription(self._kind.kind, topic, partial(self._take, topic), profile)
 
@@ -162,16 +162,9 @@ def listen(end: End, settings: Settings) -> None:
     say(lost=listener.missing, twice=listener.twice, **figures)
 
 
-def topics_of(settings: Settings) -> list[str]:
-    """Return the topics by name."""
-    topics = settings["topics"]
-    assert isinstance(topics, list)
-    return [str(topic) for topic in topics]
-
-
 def camera(end: End, settings: Settings) -> None:
     """Publish until killed."""
-    publisher = end.node.create_publisher(Image, str(settings["topic"]), reliable())
+    publisher = end.node.create_publisher(Image, settings["topic"], reliable())
     image = Image(width=_SIDE, height=_SIDE, step=_SIDE, encoding="mono8", data=bytes(_SIDE * _SIDE))
     end.every(_CAMERA_S, lambda: publisher.publish(image))
     say(event="publishes")
@@ -180,7 +173,7 @@ def camera(end: End, settings: Settings) -> None:
 
 def viewer(end: End, settings: Settings) -> None:
     """Read until the first image."""
-    end.node.create_subscription(Image, str(settings["topic"]), lambda _: end.finish(), reliable())
+    end.node.create_subscription(Image, settings["topic"], lambda _: end.finish(), reliable())
     say(event="reads")
     end.run()
     say(event="image", at_s=time.monotonic())

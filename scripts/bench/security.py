@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import random
 import signal
-import subprocess
-import sys
 import time
 from typing import Final
 
@@ -22,13 +20,13 @@ from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from faults.records import Kind
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
-from lab.process import FailedError, until
+from lab.machine import gdp
+from lab.process import new_run, until
 from lab.topology import make_topology
 
 TARGET_MS: Final = 1_000.0
@@ -57,12 +55,12 @@ def _plan() -> Plan:
     return Plan(topology, members, flows=tuple(flows))
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Close the flows of one network in each round."""
     over = Rounds()
     for number in range(options.rounds):
         progress(f"network {number + 1} of {options.rounds}")
-        with new_run(runs) as run, Overlay(run, _plan()) as overlay:
+        with new_run() as run, Overlay(run, _plan()) as overlay:
             overlay.start_all()
             _Closing(overlay).measure(over)
     targets = []
@@ -121,12 +119,10 @@ class _Closing:
             domain = folder / "domains" / label
             words = ["cert", "revoke", str(node / NODE_CERTIFICATE), "--domain", str(domain), "--out", str(out)]
         begun_ns = time.monotonic_ns()
-        done = subprocess.run([sys.executable, "-m", "gdp.cli.gdp", *words], capture_output=True, check=False)
-        if done.returncode:
-            raise FailedError(f"gdp {' '.join(words)}: {done.stderr.decode(errors='replace')[-200:]}")
+        gdp(*words)
         read_public(out)
         signalled_ns = time.monotonic_ns()
-        self._overlay.signal(f"switch {HANDED_IN_AT}", signal.SIGHUP)
+        self._overlay.processes[f"switch {HANDED_IN_AT}"].send(signal.SIGHUP)
         return begun_ns, signalled_ns
 
     def _watch(self, seconds: float) -> None:

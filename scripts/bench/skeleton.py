@@ -2,7 +2,7 @@
 
 I/O. ``report.py`` defines figures, their spread and targets. A bench states its options and measures::
 
-    def measure(options: Options, runs: Runs) -> Outcome: ...
+    def measure(options: Options) -> Outcome: ...
 
     if __name__ == "__main__":
         run_bench(command_line(__doc__, rounds=5, seconds=10.0, quick={"rounds": 1, "seconds": 1.0}), measure)
@@ -25,7 +25,7 @@ from plot import Panel, require_plot, save_bars
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
 
 OUTPUT: Final = ROOT / "docs" / "benchmarks"
@@ -166,25 +166,12 @@ def clean_exit() -> Iterator[None]:
         sys.exit(f"error: {error}")
 
 
-@contextmanager
-def new_run(runs: RunRegistry | None = None) -> Iterator[Run]:
-    """Create a run of the test bed; without ``runs``, remains of an earlier killed run are removed first."""
-    if runs is None:
-        runs = RunRegistry()
-        runs.sweep()
-    run = runs.start()
-    try:
-        yield run
-    finally:
-        run.end()
-
-
-def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options, RunRegistry], Outcome]) -> None:
+def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options], Outcome]) -> None:
     """Parse the command line, and run a bench to its table, JSON record and picture."""
     perform(parse(parser), measure)
 
 
-def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]) -> None:
+def perform(options: Options, measure: Callable[[Options], Outcome]) -> None:
     """Run a bench to its table, JSON record and picture."""
     is_saved = not getattr(options, "no_save", False)
     is_drawn = is_saved and not getattr(options, "no_plot", True)
@@ -194,9 +181,8 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
     with clean_exit():
         if is_saved and hasattr(options, "allow_load"):
             _require_page(options, state)
-        runs = RunRegistry()
-        runs.sweep()
-        outcome = measure(options, runs)
+        RunRegistry().sweep()  # remains of a killed run
+        outcome = measure(options)
     finish(outcome, options, state, time.monotonic() - begun_s, is_saved=is_saved, is_drawn=is_drawn)
 
 

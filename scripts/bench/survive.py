@@ -24,12 +24,11 @@ from typing import Final
 from faults.overlay import Overlay
 from faults.records import Kind
 from report import Rounds, Spread, Target, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 from survive_rows import NEW_TOPICS, ROWS, Row
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError
+from lab.process import FailedError, new_run
 
 ROUNDS: Final = 30
 HZ: Final = 500.0
@@ -126,14 +125,14 @@ class Flowing:
         return len(missing), sum(number - 1 for number in self.numbers.values())
 
 
-def measure_row(runs: RunRegistry, row: Row, rounds: int, options: Options) -> Measured:
+def measure_row(row: Row, rounds: int, options: Options) -> Measured:
     """Make the event of a row happen so often.
 
     Raises ``FailedError``: the network did not come up, or a process ended by itself. Raises ``GdpError``: the kernel
     refuses.
     """
     found = Measured()
-    with new_run(runs) as run, Overlay(run, row.plan(HZ)) as overlay:
+    with new_run() as run, Overlay(run, row.plan(HZ)) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -181,7 +180,7 @@ def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
     channel = len(overlay.plan.flows) + len(overlay.plan.services) + at
     begun_ns = time.monotonic_ns()
     for who in ("member P", "member R"):
-        overlay.signal(who, signal.SIGUSR1)
+        overlay.processes[who].send(signal.SIGUSR1)
     end_s = time.monotonic() + PATIENCE_S
     while channel not in flow.first_of and time.monotonic() < end_s:
         flow.look()
@@ -212,7 +211,7 @@ def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
     return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([faults]))]
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
     if options.quick:
         options.dead_s, options.settle_s = 3.0, 0.0
@@ -224,7 +223,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         rounds = min(rounds, 3) if row.holds else rounds
         progress(f"{name}: {row.what}, {rounds} times")
         try:
-            targets += add(over, row, case, measure_row(runs, row, rounds, options))
+            targets += add(over, row, case, measure_row(row, rounds, options))
         except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Final, TypedDict
 
 from faults.link_faults import FrameFaults
-from faults.overlay import Overlay
+from faults.overlay import READY_S, Overlay
 from faults.plan import Flow, Plan
 
 from lab.topology import Link, ends_of, make_topology
@@ -158,8 +158,8 @@ def _cut(**ways: str) -> Both:
     return _OnPath(
         "s4",
         ways,
-        lambda overlay, link: overlay.cut(*ends_of(link)),
-        lambda overlay, link: overlay.restore_link(*ends_of(link)),
+        lambda overlay, link: overlay.spaces.cut(*ends_of(link)),
+        lambda overlay, link: overlay.spaces.restore_link(*ends_of(link)),
     ).both()
 
 
@@ -180,7 +180,7 @@ def _again(overlay: Overlay, *names: str) -> None:
     for who in names:
         overlay.start(who)
     for who in names:
-        overlay.await_ready(who)
+        overlay.processes[who].read(READY_S)
 
 
 def _one_rib(overlay: Overlay, at: int) -> str:

@@ -29,8 +29,7 @@ from typing import Final
 from machine import DATA, RefusedError
 from plot import Panel, panel_of
 from report import Rounds, Target, progress
-from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import Lab
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
@@ -39,8 +38,8 @@ from thin_link.systems import SYSTEMS, System, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
 from gdp.errors import LocalError
-from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError
+from lab.machines import Lab
+from lab.process import new_run
 
 OURS: Final = "gdp"
 TCP: Final = "tcp"
@@ -127,8 +126,6 @@ def exchange(
         if each["refusals"]:
             progress(f"refused: {each['refusals']}")
     robot, cloud = (each["streams"] for each in said)
-    if not isinstance(robot, dict) or not isinstance(cloud, dict):
-        raise FailedError(f"the ends said {said}")
     return used, merged(streams(camera), robot, cloud)
 
 
@@ -213,12 +210,12 @@ def panels_of(over: Rounds, links: Sequence[Conditions]) -> list[Panel]:
     return panels
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Measure every system on every link, round by round."""
     recorder, links = Recorder(), links_of(options)
     for number in range(1, options.rounds + 1):
         for link in links:
-            with new_run(runs) as run:
+            with new_run() as run:
                 lab = thin_link_lab(run, tcp_control=options.tcp_control)
                 for trial in trials_of(lab, link, options, recorder.rounds):
                     recorder.attempt(trial, number, options.rounds)

@@ -16,19 +16,16 @@ limit: twice the longest delay of the quiet seconds before the cuts, and at leas
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Final, Literal
 
 from report import Rounds, percentile, progress
-from skeleton import Options, Outcome, command_line, new_run, run_bench
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.laboratory import Laboratory
-from internet.overlay import Overlay
-from lab.process import until
+from lab.process import new_run, until
 
 UPLINKS: Final = ("wlan0", "wwan0")
 TOPICS: Final[dict[str, Literal[1, 2]]] = {"one": 1, "two": 2}  # by the number of paths
@@ -41,10 +38,10 @@ LATE, SILENCE, P99, LOST, DOUBLED = "late", "silence, ms", "p99, ms", "lost", "d
 _CASES: Final = {1: "paths: 1", 2: "paths: 2"}
 
 
-def measure(options: Options, runs: RunRegistry) -> Outcome:
+def measure(options: Options) -> Outcome:
     """Cut the uplinks in turn, in one network."""
     over = Rounds()
-    with new_run(runs) as run, Laboratory(run) as laboratory, ExitStack() as stack:
+    with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         flows = start(laboratory, stack)
         sites = [laboratory.sites[each] for each in UPLINKS]
         time.sleep(options.settle_s)
@@ -96,29 +93,19 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 
     Raises ``FailedError``: the second path does not come up.
     """
-    overlay = stack.enter_context(Overlay(laboratory))
-    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     homes = [laboratory.add_site(each, Access.PORT_RESTRICTED) for each in UPLINKS]
     robot = laboratory.add_host("robot", homes[0], UPLINKS[0])
     robot.attach(homes[1], UPLINKS[1])
-    server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    hosts = border, robot, server
-    sender, reader = open_sessions(overlay, stack, hosts, TOPICS, has_direct=False, uplinks=UPLINKS)
+    overlay, server, (sender, reader) = open_sessions(robot, stack, TOPICS, has_direct=False, uplinks=UPLINKS)
     flows: dict[int, NumberedFlow] = {}
     for topic, paths in TOPICS.items():
         subscription = reader.subscribe(topic, paths=paths)
         publisher = sender.publisher(topic, paths=paths)
         publisher.wait_for_readers(timeout_s=PATIENCE_S)
         flows[paths] = NumberedFlow(publisher, subscription)
-    until(lambda: _has_pair(overlay.status(server)), lambda: "a second path", PATIENCE_S)
+    # The reader's switch then has two paths for the flow; both use its own uplink.
+    until(lambda: overlay.status(server)["counters"]["two_paths"]["shared"] == 1, "a second path", PATIENCE_S)
     return flows
-
-
-def _has_pair(status: Mapping[str, object]) -> bool:
-    """Return whether the reader's switch has two paths for the flow; both use its own uplink."""
-    counters = status["counters"]
-    assert isinstance(counters, dict)
-    return bool(dict(counters["two_paths"])["shared"] == 1)
 
 
 if __name__ == "__main__":

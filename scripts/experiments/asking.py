@@ -45,18 +45,14 @@ class Asking:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.__exit__(None, None, None)
+        self._client.close()
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield each sample as it comes; raises FailedError if none comes in time."""
-        begun = self._client.read(_BEGIN_S)
-        self.warm_up = begun["warm_up"] if isinstance(begun["warm_up"], dict) else {}
+        self.warm_up = self._client.read(_BEGIN_S)["warm_up"]
         while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
-            fields = said["sample"]
-            if isinstance(fields, dict):
-                yield Sample(**fields)
-        twice, heard = said["twice"], said["heard"]
-        self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
+            yield Sample(**said["sample"])
+        self.twice, self.heard = said["twice"], said["heard"]
 
     def by_service(self, what: str) -> dict[str, list[Sample]]:
         """Return all samples of each service, and report progress at intervals."""

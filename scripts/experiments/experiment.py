@@ -20,11 +20,14 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from field import Field, Served, Work
+from field import REPLICA, Field, Served, Work
 from machine import MachineState, machine_state, require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
-from skeleton import Options, add_allow_load, clean_exit, new_run
+from skeleton import Options, add_allow_load, clean_exit
+
+from gdp.host.run_registry import RunRegistry
+from lab.process import new_run
 
 OUTPUT: Final = ROOT / "docs" / "experiments"
 CASES: Final = ("one server", "two replicas")
@@ -157,11 +160,13 @@ def field_of(
         yield place
 
 
-def work_of(served: Iterable[Served], role: str, settings: Mapping[str, Mapping[str, object]]) -> dict[str, Work]:
-    """Return the work of each machine: the role, its services, and its settings."""
+def work_of(
+    served: Iterable[Served], role: str, settings: Mapping[str, Mapping[str, object]], program: Path = REPLICA
+) -> dict[str, Work]:
+    """Return the work of each machine: the role of the program, its services, and its settings."""
     offers = list(served)
     names = {each: " ".join(one.name for one in offers if each in one.machines) for each in settings}
-    return {each: Work(role, {**own, "services": names[each]}) for each, own in settings.items()}
+    return {each: Work(role, {**own, "services": names[each]}, program) for each, own in settings.items()}
 
 
 def gains(
@@ -213,6 +218,7 @@ def run_experiment(
             require_writable(folder)
         if not options.quick:
             require_trust(state, allow_load=options.allow_load)
+        RunRegistry().sweep()  # remains of a killed run
         report = measure(options)
     document = report.to_dict(state)
     if options.json:

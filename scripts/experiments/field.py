@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from testbed import Lab, OverlayNodes
 
 from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import ros_environment
+from lab.machines import BenchNodes, Lab
 from lab.process import LabProcess
 from lab.topology import Topology, flat_topology
 
@@ -36,6 +36,7 @@ READY_S: Final = 40.0
 _NEAR, _GATE = "s1", "gate"
 _MTU: Final = 1_500
 _HERE: Final = ROOT / "scripts" / "experiments"
+REPLICA: Final = _HERE / "replica.py"
 # The relay of the provider ``local`` waits on its standard input for permission to begin.
 _RELAY: Final = "import io, sys; from fog.providers.local.delay import main; sys.stdin = io.StringIO('\\n'); main()"
 _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
@@ -67,7 +68,7 @@ class Work:
 
     role: str
     settings: Mapping[str, object] = field(default_factory=dict)
-    program: Path = _HERE / "replica.py"
+    program: Path = REPLICA
 
 
 class Server:
@@ -154,8 +155,7 @@ class Field:
             for machine, seconds in (delays or {}).items():
                 relay = ["-c", _RELAY, _GATE, machine, str(1e3 * seconds)]
                 undo.enter_context(self._lab.start(self._relays[machine], "relay", relay)).read_line(READY_S)
-            self._nodes = OverlayNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S)
-            undo.callback(self._nodes.close)
+            self._nodes = undo.enter_context(BenchNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S))
             self.data_plane = ", ".join(sorted(self._nodes.planes))
             argv = ["-m", "proxy.cli.proxy", "--config", self._admit(ROBOT, served)]
             robot = undo.enter_context(self.process(ROBOT, "proxy", argv))

@@ -14,7 +14,7 @@ import base64
 import json
 import zlib
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
@@ -42,7 +42,7 @@ def answer_of(said: Mapping[str, object]) -> SetParameters.Response:
     return SetParameters.Response(results=[SetParametersResult(successful=True, reason=json.dumps(said))])
 
 
-def said_in(response: SetParameters.Response) -> dict[str, object]:
+def said_in(response: SetParameters.Response) -> dict[str, Any]:
     """Return the content of a response."""
     said = json.loads(response.results[0].reason)
     return said if isinstance(said, dict) else {}

@@ -26,14 +26,15 @@ from experiment import OUTPUT, Computed, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from report import progress
-from ros_row import DIRECT_DOMAIN, READY_S, Carried, Row
-from skeleton import Options, new_run
+from ros_row import DIRECT_DOMAIN, READY_S, Row
+from skeleton import Options
 
 from gdp.host.cgroups import Cgroup
-from lab.process import LabProcess
+from lab.cores import CORES_HELP, cores_of
+from lab.credentials import Carried
+from lab.process import LabProcess, new_run
 from lab.topology import LEFT, RIGHT, ring5
 from proxy.config.config import Encoding
-from ring.cores import CORES_HELP, cores_of
 
 CONTENDERS: Final = {CYCLONE: "cyclone", FAST: "fast", JSON: "fast", CDR: "fast"}  # with the middleware of its ends
 ENCODINGS: Final[Mapping[str, Encoding]] = {JSON: "json", CDR: "cdr"}
@@ -97,11 +98,14 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
 
     shape = TASKS[name]()
     prefix = f"/{name.replace(' ', '_').lower()}/"
-    carried = []
-    for encoding in ENCODINGS.values():
-        carried += [Carried(f"{prefix}{encoding}/{topic}", kind, encoding) for topic, kind in shape.parts]
-        topic, kind = shape.answer
-        carried.append(Carried(f"{prefix}{encoding}/{topic}", kind, encoding, source=RIGHT))
+    carried = {
+        source: [
+            Carried(f"{prefix}{encoding}/{topic}", kind, options={"encoding": encoding})
+            for encoding in ENCODINGS.values()
+            for topic, kind in topics
+        ]
+        for source, topics in ((LEFT, shape.parts), (RIGHT, [shape.answer]))
+    }
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
     found = {who: Measured() for who in CONTENDERS}
     size = 0
@@ -132,17 +136,13 @@ def _trip(row: Row, found: Measured, orders: Mapping[str, object], at_once: int,
     with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(orders)], direct=direct) as cloud:
         cloud.read(READY_S)
         with row.process(LEFT, "robot", [_END, "robot", json.dumps(orders)], direct=direct) as robot:
-            size = int(str(robot.read(READY_S)["request_bytes"]))
+            size: int = robot.read(READY_S)["request_bytes"]
             while "number" in (said := robot.read(_ANSWER_S)):
-                number, asked_s, answered_s = (
-                    int(str(said["number"])),
-                    _float(said, "asked_s"),
-                    _float(said, "answered_s"),
-                )
+                number, asked_s, answered_s = said["number"], said["asked_s"], said["answered_s"]
                 while (other := cloud.read(READY_S))["number"] != number:
                     pass  # greetings
                 found.failed += not said["is_right"]
-                arrived_s, computed_s = _float(other, "arrived_s"), _float(other, "computed_s")
+                arrived_s, computed_s = other["arrived_s"], other["computed_s"]
                 if number <= at_once:
                     there_s.append(arrived_s - asked_s)
                     found.back_s.append(answered_s - computed_s)
@@ -177,14 +177,10 @@ def _alone(name: str, *, quick: bool) -> dict[str, object]:
         for robot in started:
             for _ in range(count):
                 said = robot.read(_ALONE_S)
-                times.append(_float(said, "took_s"))
+                times.append(said["took_s"])
                 failed += not said["is_right"]
             progress(f"{name}, on the robot: {len(times)} of {count * robots}")
     return {"cores": cores, "took_s": _short(times), "failed": failed, "side_by_side": robots}
-
-
-def _float(said: Mapping[str, object], key: str) -> float:
-    return float(str(said[key]))
 
 
 def _short(value: object) -> object:

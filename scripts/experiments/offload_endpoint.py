@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from select import select
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import bench_path  # noqa: F401 - finds ``peers``
 from offload_tasks import TASKS, TYPES, Message, number_of, set_number
@@ -27,7 +27,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 _GREETING_S: Final = 0.2
 _LONG_S: Final = 3_600.0
-Settings: TypeAlias = "Mapping[str, object]"
+Settings: TypeAlias = "Mapping[str, Any]"
 
 
 class _FastEnd:
@@ -107,8 +107,8 @@ _ENDS: Final[Mapping[str, Callable[[int], _End]]] = {"fast": _FastEnd, "cyclone"
 
 def robot(settings: Settings) -> None:
     """Send one request after the other; print when each was sent and answered."""
-    task, end, prefix = TASKS[str(settings["task"])](), _end(settings), str(settings["prefix"])
-    at_once, count = int(str(settings["at_once"])), int(str(settings["count"]))
+    task, end, prefix = TASKS[settings["task"]](), _end(settings), settings["prefix"]
+    at_once, count = int(settings["at_once"]), int(settings["count"])
     publish = [end.publisher(prefix + topic, type_name) for topic, type_name in task.parts]
     number, asked_s, greeted_s = 0, 0.0, 0.0
 
@@ -151,8 +151,8 @@ def robot(settings: Settings) -> None:
 
 def cloud(settings: Settings) -> None:
     """Answer until killed; print when all of each request had arrived and when the answer was ready."""
-    task, end, prefix = TASKS[str(settings["task"])](), _end(settings), str(settings["prefix"])
-    at_once = int(str(settings["at_once"]))
+    task, end, prefix = TASKS[settings["task"]](), _end(settings), settings["prefix"]
+    at_once = settings["at_once"]
     answer_topic, answer_type = task.answer
     publish = end.publisher(prefix + answer_topic, answer_type)
     waiting: dict[str, Message] = {}
@@ -185,13 +185,13 @@ def cloud(settings: Settings) -> None:
 
 def alone(settings: Settings) -> None:
     """Compute without a server; print how long each request took."""
-    task = TASKS[str(settings["task"])]()
+    task = TASKS[settings["task"]]()
     task.warm_up()
     is_limited = threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: is_limited.set())
     say(event="ready")
     is_limited.wait()  # wait until the parent process has put this one into its control group
-    for number in range(1, int(str(settings["count"])) + 1):
+    for number in range(1, settings["count"] + 1):
         messages = task.request(number)
         begun_s = time.monotonic()
         answer = task.compute(messages)
@@ -200,7 +200,7 @@ def alone(settings: Settings) -> None:
 
 
 def _end(settings: Settings) -> _End:
-    return _ENDS[str(settings["middleware"])](int(str(settings["domain"])))
+    return _ENDS[settings["middleware"]](settings["domain"])
 
 
 if __name__ == "__main__":

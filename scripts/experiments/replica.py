@@ -21,7 +21,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import bench_path  # noqa: F401 - finds ``peers``
 import rclpy
@@ -38,7 +38,7 @@ from std_srvs.srv import Trigger
 from vision import Grey, Networks, count_words
 
 _THREADS: Final = 32
-Settings = Mapping[str, object]
+Settings = Mapping[str, Any]
 
 
 class _Service:
@@ -80,7 +80,7 @@ class _Planner(ABC):
     """Planner that answers ``GetPlan``, and stops on request."""
 
     def __init__(self, node: Node, settings: Settings) -> None:
-        self._services = [_Service(self, node, name, str(settings["machine"])) for name in _names(settings)]
+        self._services = [_Service(self, node, name, settings["machine"]) for name in _names(settings)]
 
     @abstractmethod
     def way(self, request: GetPlan.Request, flag: threading.Event) -> list[PoseStamped]:
@@ -94,10 +94,10 @@ class _Ompl(_Planner):
         from planning import Problem, be_quiet
 
         be_quiet()
-        folder, names = Path(str(settings["folder"])), str(settings["problems"]).split()
+        folder, names = Path(settings["folder"]), settings["problems"].split()
         self._problems = {name: Problem.load(folder, name) for name in names}
-        self._kind = str(settings["planner"])
-        self._patience_s = float(str(settings["patience_s"]))
+        self._kind = settings["planner"]
+        self._patience_s = settings["patience_s"]
         super().__init__(node, settings)
 
     def way(self, request: GetPlan.Request, flag: threading.Event) -> list[PoseStamped]:

@@ -115,7 +115,7 @@ class _Client:
 
 def ask(end: End, settings: Settings) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
-    series = Series(**settings)  # type: ignore[arg-type]
+    series = Series(**settings)
     client = _Client(end.node, TASKS[series.task](series.problem), series.services)
     answers = client.count_answers() if series.counts_answers else None
     client.wait_for_servers()
@@ -153,8 +153,8 @@ def ask(end: End, settings: Settings) -> None:
 
 def busy(end: End, settings: Settings) -> None:
     """Call one service, one call after the other for ``on_s``, none for ``off_s``, and so on, until killed."""
-    on_s, off_s = float(str(settings["on_s"])), float(str(settings["off_s"]))
-    client = _Client(end.node, TASKS[str(settings["task"])](""), [str(settings["service"])])
+    on_s, off_s = settings["on_s"], settings["off_s"]
+    client = _Client(end.node, TASKS[settings["task"]](""), [settings["service"]])
     client.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import ListParameters, SetParameters
@@ -82,7 +82,7 @@ class Look:
 
     kind = SetParameters
 
-    def __init__(self, is_right: Callable[[Mapping[str, object], Scene], bool]) -> None:
+    def __init__(self, is_right: Callable[[Mapping[str, Any], Scene], bool]) -> None:
         from vision import Scene
 
         self._is_right = is_right
@@ -128,10 +128,10 @@ class Tag:
         return _judged(said, is_right=apart_m <= _APART_M and found.turned_rad(truth) <= _TURNED_RAD, note=apart_m)
 
 
-def _covers(said: Mapping[str, object], scene: Scene) -> bool:
+def _covers(said: Mapping[str, Any], scene: Scene) -> bool:
     from image_request import mask_in
 
-    return scene.is_covered(mask_in(str(said["mask"])))
+    return scene.is_covered(mask_in(said["mask"]))
 
 
 def _request(frame: Grey, number: int) -> SetParameters.Request:
@@ -140,14 +140,14 @@ def _request(frame: Grey, number: int) -> SetParameters.Request:
     return request_of(frame, number)
 
 
-def _said(response: Response) -> dict[str, object]:
+def _said(response: Response) -> dict[str, Any]:
     from image_request import said_in
 
     return said_in(response)
 
 
-def _judged(said: Mapping[str, object], *, is_right: bool, note: float = 0.0) -> Judged:
-    return Judged(str(said["machine"]), float(str(said["worked_s"])), is_right, note)
+def _judged(said: Mapping[str, Any], *, is_right: bool, note: float = 0.0) -> Judged:
+    return Judged(said["machine"], said["worked_s"], is_right, note)
 
 
 Task: TypeAlias = "Plan | Number | Look | Tag"

@@ -6,20 +6,17 @@ I/O. Exit status: 0 no failure, 1 a failure, 2 wrong input, 130 and 143 for Ctrl
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
 
 from fog_demo.scenario import Display, Outcome, Pace, run_scenario
-from gdp.host.interruption import let_nothing_interrupt
-from lab.command import FAILED, PASSED, console_of, exit_with, new_app
+from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
 
 _PACE: Final = Pace()
 
@@ -57,18 +54,11 @@ def main() -> None:
 
 def _run(launch_file: Path, pace: Pace, console: Console, as_json: bool) -> int:
     """Run the scenario."""
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(each, _end)
+    end_on_signals()
     with Display(console) as display:
         outcome = run_scenario(launch_file, pace, display)
     _tell(outcome, console, as_json=as_json)
     return FAILED if outcome.counts.failed or not outcome.counts.requests else PASSED
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:
-    del frame
-    let_nothing_interrupt()  # what is up is taken down on the way out
-    sys.exit(128 + number)
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -27,8 +26,9 @@ from fog.supervisor.journal import Entry, Journal
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
 from lab.dds import ros_environment
+from lab.machine import LabMachine
 from lab.namespaces import Namespaces
-from lab.process import FailedError, LabProcess, until
+from lab.process import Event, FailedError, LabProcess, until
 from lab.topology import single
 
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
@@ -69,7 +69,7 @@ def end_all_of(run: Run) -> None:
     """
     if (run.directory / STATE).exists():
         argv = [sys.executable, *_fog_command(run, ["down", "--all"])]
-        ended = subprocess.run(argv, capture_output=True, text=True, timeout=_DOWN_S, check=False)
+        ended = LabMachine(Path()).run(*argv, patience_s=_DOWN_S)
         if ended.returncode:
             raise LocalError(f"run {run.id}: fog down: {(ended.stderr or ended.stdout).strip()}")
     run.end()
@@ -121,7 +121,8 @@ class Cluster:
         with ExitStack() as undo:
             undo.callback(end_all_of, self._run)
             self._space = Namespaces(single(ROBOT), self._run)[ROBOT]
-            self._environment = ros_environment(self._run.directory, _DOMAIN)
+            enter = self._space.command(["env", *ros_environment(self._run.directory, _DOMAIN)])
+            self._robot = undo.enter_context(LabMachine(self._run.directory, enter, run=self._run))
             note(f"{machines} machines boot, gateway: {gateway}")
             path = self._run.directory / "cluster.launch.py"
             for text in launch_files:
@@ -149,7 +150,7 @@ class Cluster:
         self._caller = self._undo.enter_context(self.start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
         self._until(lambda: self._caller.read(_PATIENCE_S)["answered"], "an answer to the robot's node")
 
-    def reports(self) -> Iterator[dict[str, object]]:
+    def reports(self) -> Iterator[Event]:
         """Yield the lines that the robot's node has printed since the last one was read."""
         while self._caller.has_line(0.0):
             yield self._caller.read(_PATIENCE_S)
@@ -168,9 +169,9 @@ class Cluster:
         now_s, longest_ms = time.time(), 0.0
         while True:
             said = self._caller.read(_PATIENCE_S)
-            unix_s = float(str(said["unix_s"]))
+            unix_s = said["unix_s"]
             if unix_s >= after_s:
-                longest_ms = max(longest_ms, float(str(said["silence_ms"])))
+                longest_ms = max(longest_ms, said["silence_ms"])
             if unix_s >= now_s:
                 return longest_ms / 1e3
 
@@ -237,7 +238,7 @@ class Cluster:
 
         self._until(is_whole, "as many machines as are wanted that serve, and no other")
 
-    def end_caller(self) -> dict[str, object]:
+    def end_caller(self) -> Event:
         """End the robot's node; return its last line, in which all calls have ended. Its complaints are noted."""
         os.kill(self._caller.pid, signal.SIGUSR1)
         while not (said := self._caller.read(_PATIENCE_S))["done"]:
@@ -248,19 +249,14 @@ class Cluster:
 
     def start(self, what: str, arguments: Sequence[str]) -> LabProcess:
         """Start Python at the robot, with the environment of ROS; ``what`` names its log."""
-        argv = self._space.command(["env", *self._environment, sys.executable, *arguments])
-        return LabProcess(self._run, what, argv)
+        return self._robot.launch([sys.executable, *arguments], what)
 
     def inside(self, work: Callable[[], T]) -> T:
         """Call ``work`` in the robot's namespace."""
         return self._space.inside(work)
 
     def _fog(self, *words: str) -> None:
-        argv = ["env", *self._environment, sys.executable, *_fog_command(self._run, words)]
-        command = self._space.command(argv)
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
-        if ended.returncode:
-            raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
+        self._robot.output(sys.executable, *_fog_command(self._run, words), patience_s=_LAUNCH_S)
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:
         """Poll until a state is reached that sends no event."""
@@ -269,11 +265,10 @@ class Cluster:
         return value
 
 
-def requests_in(said: dict[str, object]) -> tuple[int, int]:
+def requests_in(said: Event) -> tuple[int, int]:
     """Return how many requests a line of the robot's node counts, and how many of them failed.
 
     Requests that were not sent for lack of a server count; those under way have failed in the last line.
     """
-    count = {key: int(str(said[key])) for key in ("calls", "failed", "wrong", "unserved", "under_way")}
-    left = count["under_way"] if said["done"] else 0
-    return count["calls"] + count["unserved"], count["failed"] + count["wrong"] + count["unserved"] + left
+    left = said["under_way"] if said["done"] else 0
+    return said["calls"] + said["unserved"], said["failed"] + said["wrong"] + said["unserved"] + left

@@ -21,6 +21,7 @@ from fog.supervisor.journal import Entry
 from fog_demo.cluster import DEDICATED, Cluster, requests_in
 from gdp.host.interruption import let_nothing_interrupt
 from lab.command import StepDisplay
+from lab.process import Event
 
 _EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
@@ -38,14 +39,11 @@ class Counts:
     by_machine: tuple[tuple[str, int], ...] = ()
 
     @classmethod
-    def of(cls, said: dict[str, object]) -> Counts:
+    def of(cls, said: Event) -> Counts:
         """Return the counts of a line."""
-        (requests, failed), won, times = requests_in(said), said["by_machine"], (said["median_ms"], said["p99_ms"])
-        assert isinstance(won, dict)
-        median, p99 = (None if each is None else float(str(each)) for each in times)
-        return cls(
-            requests=requests, failed=failed, median_ms=median, p99_ms=p99, by_machine=tuple(sorted(won.items()))
-        )
+        (requests, failed), won = requests_in(said), tuple(sorted(said["by_machine"].items()))
+        times = {key: said[key] for key in ("median_ms", "p99_ms")}
+        return cls(requests=requests, failed=failed, by_machine=won, **times)
 
     def line(self) -> Text:
         """Return the counts as one line."""

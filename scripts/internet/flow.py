@@ -16,6 +16,7 @@ from typing import Final
 
 import gdp
 from gdp.trust.right import Right
+from internet.access import Access
 from internet.host import Host
 from internet.overlay import Overlay
 from lab.process import FailedError
@@ -28,19 +29,17 @@ _NUMBER: Final = struct.Struct("!q")
 
 
 def open_sessions(
-    overlay: Overlay,
-    stack: ExitStack,
-    hosts: tuple[Host, Host, Host],
-    topics: Iterable[str],
-    *,
-    has_direct: bool,
-    uplinks: Sequence[str] = (),
-) -> list[gdp.Session]:
-    """Start switches at a border, a robot and a server, and return sessions that publish and read the topics.
+    robot: Host, stack: ExitStack, topics: Iterable[str], *, has_direct: bool, uplinks: Sequence[str] = ()
+) -> tuple[Overlay, Host, list[gdp.Session]]:
+    """Start an overlay of a border, a robot and a server behind a NAT; return it, the server, and two sessions.
 
-    ``has_direct``: robot and server open a tunnel to each other. ``uplinks``: of the robot; none: the usual one.
+    ``topics``: the session at the robot publishes them, that at the server reads them. ``has_direct``: robot and server
+    open a tunnel to each other. ``uplinks``: of the robot; none: the usual one.
     """
-    border, robot, server = hosts
+    laboratory = robot.laboratory
+    overlay = Overlay(laboratory)
+    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
     overlay.add_switch(border, is_border=True)
     for host, own in ((robot, uplinks), (server, ())):
         overlay.add_switch(host, borders=[border], uplinks=own, links={"direct": has_direct})
@@ -49,7 +48,7 @@ def open_sessions(
     overlay.start(robot, server)
     sides = ((robot, Right.PUBLISH), (server, Right.READ))
     nodes = [(host, overlay.add_node(host, {topic: [right] for topic in topics})) for host, right in sides]
-    return [stack.enter_context(overlay.open_session(host, node)) for host, node in nodes]
+    return overlay, server, [stack.enter_context(overlay.open_session(host, node)) for host, node in nodes]
 
 
 class NumberedFlow:

@@ -17,7 +17,8 @@ from pyroute2.netlink.exceptions import NetlinkError
 from gdp.errors import LocalError
 from internet.access import LAN
 from internet.site import Lease, Site
-from internet.space import Space
+from lab.machine import LabMachine
+from lab.namespaces import IpNamespace
 
 _IFA_F_NODAD: Final = 0x02
 _PERMANENT: Final = 0x80  # NUD_PERMANENT: of a state that no flush removes
@@ -77,13 +78,14 @@ class _Attachment:
     lease: Lease = field(default_factory=Lease)
 
 
-class Host:
+class Host(LabMachine):
     """A machine; ``Laboratory.add_host`` makes it."""
 
     def __init__(self, laboratory: Laboratory, label: str) -> None:
         self.label = label
-        self._laboratory = laboratory
-        self.space = Space(laboratory.run, label)
+        self.laboratory = laboratory
+        self.space = IpNamespace(laboratory.run, label)
+        super().__init__(laboratory.run.directory, self.space.command([]), run=laboratory.run)
         self._attachments: dict[str, _Attachment] = {}
 
     @property
@@ -99,15 +101,15 @@ class Host:
         router = site.routers[0]
         attachment = self._attachments.get(device)
         if attachment is None:
-            port = self._laboratory.next_device()
+            port = self.laboratory.next_device()
             metric = _FIRST_METRIC * (1 + len(self._attachments))
-            link = f"link add {device} index {self._laboratory.next_index()} type veth peer {port} netns {router.path}"
-            self.space.ip([link, f"link set {device} up"])
+            link = f"link add {device} index {self.laboratory.next_index()} type veth peer {port} netns {router.path}"
+            self.space.configure([link, f"link set {device} up"])
             attachment = self._attachments[device] = _Attachment(site, site.next_host(), port, metric)
         else:
-            attachment.site.routers[0].ip([f"link set {attachment.port} netns {router.path}"])
+            attachment.site.routers[0].configure([f"link set {attachment.port} netns {router.path}"])
             attachment.site, attachment.number = site, site.next_host()
-        router.ip([f"link set {attachment.port} master {LAN} up"])
+        router.configure([f"link set {attachment.port} master {LAN} up"])
         self._wait_for_carrier(device)
         self.renew_lease(device)
 
@@ -132,7 +134,7 @@ class Host:
         """Give an unplugged device its carrier back."""
         self._set_port(device, "up")
         self._wait_for_carrier(device)
-        self.space.ip([f"neigh flush dev {device}"])  # a request from before is repeated after a second only
+        self.space.configure([f"neigh flush dev {device}"])  # a request from before is repeated after a second only
 
     def lease(self, device: str = ETHERNET) -> Lease:
         """Return the addresses of a device."""
@@ -152,7 +154,7 @@ class Host:
 
     def _set_port(self, device: str, state: str) -> None:
         attachment = self._attachments[device]
-        attachment.site.routers[0].ip([f"link set {attachment.port} {state}"])
+        attachment.site.routers[0].configure([f"link set {attachment.port} {state}"])
 
     def _wait_for_carrier(self, device: str) -> None:
         """Return when no frame is lost in either direction: an address request that is lost costs a second."""

@@ -16,23 +16,26 @@ from gdp.host.run_registry import Run
 from internet.access import Access, core_rules
 from internet.host import ETHERNET, Host
 from internet.site import Site
-from internet.space import Space
+from lab.namespaces import IpNamespace
+from lab.process import end_processes
 
 _PUBLIC: Final = (IPv4Network("198.51.100.0/24"), IPv4Network("203.0.113.0/24"), IPv4Network("192.0.2.0/24"))
 _PUBLIC6: Final = IPv6Network("2001:db8::/32")
+_END_S: Final = 10.0
 _BLOCK_BITS, _PREFIX_BITS = 29, 48
+TOOLS: Final = ("ip", "nft", "conntrack")  # what it needs
 _FIRST_INDEX: Final = 1_000  # ends of a pair differ in index; see ``lab.namespaces``
 
 
 class Laboratory:
-    """The core and what is attached to it; a context manager that ends the processes of delay lines.
+    """The core and what is attached to it; a context manager that ends the processes of hosts and of delay lines.
 
     Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, run: Run) -> None:
         self.run = run
-        self.core = Space(run, "core", forwards=True)
+        self.core = IpNamespace(run, "core", forwards=True)
         self.sites: dict[str, Site] = {}
         self.hosts: dict[str, Host] = {}
         self._blocks: Iterator[IPv4Network] = chain.from_iterable(
@@ -40,14 +43,15 @@ class Laboratory:
         )
         self._prefixes = _PUBLIC6.subnets(new_prefix=_PREFIX_BITS)
         self._indices, self._devices = count(_FIRST_INDEX), count()
-        self.core.ip(f"route add blackhole {network}" for network in (*_PUBLIC, _PUBLIC6))
+        self.core.configure(f"route add blackhole {network}" for network in (*_PUBLIC, _PUBLIC6))
 
     def __enter__(self) -> Laboratory:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for site in self.sites.values():
-            site.close()
+        end_processes([process for host in self.hosts.values() for process in host.running], _END_S)
+        for each in self.sites.values():
+            each.close()
 
     def add_site(self, label: str, access: Access, *, has_line: bool = False) -> Site:
         """Attach a site.

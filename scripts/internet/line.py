@@ -21,9 +21,6 @@ import time
 from typing import Final
 
 from fog.providers.local.delay import DelayLine
-from gdp.host.run_registry import Run
-from internet.space import Space
-from lab.process import FailedError, LabProcess
 
 log = logging.getLogger(__name__)
 
@@ -34,26 +31,6 @@ _FRAME_BYTES: Final = (1 << 16) + 64
 _BATCH: Final = 32
 _MS_NS: Final = 1_000_000
 _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
-
-
-class LineProcess(LabProcess):
-    """A running delay line between two devices of a namespace; it starts without delay.
-
-    Raises ``FailedError``: it does not start.
-    """
-
-    def __init__(self, run: Run, space: Space, one: str, other: str) -> None:
-        argv = space.command([sys.executable, "-m", "internet.line", one, other])
-        super().__init__(run, f"line {space.path.name}", argv, has_orders=True)
-        try:
-            self.set_delay(0.0)
-        except FailedError:
-            self.close()
-            raise
-
-    def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
-        """Delay frames that arrive from now on. Raises ``FailedError``: the process has ended."""
-        self.ask(ms=ms, jitter_ms=jitter_ms)
 
 
 class _Delay:

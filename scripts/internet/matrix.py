@@ -64,7 +64,8 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     hosts = {side: [_add(laboratory, access, side) for access in chosen] for side in _SIDES}
     everyone = [*hosts["a"], *hosts["b"]]
-    with Overlay(laboratory) as overlay, ExitStack() as stack:
+    overlay = Overlay(laboratory)
+    with ExitStack() as stack:
         overlay.add_switch(border, is_border=True, has_relay=Access.UDP_BLOCKED in chosen)
         for host in everyone:
             is_blocked = host.site(host.devices[0]).access is Access.UDP_BLOCKED

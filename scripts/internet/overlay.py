@@ -6,19 +6,14 @@ I/O. The run's directory holds a folder for each node, with its keys, its config
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Final
-
-import yaml
+from typing import Any, Final
 
 import gdp
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
-from gdp.management.control_client import ask_node, find_control_socket
-from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import ROOT_CERTIFICATE
@@ -26,13 +21,9 @@ from gdp.trust.right import Right
 from internet.host import Host
 from internet.laboratory import Laboratory
 from lab.credentials import grant
-from lab.process import LabProcess, end_processes
 
 LISTEN: Final = 51_820
-_PATIENCE_S: Final = 5.0
-_START_S: Final = 60.0
 _ATTACH_S: Final = 60.0
-_RELAY: Final = "relay"
 _TLS_PORT: Final = 443
 _NODE: Final = "node"
 _RIB: Final = "rib"
@@ -40,22 +31,14 @@ Yaml = Mapping[str, object]
 
 
 class Overlay:
-    """Processes of a domain; a context manager that ends them. ``folder``: of all keys and configuration files."""
+    """A domain, whose nodes run on the hosts of a laboratory. ``folder``: of all keys and configuration files."""
 
     def __init__(self, laboratory: Laboratory) -> None:
         self.folder = laboratory.run.directory
-        self._laboratory = laboratory
         self._domain, self._owner = self.folder / "domain", self.folder / "owner"
-        self._processes: dict[str, LabProcess] = {}
         self._labels: dict[str, str] = {}  # of switches, by name
         make_domain(self._domain, "field")
         make_owner(self._owner)
-
-    def __enter__(self) -> Overlay:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end(*self._processes)
 
     def add_switch(
         self,
@@ -90,52 +73,43 @@ class Overlay:
         for one, other in ((label, border.label) for border in borders):
             self._copy_record(one, other)
             self._copy_record(other, one)
-        content = {
-            "identity": str(identity),
-            "domain": self._root(),
-            "attach": [f"{_NODE}0", *([f"{_RIB}0"] if is_border else [])],
-            "links": {
-                "listen": LISTEN,
-                "public": [each.to_text() for each in endpoints],
-                "peers": str(peers),
-                **({"uplinks": list(uplinks)} if uplinks else {}),
-                **(links or {}),
-            },
-            "relay": has_relay,
+        tunnels = {
+            "listen": LISTEN,
+            "public": [each.to_text() for each in endpoints],
+            "peers": str(peers),
+            **({"uplinks": list(uplinks)} if uplinks else {}),
+            **(links or {}),
         }
-        self.config_file(label).write_text(yaml.safe_dump(content), encoding="utf-8")
+        attach = [f"{_NODE}0", *([f"{_RIB}0"] if is_border else [])]
+        host.write(label, identity, attach=attach, links=tunnels, relay=has_relay)
         if has_relay:
-            self._write_relay(label, is_border=is_border, borders=borders)
+            host.write(_relay(host), identity, **self._relay_ends(is_border=is_border, borders=borders))
 
     def start(self, *hosts: Host) -> None:
         """Start the switches and relays of these hosts; return when all are ready.
 
         Raises ``FailedError``: one does not start.
         """
-        self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
-        relays = {f"{host.label}-{_RELAY}": host for host in hosts}
-        found = {label: (host, "gdp.cli.relay", self.config_file(label)) for label, host in relays.items()}
-        self._start({label: each for label, each in found.items() if each[2].exists()})
+        switches = [(each, each.launch_node("switch", each.label)) for each in hosts]
+        for host, switch in switches:
+            host.ready(switch)
+        with_relay = [each for each in hosts if (each.folder / f"{_relay(each)}.yaml").exists()]
+        relays = [(each, each.launch_node("relay", _relay(each))) for each in with_relay]
+        for host, relay in relays:
+            host.ready(relay)
 
     def start_rib(self, host: Host) -> None:
         """Start the domain's RIB on a border; return when it is ready."""
         identity = self.folder / _RIB
         if not identity.exists():
             make_node(identity, Role.RIB, _RIB, self._domain)
-        path = self.folder / f"{_RIB}.yaml"
-        content = {"identity": str(identity), "domain": self._root(), "iface": f"{_RIB}0"}
-        path.write_text(yaml.safe_dump(content), encoding="utf-8")
-        self._start({_RIB: (host, "gdp.cli.rib", path)})
-
-    def end(self, *labels: str) -> None:
-        """End the switches of these hosts, or the RIB, at once."""
-        end_processes([self._processes.pop(label) for label in labels], _PATIENCE_S)
+        host.write(_RIB, identity, iface=f"{_RIB}0")
+        host.start("rib", _RIB)
 
     def kill_border(self, border: Host) -> None:
         """Kill a border's switch, its RIB and its relay; ``start`` and ``start_rib`` bring them back."""
-        labels = {border.label, f"{border.label}-{_RELAY}", _RIB} & self._processes.keys()
-        for process in [self._processes.pop(label) for label in labels]:
-            process.kill_group()
+        for process in list(border.running):
+            border.kill(process)
 
     def add_node(self, host: Host, rights: Mapping[str, Collection[Right]]) -> Path:
         """Make the keys of the host's node, with rights on names; return its directory."""
@@ -149,15 +123,13 @@ class Overlay:
         root, iface = self._domain / ROOT_CERTIFICATE, f"{_NODE}0"
         return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S, lease_s=lease_s))
 
-    def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
+    def tunnels(self, host: Host) -> dict[str, dict[str, Any]]:
         """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
-        rows = self.status(host)["links"]
-        assert isinstance(rows, list)
-        return {self._labels[str(row["peer"])]: row for row in rows}
+        return {self._labels[row["peer"]]: row for row in self.status(host)["links"]}
 
-    def status(self, host: Host) -> Mapping[str, object]:
+    def status(self, host: Host) -> dict[str, Any]:
         """Return the status of a host's switch."""
-        return ask_node(find_control_socket(self.switch_folder(host.label)), Command.STATUS, _PATIENCE_S).result
+        return host.status(str(self.switch_folder(host.label)))
 
     def switch_folder(self, label: str) -> Path:
         """Return the directory of a switch's keys."""
@@ -167,39 +139,20 @@ class Overlay:
         """Return the folder with the endpoint records that a switch reads."""
         return self.folder / f"{label}-peers"
 
-    def config_file(self, label: str) -> Path:
-        """Return the configuration file of a host's switch, or of another program by its label."""
-        return self.folder / f"{label}.yaml"
-
-    def log(self, label: str) -> str:
-        """Return what a process has logged."""
-        return (self.folder / f"{label}.log").read_text(encoding="utf-8")
-
-    def _write_relay(self, label: str, *, is_border: bool, borders: Sequence[Host]) -> None:
-        ends: Yaml = {"server": {"port": _TLS_PORT}}
-        if not is_border:
-            names = {peer: name for name, peer in self._labels.items()}
-            dialled = [(names[each.label], each.lease(each.devices[0])) for each in borders]
-            ends = {
-                "borders": [
-                    {"peer": name, "endpoints": [Endpoint(lease.address.partition("/")[0], _TLS_PORT).to_text()]}
-                    for name, lease in dialled
-                ]
-            }
-        content = {"identity": str(self.switch_folder(label)), "domain": self._root(), **ends}
-        self.config_file(f"{label}-{_RELAY}").write_text(yaml.safe_dump(content), encoding="utf-8")
+    def _relay_ends(self, *, is_border: bool, borders: Sequence[Host]) -> Yaml:
+        """Return the keys of a relay's configuration that say what it listens on, or what it dials."""
+        if is_border:
+            return {"server": {"port": _TLS_PORT}}
+        names = {peer: name for name, peer in self._labels.items()}
+        dialled = [(names[each.label], each.lease(each.devices[0]).address.partition("/")[0]) for each in borders]
+        ends = [{"peer": peer, "endpoints": [Endpoint(own, _TLS_PORT).to_text()]} for peer, own in dialled]
+        return {"borders": ends}
 
     def _copy_record(self, whose: str, to: str) -> None:
         name = f"{whose}{RECORD_SUFFIX}"
         (self.peers_folder(to) / name).write_bytes((self.folder / "records" / name).read_bytes())
 
-    def _root(self) -> Yaml:
-        return {"root": str(self._domain / ROOT_CERTIFICATE)}
 
-    def _start(self, commands: Mapping[str, tuple[Host, str, Path]]) -> None:
-        for label, (host, module, config) in commands.items():
-            argv = host.command([sys.executable, "-m", module, "--json", "--config", str(config)])
-            self._processes[label] = LabProcess(self._laboratory.run, label, argv)
-        for label in commands:
-            if self._processes[label].read(_START_S).get("event") != "ready":
-                raise self._processes[label].failed("does not start")
+def _relay(host: Host) -> str:
+    """Return the name of the configuration of a host's relay."""
+    return f"{host.label}-relay"

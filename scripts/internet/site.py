@@ -14,6 +14,7 @@ a prefix of 48 bits.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
 from ipaddress import IPv4Network
@@ -21,8 +22,8 @@ from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError
 from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
-from internet.line import LineProcess
-from internet.space import Space
+from lab.namespaces import IpNamespace
+from lab.process import LabProcess
 
 if TYPE_CHECKING:
     from internet.laboratory import Laboratory
@@ -63,21 +64,23 @@ class Site:
         self.is_cut = False
         self.uplink = laboratory.next_device()  # the core's device
         self._leases = 0
-        self._line: LineProcess | None = None
+        self._line: LabProcess | None = None
         count = 2 if access is Access.DOUBLE_NAT else 1
         self.routers = tuple(
-            Space(laboratory.run, f"{label}-{name}", forwards=True) for name in ("router", "carrier")[:count]
+            IpNamespace(laboratory.run, f"{label}-{name}", forwards=True) for name in ("router", "carrier")[:count]
         )
         self._block, self._prefix = laboratory.take_block(), laboratory.take_prefix()
         self._core_mac, self._wan_mac = self._next_mac(), self._next_mac()
         for router in self.routers:
             bridge = f"{LAN} address {self._next_mac()} type bridge forward_delay 0 mcast_snooping 0"
-            router.ip([f"link add {bridge}", f"link set {LAN} up"])
+            router.configure([f"link add {bridge}", f"link set {LAN} up"])
         if count == 2:
             home, carrier = self.routers
             port = laboratory.next_device()
-            carrier.ip([f"link add {port} index {laboratory.next_index()} type veth peer {WAN} netns {home.path}"])
-            carrier.ip([f"link set {port} master {LAN} up"])
+            carrier.configure(
+                [f"link add {port} index {laboratory.next_index()} type veth peer {WAN} netns {home.path}"]
+            )
+            carrier.configure([f"link set {port} master {LAN} up"])
         self._join_core(has_line=has_line)
         self._configure()
 
@@ -99,7 +102,7 @@ class Site:
         return 6 in TRAITS[self.access].versions
 
     @property
-    def _outer(self) -> Space:
+    def _outer(self) -> IpNamespace:
         return self.routers[-1]
 
     def lease(self, number: int) -> Lease:
@@ -130,8 +133,8 @@ class Site:
         if self._has6:
             core.append(f"route del {old_prefix} dev {self.uplink}")
             outer.append(f"addr del {old_prefix[1]}/64 dev {LAN}")
-        self._core.ip(core)
-        self._outer.ip(outer)
+        self._core.configure(core)
+        self._outer.configure(outer)
         self._configure()
         if self._is_nat:
             self._outer.flush_connections()  # packets that came in between have a mapping to an inner address
@@ -158,7 +161,7 @@ class Site:
         """Switch the routers off: all their links lose the carrier, and they forget their mappings."""
         self._laboratory.set_ports(self, is_up=False)
         for router in self.routers:
-            router.ip([f"link set {WAN} down"])
+            router.configure([f"link set {WAN} down"])
         self.flush_mappings()
 
     def power_on(self) -> None:
@@ -169,11 +172,11 @@ class Site:
     def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
         """Delay packets by ``ms``, and up to ``jitter_ms`` more, in each direction; their order stays.
 
-        Raises ``LocalError``: the site was made without a delay line.
+        Raises ``LocalError``: the site was made without a delay line. Raises ``FailedError``: its process has ended.
         """
         if self._line is None:
             raise LocalError(f"site {self.label} has no delay line")
-        self._line.set_delay(ms, jitter_ms)
+        self._line.ask(ms=ms, jitter_ms=jitter_ms)
 
     def close(self) -> None:
         """End the process of the delay line."""
@@ -187,14 +190,19 @@ class Site:
         number, outer = self._laboratory.next_index(), self._outer
         core_end, router_end = f"index {number} address {self._core_mac}", f"address {self._wan_mac} netns {outer.path}"
         if not has_line:
-            self._core.ip([f"link add {self.uplink} {core_end} type veth peer name {WAN} {router_end}"])
+            self._core.configure([f"link add {self.uplink} {core_end} type veth peer name {WAN} {router_end}"])
             return
-        line = Space(self._laboratory.run, f"{self.label}-line")
-        self._core.ip([f"link add {self.uplink} {core_end} type veth peer core netns {line.path}"])
-        outer.ip([f"link add {WAN} index {number} address {self._wan_mac} type veth peer site netns {line.path}"])
-        line.set({f"ipv6/conf/{device}/disable_ipv6": 1 for device in ("core", "site")})
-        line.ip(["link set core up", "link set site up"])
-        self._line = LineProcess(self._laboratory.run, line, "core", "site")
+        line = IpNamespace(self._laboratory.run, f"{self.label}-line")
+        self._core.configure([f"link add {self.uplink} {core_end} type veth peer core netns {line.path}"])
+        outer.configure(
+            [f"link add {WAN} index {number} address {self._wan_mac} type veth peer site netns {line.path}"]
+        )
+        for device in ("core", "site"):
+            line.set(f"ipv6/conf/{device}/disable_ipv6", 1)
+        line.configure(["link set core up", "link set site up"])
+        argv = line.command([sys.executable, "-m", "internet.line", "core", "site"])
+        self._line = LabProcess(self._laboratory.run, f"line {self.label}", argv, has_orders=True)
+        self.set_delay(0.0)
 
     def _configure(self) -> None:
         """Set all links up, and addresses, routes and rules; harmless where they are so."""
@@ -217,12 +225,12 @@ class Site:
         if self._has6:
             core.append(f"route replace {self._prefix} via {_ROUTER_END6} dev {self.uplink}")
             outer.append(f"route replace default via {_CORE_END6} dev {WAN}")
-        self._core.ip(core)
-        self._outer.ip(outer)
+        self._core.configure(core)
+        self._outer.configure(outer)
         if len(self.routers) == 2:
-            self._outer.ip([f"addr replace {_CARRIER[1]}/{_CARRIER.prefixlen} dev {LAN}"])
+            self._outer.configure([f"addr replace {_CARRIER[1]}/{_CARRIER.prefixlen} dev {LAN}"])
             wan = f"addr replace {_CARRIER[2]}/{_CARRIER.prefixlen} dev {WAN}"
-            self.routers[0].ip([f"link set {WAN} up", wan, f"route replace default via {_CARRIER[1]}"])
+            self.routers[0].configure([f"link set {WAN} up", wan, f"route replace default via {_CARRIER[1]}"])
             self.routers[0].wait_for_carrier(WAN)
         self._core.wait_for_carrier(self.uplink)
         self._outer.wait_for_carrier(WAN)
@@ -246,4 +254,4 @@ class Site:
                 f"addr replace {_CORE_END6}/64 dev {LAN} nodad",
                 f"addr replace {self._prefix[1]}/64 dev {LAN} nodad",
             ]
-        self.routers[0].ip(lines)
+        self.routers[0].configure(lines)

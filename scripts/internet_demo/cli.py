@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -24,11 +22,10 @@ from rich.markup import escape
 from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import RunRegistry, outer_uid
-from internet.laboratory import Laboratory
-from internet.space import TOOLS
+from internet.laboratory import TOOLS, Laboratory
 from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Display, Outcome, Pace, run_scenario
-from lab.command import FAILED, PASSED, console_of, exit_with, new_app
+from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
 
 _PACE: Final = Pace()
 
@@ -75,8 +72,7 @@ def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, conso
         console.print(f"removed what run {swept} had left behind")
     run = runs.start()
     try:
-        for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(each, _end)
+        end_on_signals()
         with Laboratory(run) as laboratory, Display(console) as display:
             outcome = play(laboratory, pace, display)
     finally:
@@ -84,11 +80,6 @@ def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, conso
         run.end()
     _tell(outcome, console, as_json=as_json)
     return FAILED if outcome.lost or outcome.doubled or not outcome.images else PASSED
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:
-    del frame
-    sys.exit(128 + number)
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:

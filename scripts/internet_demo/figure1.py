@@ -25,6 +25,7 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
+from lab.process import LabProcess
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph
 
@@ -57,7 +58,7 @@ class _Stage(Stage):
         profiles.write_text(FAST_DDS_PROFILES.replace("<type>UDPv4</type>", _ON_LOOPBACK))
         self.graphs = {self.drone.label: Graph(2, _DOMAIN), self.cloud.label: Graph(1, 0)}
         for label, graph in self.graphs.items():
-            self.environments[label] = graph.environment(self._folder / "ros-logs", profiles)
+            self._laboratory.hosts[label].environment = dict(graph.environment(self._folder / "ros-logs", profiles))
 
     def admit(self, host: Host, token: str) -> None:
         """Let a machine join, and write its ROS into its proxy.yaml."""
@@ -81,24 +82,17 @@ class _Stage(Stage):
             graph, site = self.graphs[host.label], host.site()
             nat = f"NAT of the {site.label} network, {site.address}"
             lines.append(f"  {host.label:7} ROS {graph.ros}  {host.lease().address:15} -- {nat:44} {side}")
-        topics = ask_node(find_control_socket(drone.directory / "proxy"), Command.TOPICS, _PATIENCE_S).result["topics"]
-        assert isinstance(topics, list)
-        return [*lines, *(f"  {each['topic']:9} is {each['name']}" for each in topics)]
+        topics: Any = ask_node(find_control_socket(drone.directory / "proxy"), Command.TOPICS, _PATIENCE_S).result
+        return [*lines, *(f"  {each['topic']:9} is {each['name']}" for each in topics["topics"])]
 
 
-class _Node:
-    """A talker or a listener of one topic."""
-
-    def __init__(self, stage: _Stage, host: Host, *words: str) -> None:
-        self.process = stage.start_program(host, [sys.executable, "-m", *words], heard=True)
-
-    def wait_for(self, event: str, is_met: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
-        """Return the next event of this name for which ``is_met``, after a minute any. Raises ``FailedError``: none."""
-        deadline_s = time.monotonic() + _PATIENCE_S
-        while True:
-            said: dict[str, Any] = self.process.read(deadline_s + _PATIENCE_S - time.monotonic())
-            if said["event"] == event and (is_met(said) or time.monotonic() > deadline_s):
-                return said
+def _said(node: LabProcess, event: str, is_met: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+    """Return the next event of this name for which ``is_met``, after a minute any. Raises ``FailedError``: none."""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while True:
+        said: dict[str, Any] = node.read(deadline_s + _PATIENCE_S - time.monotonic())
+        if said["event"] == event and (is_met(said) or time.monotonic() > deadline_s):
+            return said
 
 
 def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
@@ -109,12 +103,13 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
     rospy_folder()  # raises
     outcome = Outcome()
     display.step("networks: an enterprise's and a university's NAT for the drone, a provider's NAT for the cloud")
-    with _Stage(laboratory, pace.delay_ms) as stage, ThreadPoolExecutor() as pool:
+    stage = _Stage(laboratory, pace.delay_ms)
+    with ThreadPoolExecutor() as pool:
         university = stage.add_site("university", Access.PORT_RESTRICTED)
         token = stage.create_domain()
         stage.start(stage.cloud_b)
         list(pool.map(stage.admit, (stage.drone, stage.cloud), (token, stage.make_token())))
-        _Node(stage, stage.cloud, "ring.nodes.master", str(MASTER_PORT)).wait_for("ready")
+        _said(_launch(stage.cloud, "ring.nodes.master", str(MASTER_PORT)), "ready")
         stage.start(stage.drone, stage.cloud)
         nodes = {flow.topic: _start(stage, pace, flow) for flow in stage.flows}
         stage.wait_until_joined()
@@ -124,11 +119,11 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
         for command in stage.typed:
             display.step(f"typed at {command}")
         for _, listener in nodes.values():
-            listener.wait_for("hears")
+            _said(listener, "hears")
         outcome.drawing = stage.drawing("before")
         display.step("/images and /commands cross")
         for talker, _ in nodes.values():
-            talker.process.send(signal.SIGUSR1)
+            talker.send(signal.SIGUSR1)
         time.sleep(pace.calm_s)
         display.step("the drone flies from the enterprise network to the university network")
         stage.drone.attach(university)
@@ -138,25 +133,29 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
     return outcome
 
 
-def _start(stage: _Stage, pace: Pace, flow: _Flow) -> tuple[_Node, _Node]:
+def _launch(host: Host, *words: str) -> LabProcess:
+    return host.launch([sys.executable, "-m", *words], host.label)
+
+
+def _start(stage: _Stage, pace: Pace, flow: _Flow) -> tuple[LabProcess, LabProcess]:
     """Start the ring's talker and listener of a flow; return them when they are ready."""
     count, rows = int(2 * pace.calm_s * pace.rate_hz), max(1, pace.image_bytes // _ROW_BYTES)
     nodes = []
     for host, role in ((flow.start, flow.node), (flow.end, f"listener:{flow.node}")):
         ros = stage.graphs[host.label].ros
         words = [str(ros), role, str(count), str(pace.rate_hz), str(rows), *(["--ros-args", "-r"] if ros == 2 else [])]
-        nodes.append(_Node(stage, host, "ring.nodes", *words, f"{flow.original}:={flow.topic}"))
+        nodes.append(_launch(host, "ring.nodes", *words, f"{flow.original}:={flow.topic}"))
     for each in nodes:
-        each.wait_for("ready")
+        _said(each, "ready")
     return nodes[0], nodes[1]
 
 
-def _count(outcome: Outcome, topic: str, talker: _Node, listener: _Node) -> None:
+def _count(outcome: Outcome, topic: str, talker: LabProcess, listener: LabProcess) -> None:
     """Wait until all messages have arrived, or for a minute, and count those that did as they were."""
-    sent = talker.wait_for("done")["sent"]
-    listener.wait_for("progress", lambda said: said["topics"][0]["received"] >= len(sent))
-    listener.process.send(signal.SIGINT)
-    (report,) = listener.wait_for("done")["topics"]
+    sent = _said(talker, "done")["sent"]
+    _said(listener, "progress", lambda said: said["topics"][0]["received"] >= len(sent))
+    listener.send(signal.SIGINT)
+    (report,) = _said(listener, "done")["topics"]
     heard = report["heard"]
     lost, pause_s = len(set(sent) - set(heard)), (report["silent_ms"] or 0.0) / 1e3
     outcome.images += len(sent)

@@ -110,7 +110,8 @@ def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcom
     """Play the demonstration. Raises ``LocalError``: a machine does not join, or a program does not start."""
     outcome = Outcome()
     display.step("networks: home and 5G for the robot, a provider's NAT, a public cloud, an office on IPv6 only")
-    with Stage(laboratory, pace.delay_ms) as stage, ExitStack() as stack:
+    stage = Stage(laboratory, pace.delay_ms)
+    with ExitStack() as stack:
         begun_s = time.monotonic()
         _join_all(stage)
         outcome.typed = stage.typed

@@ -14,20 +14,18 @@ environment of ROS is left out: sessions of this process take its place, with it
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import gdp
 from gdp.control.endpoints import Endpoint
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import LISTEN_PORT
 from gdp.enrolment.programs import programs_of
-from gdp.errors import GdpError, LocalError
+from gdp.errors import GdpError
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_owner
@@ -38,7 +36,7 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
 from lab.credentials import grant
-from lab.process import LabProcess, end_processes, python_environment, until
+from lab.process import until
 
 WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"
@@ -46,7 +44,6 @@ _DOMAIN: Final = "lab"
 _PATIENCE_S: Final = 60.0
 _STATUS_S: Final = 2.0
 _SHOWN: Final = 40  # characters of a word
-_StageT = TypeVar("_StageT", bound="Stage")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,24 +66,21 @@ class Link:
 
 
 class Stage:
-    """Networks, machines and their programs; a context manager that ends the programs.
+    """Networks, and machines with their programs.
 
     Args:
         delay_ms: of each uplink, in each direction; 0: none, and no process for it.
 
     Attributes:
         typed: the commands that a person types, each after its machine.
-        environments: of ROS by machine; the ROS proxy of such a machine runs, too.
     """
 
     def __init__(self, laboratory: Laboratory, delay_ms: float) -> None:
         self._laboratory = laboratory
         self._folder = laboratory.run.directory
         self._delay_ms = delay_ms
-        self._processes: list[LabProcess] = []
         self.machines: dict[str, Machine] = {}
         self.typed: list[str] = []
-        self.environments: dict[str, Mapping[str, str]] = {}
         self.cloud_b = laboratory.add_host("cloud-b", self.add_site("dc", Access.PUBLIC))
         self._add_members()
 
@@ -97,12 +91,6 @@ class Stage:
         self.robot.attach(self.mobile, WWAN)
         self.cloud_a = self._laboratory.add_host("cloud-a", self.add_site("provider", Access.PORT_RESTRICTED))
         self.edge = self._laboratory.add_host("edge", self.add_site("office", Access.IPV6_ONLY))
-
-    def __enter__(self: _StageT) -> _StageT:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        end_processes(self._processes, _PATIENCE_S / 6)
 
     def add_site(self, label: str, access: Access) -> Site:
         """Attach one more network."""
@@ -125,7 +113,7 @@ class Stage:
     def type_at(self, host: Host, *words: str) -> str:
         """Run a command of ``gdp`` about a machine on it; return its output."""
         self._typed(host, words)
-        return self._run(host, *words, f"--directory={self._directory(host)}")
+        return host.gdp(*words, f"--directory={self._directory(host)}")
 
     def join(self, host: Host, token: str, *options: str) -> None:
         """Let a machine join by a token."""
@@ -133,14 +121,14 @@ class Stage:
 
     def remove(self, label: str) -> None:
         """Remove a machine from the domain."""
-        self._run(self.cloud_b, "domain", "remove", _DOMAIN, label, f"--directory={self._directory(self.cloud_b)}")
+        self.cloud_b.gdp("domain", "remove", _DOMAIN, label, f"--directory={self._directory(self.cloud_b)}")
 
     def start(self, *hosts: Host) -> None:
         """Start the programs of machines, as the last step of their commands does; the kernel ends them with us."""
         for host in hosts:
             for program in programs_of(MemberFiles.load(self._directory(host))):
-                if program.name != "proxy" or host.label in self.environments:
-                    self.start_program(host, program.argv)
+                if program.name != "proxy" or host.environment:
+                    host.launch(program.argv, host.label, heard=False)
 
     def wait_until_joined(self) -> None:
         """Return when each machine has a tunnel to the border. Raises ``FailedError``: one has none in time."""
@@ -193,25 +181,10 @@ class Stage:
         """
         self._typed(host, words)
         directory = self._directory(host)
-        said = self._run(host, *words, f"--directory={directory}", "--no-start", answer=answer)
+        said = host.gdp(*words, f"--directory={directory}", "--no-start", answer=answer)
         self.machines[host.label] = Machine(host.label, host, directory)
         return said
 
     def _typed(self, host: Host, words: Sequence[str]) -> None:
         shown = " ".join(word if len(word) < _SHOWN else f"{word[: _SHOWN - 3]}..." for word in words)
         self.typed.append(f"{host.label}: gdp {shown}")
-
-    def _run(self, host: Host, *words: str, answer: str = "") -> str:
-        argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
-        environment = python_environment(self.environments.get(host.label, {}))
-        done = subprocess.run(argv, input=answer, capture_output=True, check=False, text=True, env=environment)
-        if done.returncode:
-            raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
-        return done.stdout
-
-    def start_program(self, host: Host, argv: Sequence[str], *, heard: bool = False) -> LabProcess:
-        """Start a program of a machine; what is not heard goes to the machine's log, as its errors do."""
-        environment = self.environments.get(host.label)
-        process = LabProcess(self._laboratory.run, host.label, host.command(argv), environment=environment, heard=heard)
-        self._processes.append(process)
-        return process

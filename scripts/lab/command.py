@@ -5,9 +5,12 @@ I/O; prints. Exit codes: 0 passed, 1 failed, 2 wrong input, or what the command 
 
 from __future__ import annotations
 
+import signal
+import sys
 import time
 from collections.abc import Callable
-from typing import Final, TypeVar
+from types import FrameType
+from typing import Final, NoReturn, TypeVar
 
 import typer
 from rich.console import Console, RenderableType
@@ -16,6 +19,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from gdp.errors import GdpError
+from gdp.host.interruption import let_nothing_interrupt
 from lab.process import FailedError
 
 PASSED: Final = 0
@@ -35,6 +39,17 @@ def console_of(*, stderr: bool = False, columns: int = _WIDE) -> Console:
     """Return a console; ``columns``: its width where it is no terminal."""
     console = Console(stderr=stderr)
     return console if console.is_terminal else Console(stderr=stderr, width=columns)
+
+
+def end_on_signals() -> None:
+    """Let Ctrl-C, SIGTERM and SIGHUP end this process by ``SystemExit``; nothing interrupts what is then taken down."""
+
+    def end(number: int, _: FrameType | None) -> NoReturn:
+        let_nothing_interrupt()
+        sys.exit(128 + number)
+
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, end)
 
 
 def exit_with(work: Callable[[], int]) -> None:

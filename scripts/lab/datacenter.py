@@ -27,9 +27,8 @@ from ipaddress import IPv4Address
 from typing import Final
 
 from gdp.host.run_registry import Run
-from internet.space import Space
 from lab.machine import LabMachine
-from lab.namespaces import Namespace
+from lab.namespaces import IpNamespace, Namespace
 
 CALLER: Final = IPv4Address("198.51.100.1")
 METADATA: Final = IPv4Address("169.254.169.254")
@@ -90,7 +89,7 @@ class Router:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._next = _FIRST
-        self.namespace = Space(run, "router", forwards=True)
+        self.namespace = IpNamespace(run, "router", forwards=True)
         self.device = f"wan{run.id}"
         link = ("type", "veth", "peer", "name", "wan", "netns", str(self.namespace.path))
         for words in (
@@ -99,7 +98,7 @@ class Router:
             ("link", "set", self.device, "up"),
         ):
             LabMachine(run.directory).output("ip", *words)
-        self.namespace.ip(
+        self.namespace.configure(
             [
                 f"address add {_WAN}/24 dev wan",
                 "link set wan up",
@@ -115,7 +114,7 @@ class Router:
         """Return the namespace and addresses of a new machine whose device ``eth0`` is up."""
         number, self._next = self._next, self._next + 1
         lease = Lease(Namespace(self._run, name), _PRIVATE + number, _PUBLIC + number)
-        self.namespace.ip(
+        self.namespace.configure(
             [
                 f"link add m{number} type veth peer name eth0 netns {lease.namespace.path}",
                 f"link set m{number} master lan up",

@@ -116,28 +116,29 @@ class LabMachine:
         node.until_logged(_READY, patience_s=_READY_S)
         return node
 
-    def run(self, *argv: str, patience_s: float = _COMMAND_S) -> subprocess.CompletedProcess[str]:
-        """Run a command to its end; it may fail."""
+    def run(self, *argv: str, answer: str = "", patience_s: float = _COMMAND_S) -> subprocess.CompletedProcess[str]:
+        """Run a command to its end; it may fail. ``answer``: what it gets when it asks."""
         return subprocess.run(
             [*self._enter, *argv],
             cwd=self.folder,
             env=python_environment(self.environment),
+            input=answer,
             capture_output=True,
             text=True,
             timeout=patience_s,
             check=False,
         )
 
-    def output(self, *argv: str) -> str:
+    def output(self, *argv: str, answer: str = "", patience_s: float = _COMMAND_S) -> str:
         """Run a command to its end, and return what it prints. Raises ``FailedError``: it fails."""
-        done = self.run(*argv)
+        done = self.run(*argv, answer=answer, patience_s=patience_s)
         if done.returncode:
             raise FailedError(f"{' '.join(argv)}: exit {done.returncode}: {done.stdout}{done.stderr}")
         return done.stdout
 
-    def gdp(self, *words: object) -> str:
+    def gdp(self, *words: object, answer: str = "") -> str:
         """Run ``gdp`` to its end, and return what it prints. Raises ``FailedError``: it fails."""
-        return self.output(*GDP, *map(str, words))
+        return self.output(*GDP, *map(str, words), answer=answer)
 
     def status(self, at: str) -> dict[str, Any]:
         """Return the status of a node, by the path of its control socket or of the folder with its keys."""

@@ -11,22 +11,36 @@ import contextlib
 import ctypes
 import os
 import select
+import socket
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
 from pyroute2 import IPRoute, netns
+from pyroute2.netlink.exceptions import NetlinkError
 
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.run_registry import Run, in_first_user_namespace
 from gdp.ports.rtnetlink import LinkMonitor
-from lab.topology import Link, Topology
+from lab.topology import Topology
 
 _PATIENCE_S: Final = 10.0
 _HERE: Final = "/proc/thread-self/ns/net"
+_NET: Final = Path("/proc/sys/net")
+_SETTINGS: Final = {  # no address waits for duplicate detection, and none is lost with the carrier
+    "ipv4/conf/all/send_redirects": 0,
+    "ipv4/conf/default/send_redirects": 0,
+    "ipv6/conf/default/accept_dad": 0,
+    "ipv6/conf/default/accept_ra": 0,
+    "ipv6/conf/default/router_solicitations": 0,
+    "ipv6/conf/all/keep_addr_on_down": 1,
+    "ipv6/conf/default/keep_addr_on_down": 1,
+}
+_FORWARDING: Final = {"ipv4/ip_forward": 1, "ipv6/conf/all/forwarding": 1}
+_NO_BRIDGE_RULES: Final = {"bridge/bridge-nf-call-iptables": 0, "bridge/bridge-nf-call-ip6tables": 0}
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 T = TypeVar("T")
@@ -47,8 +61,35 @@ class Namespace:
         netns_files.create(self.path)
 
     def inside(self, work: Callable[[], T]) -> T:
-        """Call ``work`` in a thread inside, and return its result; a socket made there stays there."""
-        return netns_files.inside(self.path, work)
+        """Call ``work`` in a thread inside, and return its result; a socket made there stays there.
+
+        Raises ``LocalError``: the kernel refuses a request of netlink.
+        """
+        try:
+            return netns_files.inside(self.path, work)
+        except NetlinkError as error:
+            raise LocalError(f"{self.path.name}: {error}") from error
+
+    def join(self, far: Namespace, own: Mapping[str, object], peer: Mapping[str, object], **more: int) -> None:
+        """Make a pair of devices, one here and one in a far namespace; ``more``: further keys of the near one."""
+        descriptor = os.open(far.path, os.O_RDONLY | os.O_CLOEXEC)
+
+        def add() -> None:
+            with IPRoute() as here:
+                here.link("add", kind="veth", peer={**peer, "net_ns_fd": descriptor}, **own, **more)
+
+        try:
+            self.inside(add)
+        finally:
+            os.close(descriptor)
+
+    def move(self, device: str, to: Namespace) -> None:
+        """Move a device to another namespace, where it is down."""
+        descriptor = os.open(to.path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            self.inside(partial(set_link, device, net_ns_fd=descriptor))
+        finally:
+            os.close(descriptor)
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
@@ -62,6 +103,34 @@ class Namespace:
             netns.setns(before)
             os.close(before)
 
+    def run(self, *argv: str, text: str = "") -> str:
+        """Run a command inside, with ``text`` as its input; return what it prints. Raises ``LocalError``: it fails."""
+        run = partial(subprocess.run, argv, input=text, capture_output=True, check=False, text=True)
+        done: subprocess.CompletedProcess[str] = self.inside(run)
+        if done.returncode:
+            raise LocalError(f"{self.path.name}: {' '.join(argv)}: {done.stderr.strip()}\n{text}")
+        return done.stdout
+
+    def ip(self, *words: str) -> str:
+        """Run ``ip`` inside, and return what it prints. Raises ``LocalError``: it refuses."""
+        return self.run("ip", *words)
+
+    def configure(self, lines: Iterable[str]) -> None:
+        """Execute commands of ip(8), each without the word ``ip``. Raises ``LocalError``: one is refused."""
+        self.run("ip", "-batch", "-", text="\n".join(lines))
+
+    def nft(self, text: str) -> None:
+        """Execute commands of nft(8) as one transaction. Raises ``LocalError``: it is refused."""
+        self.run("nft", "-f", "-", text=text)
+
+    def set(self, setting: str, value: object) -> None:
+        """Set a value below ``/proc/sys/net`` of the namespace."""
+        self.inside(lambda: (_NET / setting).write_text(str(value), encoding="ascii"))
+
+    def wait_for_carrier(self, *devices: str) -> None:
+        """Return when these devices can send. Raises ``LocalError``: they do not get so far."""
+        self.inside(partial(wait_for_carrier, *devices))
+
     def command(self, argv: Sequence[str], *, dies_with_us: bool = True) -> list[str]:
         """Return the command line that runs ``argv`` inside, under the same process id.
 
@@ -69,6 +138,22 @@ class Namespace:
         """
         leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
         return ["nsenter", f"--net={self.path}", "--", *leash, *argv]
+
+
+class IpNamespace(Namespace):
+    """A namespace of a run with both versions of IP, whose loopback is up. ``forwards``: whether it is a router."""
+
+    def __init__(self, run: Run, label: str, *, forwards: bool = False) -> None:
+        super().__init__(run, label)
+        has_bridges = (_NET / "bridge").exists()  # else br_netfilter is not loaded, and bridged packets meet no rule
+        settings = _SETTINGS | (_FORWARDING if forwards else {}) | (_NO_BRIDGE_RULES if has_bridges else {})
+        for setting, value in settings.items():
+            self.set(setting, value)
+        self.ip("link", "set", "lo", "up")
+
+    def flush_connections(self) -> None:
+        """Forget the connections that the namespace tracks, and with them their NAT mappings."""
+        self.run("conntrack", "-F")
 
 
 class Space(Namespace):
@@ -102,23 +187,13 @@ class Space(Namespace):
         """Leave the namespace to the kernel; its processes and sockets keep it."""
         os.close(self._descriptor)
 
-    def ip(self, *words: str) -> str:
-        """Run ``ip`` inside, and return what it prints. Raises ``subprocess.CalledProcessError``: it refuses."""
-        with self.entered():
-            return subprocess.run(["ip", *words], check=True, capture_output=True, text=True).stdout
-
-    def set(self, setting: str, value: str) -> None:
-        """Set a value below ``/proc/sys/net`` of the namespace."""
-        with self.entered():
-            Path("/proc/sys/net", setting).write_text(value, encoding="ascii")
-
     def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
         """Create a pair of joined devices; return when both are up."""
         ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
         self.ip("link", "add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
         for name in (one, other):
             self.ip("link", "set", name, "up")
-        self.inside(partial(wait_for_carrier, one, other))
+        self.wait_for_carrier(one, other)
 
     def connect(self, other: Space, device: str, far: str = "") -> None:
         """Join this namespace by ``device`` to the device ``far`` of another, by default of the same name."""
@@ -126,7 +201,7 @@ class Space(Namespace):
         self.ip("link", "add", device, "type", "veth", "peer", "name", far or device, *place)
         other.ip("link", "set", far or device, "up")
         self.ip("link", "set", device, "up")
-        self.inside(partial(wait_for_carrier, device))
+        self.wait_for_carrier(device)
 
 
 @contextlib.contextmanager
@@ -149,7 +224,6 @@ def wait_for_carrier(*devices: str) -> None:
 
 
 _MAC_PREFIX: Final = "02:67:64:70"  # locally administered; "gdp" in ASCII
-_LOOPBACK: Final = 1  # the index of lo in every namespace
 _INDEX_FROM: Final = 100
 _PLUG_FROM: Final = 10_000
 
@@ -167,8 +241,9 @@ class Namespaces:
         for namespace in self._namespaces.values():
             namespace.inside(netns_files.disable_ipv6)
         self._join()
-        for node in topology.nodes:
-            self._inside(node, partial(_raise, [link.other(node) for link in topology.links_of(node)]))
+        for node, namespace in self._namespaces.items():
+            for device in ("lo", *(link.other(node) for link in topology.links_of(node))):
+                namespace.inside(partial(set_link, device, state="up"))
 
     def __getitem__(self, node: str) -> Namespace:
         """Return the namespace of a switch."""
@@ -186,75 +261,89 @@ class Namespaces:
         """Connect device ``ifname`` in one switch's namespace to a new ``ifname-s`` in another's, or its own."""
         self._plugged += 1
         mtu = max(link.mtu for link in self.topology.links)
-        far = os.open(self[switch].path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self._inside(home, partial(_plug, ifname, mtu, _PLUG_FROM + self._plugged, far))
-        finally:
-            os.close(far)
-        self._inside(switch, partial(_set_state, f"{ifname}-s", "up"))
-        self._inside(home, partial(_set_state, ifname, "up"))
+        own, peer = {"ifname": ifname, "mtu": mtu}, {"ifname": f"{ifname}-s", "mtu": mtu}
+        self[home].join(self[switch], own, peer, index=_PLUG_FROM + self._plugged)
+        self[switch].inside(partial(set_link, f"{ifname}-s", state="up"))
+        self[home].inside(partial(set_link, ifname, state="up"))
 
     def unplug(self, home: str, ifname: str) -> None:
         """Remove the pair that ``plug`` made."""
-        self._inside(home, partial(_delete, ifname))
+        self[home].inside(partial(remove_link, ifname))
 
     def _set_link(self, a: str, b: str, state: str) -> None:
         link = self.topology.link(a, b)
-        self._inside(link.a, partial(_set_state, link.b, state))
+        self[link.a].inside(partial(set_link, link.b, state=state))
 
     def _join(self) -> None:
+        """Make the veth pairs, whose two ends must not share an index.
+
+        With equal indices, Linux may report a lost carrier up to a second late. Source: Linux, net/core/link_watch.c,
+        ``linkwatch_urgent_event``. The kernel chooses the far end's index, and counts from 2.
+        """
         number = {node: index for index, node in enumerate(self.topology.nodes, 1)}
-        files = {node: os.open(each.path, os.O_RDONLY | os.O_CLOEXEC) for node, each in self._namespaces.items()}
-        try:
-            # The request may come from any namespace; in one of ours, no device name of the machine can clash.
-            self._inside(self.topology.nodes[0], partial(_add, self.topology.links, number, files))
-        finally:
-            for descriptor in files.values():
-                os.close(descriptor)
-
-    def _inside(self, node: str, work: Callable[[IPRoute], object]) -> None:
-        def ask() -> None:
-            """Do the work with a netlink socket in the namespace."""
-            with IPRoute() as ipr:
-                work(ipr)
-
-        try:
-            self[node].inside(ask)
-        except Exception as error:  # pyroute2 raises NetlinkError, which is not an OSError
-            raise LocalError(f"namespace of {node}: {error}") from error
-
-
-def _add(links: Sequence[Link], number: dict[str, int], files: dict[str, int], ipr: IPRoute) -> None:
-    """Make the veth pairs, whose two ends must not share an index.
-
-    With equal indices, Linux may report a lost carrier up to a second late. Source: Linux, net/core/link_watch.c,
-    ``linkwatch_urgent_event``. The kernel chooses the far end's index, and counts from 2.
-    """
-    for index, link in enumerate(links, _INDEX_FROM):
-        a, b = number[link.a], number[link.b]
-        own = {"ifname": link.b, "mtu": link.mtu, "address": _mac(a, b), "net_ns_fd": files[link.a]}
-        peer = {"ifname": link.a, "mtu": link.mtu, "address": _mac(b, a), "net_ns_fd": files[link.b]}
-        ipr.link("add", kind="veth", index=index, peer=peer, **own)
-
-
-def _plug(ifname: str, mtu: int, index: int, far: int, ipr: IPRoute) -> None:
-    peer = {"ifname": f"{ifname}-s", "mtu": mtu, "net_ns_fd": far}
-    ipr.link("add", kind="veth", ifname=ifname, mtu=mtu, index=index, peer=peer)
-
-
-def _delete(ifname: str, ipr: IPRoute) -> None:
-    ipr.link("del", index=ipr.link_lookup(ifname=ifname)[0])
+        for index, link in enumerate(self.topology.links, _INDEX_FROM):
+            a, b = number[link.a], number[link.b]
+            own = {"ifname": link.b, "mtu": link.mtu, "address": _mac(a, b)}
+            peer = {"ifname": link.a, "mtu": link.mtu, "address": _mac(b, a)}
+            self[link.a].join(self[link.b], own, peer, index=index)
 
 
 def _mac(own: int, other: int) -> str:
     return f"{_MAC_PREFIX}:{own:02x}:{other:02x}"
 
 
-def _raise(devices: Sequence[str], ipr: IPRoute) -> None:
-    ipr.link("set", index=_LOOPBACK, state="up")
+def add_address(device: str, address: str) -> None:
+    """Give a device of the thread's namespace an IPv4 address of a network of 24 bits."""
+    with IPRoute() as here:
+        here.addr("add", index=_index(device), address=address, prefixlen=24)
+
+
+def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
+    """Join devices by a new bridge without spanning tree."""
+    with IPRoute() as here:
+        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
     for device in devices:
-        _set_state(device, "up", ipr)
+        set_link(device, master=name)
+    set_link(name, state="up")
 
 
-def _set_state(device: str, state: str, ipr: IPRoute) -> None:
-    ipr.link("set", index=ipr.link_lookup(ifname=device)[0], state=state)
+def add_neighbour(device: str, address: str, mac: bytes) -> None:
+    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
+    with IPRoute() as here:
+        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=_index(device), state="permanent")
+
+
+def set_link(device: str, **change: str | int) -> None:
+    """Change a device: ``state``, ``mtu`` in bytes, ``master``: its bridge, ``net_ns_fd``: of where to move it to."""
+    if isinstance(master := change.get("master"), str):
+        change["master"] = _index(master)
+    with IPRoute() as here:
+        here.link("set", index=_index(device), **change)
+
+
+def remove_link(device: str) -> None:
+    """Remove a device, and with it the other end of a pair."""
+    with IPRoute() as here:
+        here.link("del", index=_index(device))
+
+
+def received(devices: Sequence[str]) -> dict[str, int]:
+    """Return how many frames have come in, by device."""
+    with IPRoute() as here:
+        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
+    return {device: links[device]["rx_packets"] for device in devices}
+
+
+def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
+    """Return the MAC addresses, by device."""
+    with IPRoute() as here:
+        links = {link.get("ifname"): link.get("address") for link in here.get_links()}
+    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
+
+
+def _index(device: str) -> int:
+    """Return the index of a device of the thread's namespace. Raises ``LocalError``: there is none."""
+    try:
+        return socket.if_nametoindex(device)
+    except OSError as error:
+        raise LocalError(f"no device {device}") from error

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gdp.errors import GdpError
 from gdp.host.processes import Process, end_all
@@ -32,6 +32,7 @@ _ANSWER_S: Final = 600.0
 _FINISH_S: Final = 60.0
 _PAUSE_S: Final = 0.02
 
+Event = dict[str, Any]  # a line of JSON by which a process reports
 T = TypeVar("T")
 _ProcessT = TypeVar("_ProcessT", bound="LabProcess")
 
@@ -96,6 +97,7 @@ class LabProcess:
         home = Path() if run is None else run.directory
         self.log = log or home / f"{label.replace(' ', '-')}.log"
         self._unread = b""
+        self.is_silent = not heard  # it prints nothing more
         with self.log.open("ab") as errors:
             self._log_from = errors.tell()
             self._process = subprocess.Popen(
@@ -150,11 +152,17 @@ class LabProcess:
                 self._process.wait(_CLOSE_S)
 
     def reap(self, timeout_s: float | None = None) -> str:
-        """Return, when the process has ended, what it printed and nothing has read; harmless where it was called."""
-        if self._process.stdout is None or self._process.stdout.closed:
-            self._process.wait(timeout_s)
-            return ""
-        printed, _ = self._process.communicate(timeout=timeout_s)
+        """Return, when the process has ended, what it printed and nothing has read; harmless where it was called.
+
+        Raises ``FailedError``: it goes on after this time.
+        """
+        try:
+            if self._process.stdout is None or self._process.stdout.closed:
+                self._process.wait(timeout_s)
+                return ""
+            printed, _ = self._process.communicate(timeout=timeout_s)
+        except subprocess.TimeoutExpired as error:
+            raise self.failed(f"still runs after {timeout_s:g} s") from error
         return (self._unread + printed).decode(errors="replace")
 
     def output(self, patience_s: float = _FINISH_S) -> str:
@@ -169,14 +177,12 @@ class LabProcess:
         self.send(number)
         return self.reap(patience_s)
 
-    def read(self, patience_s: float) -> dict[str, object]:
+    def read(self, patience_s: float) -> Event:
         """Return the next line that it prints, a JSON object.
 
         Raises ``FailedError``: it ended, or printed nothing in time, or a reason why it refuses, or something else.
         """
-        said = json.loads(self.read_line(patience_s))
-        if not isinstance(said, dict):
-            raise FailedError(f"{self.label} said {said!r}")
+        said = self._event(self.read_line(patience_s))
         if "refused_because" in said:
             raise FailedError(str(said["refused_because"]))
         return said
@@ -190,21 +196,43 @@ class LabProcess:
         except BrokenPipeError as error:
             raise self.failed("ended") from error
 
-    def ask(self, **values: object) -> dict[str, object]:
+    def ask(self, **values: object) -> Event:
         """Send a command and return the answer; raises as ``read``."""
         self.tell(**values)
         return self.read(_ANSWER_S)
 
     def has_line(self, patience_s: float) -> bool:
         """Return whether a line is ready, or arrives in time; raises as ``read`` where none can arrive."""
-        assert self._process.stdout is not None
-        descriptor = self._process.stdout.fileno()
-        if b"\n" not in self._unread and readable([descriptor], patience_s):
-            part = os.read(descriptor, 1 << 16)
+        if b"\n" not in self._unread and readable([self], patience_s):
+            part = os.read(self.fileno(), 1 << 16)
             if not part:
                 raise self.failed("ended")
             self._unread += part
         return b"\n" in self._unread
+
+    def fileno(self) -> int:
+        """Return the descriptor of what it prints."""
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def take_events(self) -> list[Event]:
+        """Return what it has reported since the last call; waits for nothing. Raises ``FailedError``: as ``read``."""
+        while not self.is_silent and readable([self], 0.0):
+            part = os.read(self.fileno(), 1 << 16)
+            self._unread += part
+            self.is_silent = not part
+        *lines, self._unread = self._unread.split(b"\n")
+        return [self._event(line) for line in lines]
+
+    def _event(self, line: bytes) -> Event:
+        """Return what a line reports. Raises ``FailedError``: it is no JSON object."""
+        try:
+            said: object = json.loads(line)
+        except ValueError:
+            said = None
+        if not isinstance(said, dict):
+            raise FailedError(f"{self.label} said {line.decode(errors='replace')[:_REASON_CHARS]!r}")
+        return said
 
     def read_line(self, patience_s: float) -> bytes:
         """Return the next line that it prints, of any content; raises as ``read``."""
@@ -288,16 +316,3 @@ def until(
         else:
             meanwhile()
     return value
-
-
-def figures_of(said: Mapping[str, object]) -> dict[str, float]:
-    """Return the figures of a report, by key."""
-    return {key: value for key, value in said.items() if isinstance(value, int | float)}
-
-
-def floats_of(said: Mapping[str, object], key: str) -> list[float]:
-    """Return a list of figures of a report. Raises ``FailedError``: it has none."""
-    values = said.get(key)
-    if not isinstance(values, list):
-        raise FailedError(f"a list {key!r} was expected, not {said}")
-    return [float(value) for value in values]

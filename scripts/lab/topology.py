@@ -5,7 +5,7 @@ Sans-I/O. ``namespaces.py`` makes kernel namespaces of it; ``simulation.py`` mak
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
@@ -120,6 +120,16 @@ class Topology:
     def attached(self, role: Role) -> tuple[Attachment, ...]:
         """Return the attachments of one role, in the topology's order."""
         return tuple(at for at in self.attachments if at.role == role)
+
+    def reached(self, start: str, *, down: Collection[frozenset[str]], dead: Collection[str]) -> frozenset[str]:
+        """Return the switches that a live one reaches, itself included: not over links that are down, or dead ones."""
+        found, ahead = {start}, [start]
+        while ahead:
+            node = ahead.pop()
+            new = {link.other(node) for link in self.links_of(node) if link.ends() not in down} - found - set(dead)
+            found |= new
+            ahead += new
+        return frozenset(found)
 
     def rib_of(self, label: str) -> Attachment | None:
         """Return the RIB of this domain, None if it has none."""

@@ -158,7 +158,7 @@ class Zygote:
                 return cls(pid, ours)
             environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
             theirs.set_inheritable(True)
-            words = [sys.executable, "-m", "lab.zygote", str(theirs.fileno()), _PLACE_OF_NAME]
+            words = [sys.executable, __file__, str(theirs.fileno()), _PLACE_OF_NAME]
             return cls(os.posix_spawn(sys.executable, words, environment), ours)
 
     def fork(self, request: Request, descriptors: Sequence[int]) -> int:
@@ -182,7 +182,9 @@ class Zygote:
         first = Path(program.file).parent if program.file else cwd
         folders = [first, *map(Path, filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))]
         return self._place == _place() and not any(
-            (each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp") for each in folders
+            (each / "sitecustomize.py").exists()
+            or ((each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp"))
+            for each in folders
         )
 
     def close(self) -> None:
@@ -257,6 +259,7 @@ class Popen(subprocess.Popen):  # type: ignore[type-arg]
 def main() -> None:
     """Import the project, then fork programs until the caller closes its end of the socket."""
     path = sys.path[1:]
+    sys.path[:1] = [str(ROOT), str(ROOT / "scripts")]  # of this copy, also where the interpreter has another installed
     link = socket.socket(fileno=int(sys.argv[1]))
     for module in _PRELOADED:
         importlib.import_module(module)

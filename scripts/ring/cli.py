@@ -5,7 +5,6 @@ I/O. Exit codes: 0 passed, 1 failed, 2 wrong input, 130 and 143 for Ctrl-C and S
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import shlex
@@ -20,14 +19,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from gdp.errors import LocalError
-from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
+from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from lab.command import FAILED, PASSED, console_of, exit_with, new_app
+from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
+from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.cores import CORES_HELP
 from ring.faults import Cut, Kill, Roam
 from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
@@ -39,16 +38,19 @@ from ring.run import DEMO_S, Ring, make_demo
 from ring.table import summary, table
 
 
-def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
-    """Return pairs of (effect, command line) in the recommended order; ``again``: the file of its new receiver."""
-    replay = Path(sys.executable).with_name("gdp-replay")
+def hints(ring: Ring | LiveRing) -> list[tuple[str, str]]:
+    """Start again what has ended, and return pairs of (effect, command line) in the recommended order."""
+    if isinstance(ring, LiveRing):
+        ring.go_on()
+        return [*live_hints(ring), *common(ring.overlay)]
+    replay, again = Path(sys.executable).with_name("gdp-replay"), ring.start_again()
     config = ring.overlay.credentials.file("proxy", ring.overlay.robot.switch)
     sender = f"{replay} {shlex.quote(str(ring.bag))} --config {config}"
     return [(f"send the recording again, into {again}", inside(ring.overlay, "nuc1", sender)), *common(ring.overlay)]
 
 
 def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
-    """Return such pairs for a live ring."""
+    """Return the pairs that apply to a live ring alone."""
     found = []
     for at, graph in zip(("nuc1", "nuc5"), ring.graphs, strict=True):
         if graph.ros == 1:
@@ -59,8 +61,7 @@ def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
             listener = f"env {variables} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
             found.append((f"one more listener at {at}, for five seconds", inside(ring.overlay, at, listener)))
     proxy = inside(ring.overlay, "nuc5", _metrics("proxy"))
-    logs = f"tail -n 3 {ring.directory}/*.log"
-    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", logs), *common(ring.overlay)]
+    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", f"tail -n 3 {ring.directory}/*.log")]
 
 
 def common(overlay: Overlay) -> list[tuple[str, str]]:
@@ -77,8 +78,9 @@ def common(overlay: Overlay) -> list[tuple[str, str]]:
 def inside(overlay: Overlay, node: str, command: str) -> str:
     """Return the shell command that runs a command in the namespace of a switch, from outside."""
     if in_first_user_namespace():
-        return f"ip netns exec {overlay.namespaces[node].path.name} {command}"
-    return f"nsenter --target {overlay.switches[node].pid} --user --mount --net --preserve-credentials {command}"
+        return f"ip netns exec {overlay.lab.namespaces[node].path.name} {command}"
+    pid = overlay.nodes.running["switch", node].pid
+    return f"nsenter --target {pid} --user --mount --net --preserve-credentials {command}"
 
 
 def _metrics(role: str) -> str:
@@ -207,15 +209,16 @@ def spelled_out(words: Sequence[str]) -> Iterator[str]:
 
 def _run(options: Options, run: Run, errors: Console) -> int:
     """Execute one run, and remove what it created unless it is to be kept."""
-    kept = False
+    end_on_signals()
+    is_kept = False
     try:
-        code = asyncio.run(interruptible(_go(options, run, errors)))
-        kept = options.keep and code in (PASSED, FAILED)
-    except Interrupted as interrupted:
+        code = _go(options, run, errors)
+        is_kept = options.keep
+    except SystemExit:
         errors.print("interrupted; taking everything down")
-        code = interrupted.exit_code
+        raise
     finally:
-        if kept:
+        if is_kept:
             run.retain()
         else:
             let_nothing_interrupt()
@@ -223,44 +226,28 @@ def _run(options: Options, run: Run, errors: Console) -> int:
     return code
 
 
-async def _go(options: Options, run: Run, errors: Console) -> int:
+def _go(options: Options, run: Run, errors: Console) -> int:
+    with ProgressReporter(errors) as reporter:
+        ring = _ring(options, run, reporter)
+        result = ring.result()
+    _show(result, is_wide=options.wide)
+    _write(options, result, ring.recording if isinstance(ring, Ring) else None)
+    if options.keep:
+        _hint(run, hints(ring), errors)
+    return PASSED if result.passed else FAILED
+
+
+def _ring(options: Options, run: Run, reporter: ProgressReporter) -> Ring | LiveRing:
     if options.live is not None:
-        return await _go_live(options, options.live, run, errors)
-    with ProgressReporter(errors) as reporter:
-        bag = options.bag
-        if bag is None:
-            duration_s = options.seconds or DEMO_S
-            reporter.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
-            bag = await make_demo(run, duration_s)
-        if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
-        standing = Ring(options, run, reporter, bag)
-        try:
-            result = await standing.result()
-        finally:
-            standing.overlay.children.forget()
-    _show(result, is_wide=options.wide)
-    _write(options, result, standing.recording)
-    if options.keep:
-        _hint(run, hints(standing, standing.start_again()), errors)
-        standing.overlay.children.forget()
-    return PASSED if result.passed else FAILED
-
-
-async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> int:
-    with ProgressReporter(errors) as reporter:
-        standing = LiveRing(options, live, run, reporter)
-        try:
-            result = await standing.result()
-        finally:
-            standing.overlay.children.forget()
-    _show(result, is_wide=options.wide)
-    _write(options, result)
-    if options.keep:
-        standing.go_on()
-        _hint(run, live_hints(standing), errors)
-        standing.overlay.children.forget()
-    return PASSED if result.passed else FAILED
+        return LiveRing(options, options.live, run, reporter)
+    bag = options.bag
+    if bag is None:
+        duration_s = options.seconds or DEMO_S
+        reporter.step(f"making a recording: {duration_s:g} seconds of a robot's drive")
+        bag = make_demo(run, duration_s)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+    return Ring(options, run, reporter, bag)
 
 
 def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:

@@ -7,7 +7,7 @@ Sans-I/O. All seconds count from the time at which the first message may be sent
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, cast, get_args
 
@@ -175,7 +175,7 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
     down: set[frozenset[str]] = set()
     dead: set[str] = set()
     newest: Fault | None = None
-    for fault, begins in _moments(faults):
+    for _, fault, begins in moments(faults):
         if isinstance(fault, Roam):
             if places[fault.who] == fault.to:
                 raise LocalError(f"{fault}: {fault.who} is at {fault.to} already")
@@ -194,32 +194,20 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
                 f" (switch:{at}@10-20)"
             )
     (one, here), (other, there) = places.items()
-    if there not in _reached(topology, here, down, dead):
+    if there not in topology.reached(here, down=down, dead=dead):
         raise LocalError(
             f"after {newest} no way is left from {one} at {here} to {other} at {there}: let something come back"
             " (nuc2-nuc3@5-20)"
         )
 
 
-def _moments(faults: Iterable[Fault]) -> Iterator[tuple[Fault, bool]]:
-    """Yield the fault events in order of time, as (fault, whether it begins)."""
-    moments = [(fault.after_s, fault, True) for fault in faults]
-    moments += [
+def moments(faults: Iterable[Fault]) -> list[tuple[float, Fault, bool]]:
+    """Return the fault events in order of time, as (seconds, fault, whether it begins)."""
+    found = [(fault.after_s, fault, True) for fault in faults]
+    found += [
         (fault.until_s, fault, False) for fault in faults if not isinstance(fault, Roam) and fault.until_s is not None
     ]
-    return ((fault, begins) for _, fault, begins in sorted(moments, key=lambda each: each[0]))
-
-
-def _reached(topology: Topology, start: str, down: set[frozenset[str]], dead: set[str]) -> set[str]:
-    reached, edge = {start}, [start]
-    while edge:
-        node = edge.pop()
-        for link in topology.links_of(node):
-            other = link.other(node)
-            if link.ends() not in down and other not in dead | reached:
-                reached.add(other)
-                edge.append(other)
-    return reached
+    return sorted(found, key=lambda each: each[0])
 
 
 def _when(text: str, after: str, until: str | None) -> tuple[float, float | None]:

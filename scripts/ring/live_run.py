@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import importlib.util
 import signal
 import time
-from collections.abc import Awaitable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from lab.children import Child, Children, cancel, gathered
 from lab.credentials import Side
-from lab.events import Event
+from lab.process import Event, LabProcess
+from lab.supervisor import Supervisor, failed
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
@@ -36,10 +34,10 @@ QUIET_S: Final = 5.0
 class LiveNodes:
     """The nodes of a live run, all ready. ``talkers``: number of messages that each will publish."""
 
-    talkers: Mapping[Child, int]
-    lamp: Child
-    listener: Child
-    caller: Child
+    talkers: Mapping[LabProcess, int]
+    lamp: LabProcess
+    listener: LabProcess
+    caller: LabProcess
     calls: int
 
     @property
@@ -49,78 +47,85 @@ class LiveNodes:
 
 
 class LiveSession:
-    """One run's traffic. ``children`` owns the nodes."""
+    """One run's traffic. ``supervisor`` watches the nodes."""
 
-    def __init__(self, children: Children, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
-        self._children = children
+    def __init__(self, supervisor: Supervisor, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
+        self._supervisor = supervisor
         self._live_nodes = live_nodes
         self._reporter = reporter
-        self._sent: dict[Child, int] = {}
+        self._sent: dict[LabProcess, int] = {}
         self._received: dict[str, int] = {}
         self._asked = 0
         self._answered = 0
         self.silence = Silence()
         self._latency_ms: float | None = None
-        self._moved = asyncio.Event()
+        self._has_moved = False
+        self._done: dict[LabProcess, Event] = {}
 
-    async def meet(self) -> None:
+    def meet(self) -> None:
         """Wait until the remote side receives every topic and discovers the service."""
-        far = (self._live_nodes.listener, self._live_nodes.caller)
-        await self._children.guarded(gathered(child.wait_for("hears", MEET_S) for child in far))
+        for node in (self._live_nodes.listener, self._live_nodes.caller):
+            self._supervisor.wait_for(node, "hears", MEET_S)
 
-    async def talk(self, seconds: float) -> Heard:
+    def talk(self, seconds: float) -> Heard:
         """Run the traffic for this long, wait for messages under way, and return each node's report."""
-        live_nodes = self._live_nodes
-        self._reporter.begin_traffic(live_nodes.messages + live_nodes.calls)
-        ear = asyncio.ensure_future(self._follow(live_nodes.listener))
-        lamp = asyncio.ensure_future(self._follow(live_nodes.lamp))
+        nodes = self._live_nodes
+        talkers, near, far = tuple(nodes.talkers), (*nodes.talkers, nodes.caller), (nodes.lamp, nodes.listener)
+        self._reporter.begin_traffic(nodes.messages + nodes.calls)
         try:
-            for child in (*live_nodes.talkers, live_nodes.caller):
-                child.send(signal.SIGUSR1)
-            patience_s = seconds + ENDING_S
-            speaking = [
-                _in_time(child, self._follow(child), patience_s) for child in (*live_nodes.talkers, live_nodes.caller)
-            ]
-            *talkers, caller = await self._children.guarded(gathered(speaking))
-            self._answered = caller.count("answered")
-            await self._children.guarded(self._until_quiet())
-            live_nodes.listener.send(signal.SIGINT)
-            live_nodes.lamp.send(signal.SIGINT)
-            nodes = ((live_nodes.listener, ear), (live_nodes.lamp, lamp))
-            ending = gathered(_in_time(node, report, ENDING_S) for node, report in nodes)
-            listener_said, lamp_said = await self._children.guarded(ending)
+            for node in near:
+                node.send(signal.SIGUSR1)
+            self._await_reports(near, seconds + ENDING_S)
+            self._answered = self._done[nodes.caller]["answered"]
+            self._await_quiet()
+            for node in far:
+                node.send(signal.SIGINT)
+            self._await_reports(far, ENDING_S)
         finally:
-            await cancel(ear, lamp)
             self._reporter.end_traffic()
-        return Heard(tuple(talkers), lamp_said, listener_said, caller)
+        said = self._done
+        return Heard(tuple(said[each] for each in talkers), said[nodes.lamp], said[nodes.listener], said[nodes.caller])
 
-    async def _follow(self, child: Child) -> Event:
-        """Follow a node until its report."""
-        async with contextlib.aclosing(child.events()) as events:
-            async for event in events:
-                if event.name == "done":
-                    return event
-                if event.name == "progress":
-                    self._note(child, event)
-        raise child.failed(f"ended with code {await child.ended} before its report")
+    def _await_reports(self, nodes: Collection[LabProcess], patience_s: float) -> None:
+        """Follow all nodes until these have reported."""
+        if not self._follow(lambda: self._done.keys() >= set(nodes), patience_s):
+            missing = next(each for each in nodes if each not in self._done)
+            raise failed(missing, f"did not report within {patience_s:g} s")
 
-    def _note(self, child: Child, event: Event) -> None:
+    def _await_quiet(self) -> None:
+        """Wait until everything arrived, or nothing arrived for a while."""
+        while sum(self._received.values()) < self._live_nodes.messages:
+            self._has_moved = False
+            if not self._follow(lambda: self._has_moved, QUIET_S):
+                return
+
+    def _follow(self, is_over: Callable[[], bool], patience_s: float) -> bool:
+        nodes = self._live_nodes
+        every = (*nodes.talkers, nodes.lamp, nodes.listener, nodes.caller)
+        return self._supervisor.follow(every, is_over, self._take, patience_s)
+
+    def _take(self, node: LabProcess, event: Event) -> None:
+        if event["event"] == "done":
+            self._done[node] = event
+        elif event["event"] == "progress":
+            self._note(node, event)
+
+    def _note(self, child: LabProcess, event: Event) -> None:
         now_s, silence = time.monotonic(), self.silence
         if child is self._live_nodes.listener:
-            received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
-            if received != self._received:
-                self._moved.set()
+            received = {each["topic"]: each["received"] for each in event["topics"]}
+            self._has_moved |= received != self._received
             for topic, count in received.items():
                 silence.received(topic, count, now_s)
             self._received = received
-            self._latency_ms = event.number_or_none("latency_ms")
+            self._latency_ms = event.get("latency_ms")
         elif child is self._live_nodes.caller:
-            self._asked, self._answered = event.count("asked"), event.count("answered")
+            self._asked, self._answered = event["asked"], event["answered"]
             silence.sent(LAMP, self._asked, now_s)
             silence.received(LAMP, self._answered, now_s)
         else:
-            self._sent[child] = event.count("sent")
-            silence.sent(event.text("topic"), event.count("sent"), now_s)
+            self._sent[child] = event["sent"]
+            silence.sent(event["topic"], event["sent"], now_s)
         self._reporter.traffic(
             Traffic(
                 total=self._live_nodes.messages + self._live_nodes.calls,
@@ -131,22 +136,6 @@ class LiveSession:
                 latency_ms=self._latency_ms,
             )
         )
-
-    async def _until_quiet(self) -> None:
-        """Wait until everything arrived, or nothing arrived for a while."""
-        while sum(self._received.values()) < self._live_nodes.messages:
-            self._moved.clear()
-            try:
-                await asyncio.wait_for(self._moved.wait(), QUIET_S)
-            except asyncio.TimeoutError:
-                return
-
-
-async def _in_time(child: Child, report: Awaitable[Event], patience_s: float) -> Event:
-    try:
-        return await asyncio.wait_for(report, patience_s)
-    except asyncio.TimeoutError:
-        raise child.failed(f"did not report within {patience_s:g} s") from None
 
 
 _ROS2: Final = ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs")
@@ -169,28 +158,27 @@ class LiveRing:
         self._profiles.write_text(FAST_DDS_PROFILES, encoding="utf-8")
         self.overlay = Overlay(options, run, reporter)
         self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
-        self._proxies: list[Child] = []
-        self._nodes: list[Child] = []
+        self._proxies: list[LabProcess] = []
+        self._nodes: list[LabProcess] = []
 
-    async def result(self) -> Result:
+    def result(self) -> Result:
         """Run the traffic between robot and server, and compare."""
-        overlay, children = self.overlay, self.overlay.children
-        await overlay.stand_up()
-        await children.ready([self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1])
+        overlay, supervisor = self.overlay, self.overlay.supervisor
+        overlay.stand_up()
+        supervisor.ready(*(self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1))
         self._proxies = [self._start_proxy(*end) for end in self._ends]
-        await children.ready(self._proxies)
-        live_nodes = await self._live_nodes()
-        session = LiveSession(children, live_nodes, self._reporter)
-        await session.meet()
+        supervisor.ready(*self._proxies)
+        session = LiveSession(supervisor, self._live_nodes(), self._reporter)
+        session.meet()
         self._reporter.step(f"they hear each other; {self._options.live_s:g} s of traffic")
-        injection, begun_s = Injection(overlay, self._options.faults, self._reporter), time.monotonic()
+        injection, begun_s = Injection(supervisor, self._options.faults, overlay.inject), time.monotonic()
         try:
-            heard = await session.talk(self._options.live_s)
+            heard = session.talk(self._options.live_s)
         finally:
-            await injection.stop()
+            complaints = injection.stop()
         traffic_s = time.monotonic() - begun_s
         self._reporter.step("comparing what was published with what was heard")
-        result = await self._compare(heard, injection.complaints())
+        result = self._compare(heard, complaints)
         return replace(result, traffic_s=traffic_s, silent_s=session.silence.longest_s)
 
     def go_on(self) -> None:
@@ -209,14 +197,14 @@ class LiveRing:
         """Return the environment of the processes in a graph."""
         return graph.environment(self._run.directory / "ros-logs", self._profiles)
 
-    async def _live_nodes(self) -> LiveNodes:
+    def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
         seconds, talking = self._options.live_s, paces(self._options.camera_hz)
         calls = calls_in(seconds)
         self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
         self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
-        talkers = dict[Child, int]()
+        talkers = dict[LabProcess, int]()
         for name, hz in talking.items():
             count = messages_in(seconds, hz)
             talkers[self._start_node(robot, at_robot, name, count, hz)] = count
@@ -224,39 +212,38 @@ class LiveRing:
         listener = self._start_node(server, at_server, "listener", 0)
         caller = self._start_node(server, at_server, "caller", calls)
         self._nodes = [*talkers, lamp, listener, caller]
-        await self.overlay.children.ready(self._nodes)
+        self.overlay.supervisor.ready(*self._nodes)
         return LiveNodes(talkers, lamp, listener, caller, calls)
 
-    async def _compare(self, heard: Heard, complaints: list[str]) -> Result:
-        said = [await self._finish(proxy) for proxy in self._proxies]
-        result = Result(rows(heard, said[1].parts("topics")), self.overlay.settings, complaints=tuple(complaints))
+    def _compare(self, heard: Heard, complaints: list[str]) -> Result:
+        said = [self._finish(proxy) for proxy in self._proxies]
+        result = Result(rows(heard, said[1]["topics"]), self.overlay.settings, complaints=tuple(complaints))
         if result.passed:
             return result
         ends = zip(self._proxies, said, strict=True)
         counted = [f"{proxy.label} counts {words}" for proxy, each in ends if (words := _faults(each))]
         return replace(result, complaints=(*complaints, *counted))
 
-    async def _finish(self, proxy: Child) -> Event:
+    def _finish(self, proxy: LabProcess) -> Event:
         """Request a proxy to end; return its final report."""
-        children = self.overlay.children
-        children.may_end(proxy)
+        self.overlay.supervisor.release(proxy)
         proxy.send(signal.SIGINT)
-        return await children.guarded(proxy.wait_for("done", ENDING_S))
+        return self.overlay.supervisor.wait_for(proxy, "done", ENDING_S)
 
-    def _start_master(self, at: Attachment, graph: Graph) -> Child:
+    def _start_master(self, at: Attachment, graph: Graph) -> LabProcess:
         return self._start(at, graph, "master", ["-m", "ring.nodes.master", str(MASTER_PORT)])
 
-    def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> Child:
+    def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> LabProcess:
         carried = {side: carried_in(self._options.encoding)}
         config = self.overlay.credentials.proxy(at, carried, ros=graph.to_yaml())
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self._start(at, graph, "proxy", argv, heard=heard)
 
-    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int, hz: float | None = None) -> Child:
+    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int, hz: float | None = None) -> LabProcess:
         pace = [] if hz is None else [str(hz)]
         return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count), *pace])
 
-    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> Child:
+    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> LabProcess:
         return self.overlay.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
 
 
@@ -274,4 +261,4 @@ def _require(versions: set[int]) -> None:
 
 def _faults(done: Event) -> str:
     """Return the faults that a proxy counted; empty: none."""
-    return ", ".join(f"{count} {label}" for label, count in done.part("faults").fields.items() if count)
+    return ", ".join(f"{count} {label}" for label, count in done.get("faults", {}).items() if count)

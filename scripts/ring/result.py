@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 
 from gdp.errors import LocalError
-from lab.events import Event
+from lab.process import Event
 from proxy.recordings.compare import TopicComparison, compare_digests
 from ring.nodes.content import LAMP, LAMP_TYPE
 
@@ -33,17 +33,11 @@ class Journey:
 
     @classmethod
     def from_event(cls, topic: Event) -> Journey:
-        """Read one entry of a receiver's report."""
-        latency = topic.part("latency_ms")
+        """Read one entry of a receiver's report, or what a caller reports."""
         return cls(
-            median_ms=latency.number_or_none("median"),
-            p99_ms=latency.number_or_none("p99"),
-            max_ms=latency.number_or_none("max"),
-            duplicated=topic.count("duplicated"),
-            parts=topic.count("parts"),
-            hops=topic.count("hops"),
-            hops_seen=tuple(topic.counts("hops_seen")),
-            silent_ms=topic.number_or_none("silent_ms"),
+            **{f"{key}_ms": value for key, value in (topic.get("latency_ms") or {}).items()},
+            **{key: topic[key] for key in ("duplicated", "parts", "hops", "silent_ms") if key in topic},
+            hops_seen=tuple(topic.get("hops_seen", ())),
         )
 
 
@@ -142,7 +136,7 @@ class Result:
 
 def put_together(comparisons: Iterable[TopicComparison], reports: Sequence[Event]) -> tuple[TopicResult, ...]:
     """Return one row per compared topic, with the receiver's measurements where there are any."""
-    journeys = {(report.text("topic"), report.text("type")): Journey.from_event(report) for report in reports}
+    journeys = {(report["topic"], report["type"]): Journey.from_event(report) for report in reports}
     return tuple(
         TopicResult(comparison, journeys.get((comparison.topic, comparison.type_name), Journey()))
         for comparison in comparisons
@@ -164,47 +158,43 @@ def rows(heard: Heard, carried: Sequence[Event]) -> tuple[TopicResult, ...]:
 
     ``carried``: measurements of the server's proxy, one event a topic; latencies are the listener's.
     """
-    reports = [_with_latency(each, _of(each.text("topic"), heard.listener.parts("topics"))) for each in carried]
-    return (*put_together(_compared(heard), sorted(reports, key=lambda each: each.count("received"))), _lamp(heard))
+    reports = [_with_latency(each, _of(each["topic"], heard.listener["topics"])) for each in carried]
+    return (*put_together(_compared(heard), sorted(reports, key=lambda each: each["received"])), _lamp(heard))
 
 
 def _compared(heard: Heard) -> Iterator[TopicComparison]:
     for said in heard.talkers:
-        topic = said.text("topic")
-        arrived = _of(topic, heard.listener.parts("topics")).texts("heard")
-        sent = map(bytes.fromhex, said.texts("sent"))
-        yield compare_digests(topic, said.text("type"), said.count("bytes"), sent, map(bytes.fromhex, arrived))
+        topic = said["topic"]
+        arrived = _of(topic, heard.listener["topics"])["heard"]
+        sent = map(bytes.fromhex, said["sent"])
+        yield compare_digests(topic, said["type"], said["bytes"], sent, map(bytes.fromhex, arrived))
 
 
 def _lamp(heard: Heard) -> TopicResult:
     """Return the row of the calls: each must be answered, with the reply of a lamp that is switched once a call."""
-    calls, answered = heard.caller.count("calls"), heard.caller.count("answered")
-    wrong = answered - heard.caller.count("right")
+    calls, answered = heard.caller["calls"], heard.caller["answered"]
+    wrong = answered - heard.caller["right"]
     comparison = TopicComparison(
         topic=LAMP,
         type_name=LAMP_TYPE,
         messages=calls,
-        bytes=heard.caller.count("bytes"),
+        bytes=heard.caller["bytes"],
         delivered=answered,
         lost=calls - answered,
-        duplicated=max(heard.lamp.count("served") - calls, 0),
+        duplicated=max(heard.lamp["served"] - calls, 0),
         altered=wrong,
         identical=answered == calls and not wrong,
         in_order=True,
     )
-    latency = heard.caller.part("latency_ms")
-    median_ms, p99_ms, max_ms = (latency.number_or_none(key) for key in ("median", "p99", "max"))
-    way = Journey(median_ms=median_ms, p99_ms=p99_ms, max_ms=max_ms, silent_ms=heard.caller.number_or_none("silent_ms"))
-    return TopicResult(comparison, way, is_service=True)
+    return TopicResult(comparison, Journey.from_event(heard.caller), is_service=True)
 
 
 def _of(topic: str, events: Sequence[Event]) -> Event:
     for event in events:
-        if event.text("topic") == topic:
+        if event["topic"] == topic:
             return event
     raise LocalError(f"no report on {topic}")
 
 
 def _with_latency(carried: Event, listener: Event) -> Event:
-    measured = {key: listener.fields.get(key) for key in ("latency_ms", "silent_ms")}
-    return Event({**carried.fields, **measured})
+    return {**carried, **{key: listener.get(key) for key in ("latency_ms", "silent_ms")}}

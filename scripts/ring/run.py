@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
-from lab.children import READY_S, Child, Children, cancel
 from lab.credentials import Carried
-from lab.events import Event
-from lab.process import FailedError
+from lab.process import Event, FailedError, LabProcess
+from lab.supervisor import READY_S, Supervisor, exit_code, failed
 from proxy.config.config import Encoding
 from proxy.recordings.compare import compare
 from proxy.recordings.reader import BagReader
@@ -31,8 +29,6 @@ from ring.silence import Silence
 ENDING_S: Final = 30.0  # to close a recording, or to get the last acknowledgements
 STALL_S: Final = 30.0
 _ALL: Final = "recording"  # its topics are counted together
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,105 +53,94 @@ class Report:
 class Replay:
     """One replay in progress.
 
-    ``children``: supervised throughout; the receiver is released when it is requested to finish.
+    ``supervisor``: watches all the while; the receiver is released when it is requested to finish.
     """
 
     def __init__(
-        self, children: Children, sender: Child, receiver: Child, total: int, reporter: ProgressReporter
+        self, supervisor: Supervisor, sender: LabProcess, receiver: LabProcess, total: int, reporter: ProgressReporter
     ) -> None:
-        self._children = children
+        self._supervisor = supervisor
         self._sender = sender
         self._receiver = receiver
         self._reporter = reporter
         self._traffic = Traffic(total=total)
         self._silence = Silence()
         self._unconfirmed = ""  # names of topics
-        self._moved = asyncio.Event()
+        self._has_moved = False
+        self._done: dict[LabProcess, Event] = {}
 
-    async def report(self, inject: Callable[[], Injection]) -> Report:
-        """Follow the traffic to its end, while ``inject`` causes faults."""
+    def report(self, injection: Injection) -> Report:
+        """Follow the traffic to its end, while faults are injected."""
         self._reporter.begin_traffic(self._traffic.total)
-        heard = asyncio.ensure_future(self._listen(self._receiver))
-        injection, begun_s = inject(), time.monotonic()
+        begun_s = time.monotonic()
         try:
-            sent = await self._children.guarded(self._unstalled(self._listen(self._sender)))
+            while not self._supervisor.is_over(self._sender):
+                self._has_moved = False
+                self._follow_unless_stalled()
             traffic_s = time.monotonic() - begun_s
-            sender_code = await self._sender.wait(ENDING_S)
-            if sent is None:
-                raise self._sender.failed(f"ended with code {sender_code} in the middle")
-            received, receiver_code = await self._finish(heard)
+            sender_code = exit_code(self._sender, ENDING_S)
+            if self._sender not in self._done:
+                raise failed(self._sender, f"ended with code {sender_code} in the middle")
+            receiver_code = self._finish()
         finally:
-            await cancel(heard)
-            await injection.stop()
+            complaints = injection.stop()
             self._reporter.end_traffic()
-        complaints = injection.complaints()
-        complaints += [_not_confirmed(topic) for topic in sent.parts("unconfirmed")]
+        sent, received = self._done[self._sender], self._done[self._receiver]
+        complaints += [_not_confirmed(topic) for topic in sent["unconfirmed"]]
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
-        unread = sent.text_or_none("unread") or None
-        topics = tuple(received.parts("topics"))
+        unread = sent.get("unread") or None
+        topics = tuple(received["topics"])
         return Report(topics, unread, tuple(complaints), traffic_s, self._silence.longest_s)
 
-    async def _finish(self, heard: asyncio.Future[Event | None]) -> tuple[Event, int]:
-        """Request the receiver to close its recording; return its last event and its exit code."""
-        self._children.may_end(self._receiver)
-        self._receiver.send(signal.SIGINT)
-        try:
-            received = await self._children.guarded(asyncio.wait_for(heard, ENDING_S))
-        except asyncio.TimeoutError:
-            raise self._receiver.failed(f"did not finish within {ENDING_S:g} s") from None
-        code = await self._receiver.wait(ENDING_S)
-        if received is None:
-            raise self._receiver.failed(f"ended with code {code} without a report")
-        return received, code
+    def _follow_unless_stalled(self) -> None:
+        """Follow both ends until traffic moves, or the sender ends. Raises ``FailedError``: neither, for a while."""
+        both = (self._sender, self._receiver)
+        if not self._supervisor.follow(both, self._moves_or_ends, self._take, STALL_S):
+            raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
 
-    async def _listen(self, child: Child) -> Event | None:
-        """Follow a child until it closes its output; return its last event, None if there was none."""
-        done = None
-        async for event in child.events():
-            if event.name == "progress":
-                self._follow(event)
-            elif event.name == "done":
-                done = event
-        return done
+    def _moves_or_ends(self) -> bool:
+        return self._has_moved or self._supervisor.is_over(self._sender)
+
+    def _finish(self) -> int:
+        """Request the receiver to close its recording; return its exit code."""
+        receiver = self._receiver
+        self._supervisor.release(receiver)
+        receiver.send(signal.SIGINT)
+        if not self._supervisor.follow([receiver], lambda: self._supervisor.is_over(receiver), self._take, ENDING_S):
+            raise failed(receiver, f"did not finish within {ENDING_S:g} s")
+        code = exit_code(receiver, ENDING_S)
+        if receiver not in self._done:
+            raise failed(receiver, f"ended with code {code} without a report")
+        return code
+
+    def _take(self, process: LabProcess, event: Event) -> None:
+        if event["event"] == "done":
+            self._done[process] = event
+        elif event["event"] == "progress":
+            self._follow(event)
 
     def _follow(self, event: Event) -> None:
         before, now_s = self._traffic, time.monotonic()
-        if "sent" in event.fields:
-            self._silence.sent(_ALL, event.count("sent"), now_s)
-            self._unconfirmed = ", ".join(event.part("unconfirmed").fields)
-            self._traffic = replace(before, sent=event.count("sent"))
+        if "sent" in event:
+            self._silence.sent(_ALL, event["sent"], now_s)
+            self._unconfirmed = ", ".join(event.get("unconfirmed", {}))
+            self._traffic = replace(before, sent=event["sent"])
             waiting = before.sent < before.total  # for the next stamp of the recording, which may have long pauses
         else:
-            received, lost = event.count("received"), event.count("lost")
-            latency_ms = event.number_or_none("latency_ms")
+            received, lost = event["received"], event["lost"]
+            latency_ms = event.get("latency_ms")
             self._silence.received(_ALL, received + lost, now_s)
             self._traffic = replace(before, received=received, lost=lost, latency_ms=latency_ms)
             waiting = False
-        if waiting or self._traffic != before:
-            self._moved.set()
+        self._has_moved |= waiting or self._traffic != before
         silent = tuple((self._unconfirmed or flow, seconds) for flow, seconds in self._silence.silent(now_s))
         self._reporter.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
 
-    async def _unstalled(self, work: Coroutine[None, None, T]) -> T:
-        """Run ``work`` as long as traffic moves."""
-        task = asyncio.ensure_future(work)
-        try:
-            while not task.done():
-                self._moved.clear()
-                moved = asyncio.ensure_future(self._moved.wait())
-                done, _ = await asyncio.wait([task, moved], timeout=STALL_S, return_when=asyncio.FIRST_COMPLETED)
-                await cancel(moved)
-                if not done:
-                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
-            return task.result()
-        finally:
-            await cancel(task)
-
 
 def _not_confirmed(topic: Event) -> str:
-    messages, confirmed = topic.count("messages"), topic.count("confirmed")
-    return f"{topic.text('topic')}: {messages - confirmed} of {messages} were never confirmed"
+    messages, confirmed = topic["messages"], topic["confirmed"]
+    return f"{topic['topic']}: {messages - confirmed} of {messages} were never confirmed"
 
 
 DEMO_S: Final = 10.0
@@ -185,7 +170,6 @@ class Ring:
         if self.recording.exists():
             raise ConfigError(str(self.recording), "", "exists already; choose another --out")
         self.overlay = Overlay(options, run, reporter)
-        self._children = self.overlay.children
 
     @property
     def recording(self) -> Path:
@@ -193,23 +177,22 @@ class Ring:
         name = "recording.bag" if self._ros == 1 else "recording.mcap"
         return (self.options.out or self._run.directory) / name
 
-    async def result(self) -> Result:
+    def result(self) -> Result:
         """Send the recording through the ring, and compare."""
-        await self.overlay.stand_up()
+        overlay, supervisor = self.overlay, self.overlay.supervisor
+        overlay.stand_up()
         receiver = self._start_receiver(self.recording)
-        await self._children.ready([receiver])
-        self._reporter.step(f"replaying {self._total} messages at {self.overlay.robot.switch}")
+        supervisor.ready(receiver)
+        self._reporter.step(f"replaying {self._total} messages at {overlay.robot.switch}")
         sender = self._start_sender()
-        await self._children.guarded(sender.wait_for("ready", READY_S))
-        replay = Replay(self._children, sender, receiver, self._total, self._reporter)
-        report = await replay.report(lambda: Injection(self.overlay, self.options.faults, self._reporter))
+        supervisor.wait_for(sender, "ready", READY_S)
+        replay = Replay(supervisor, sender, receiver, self._total, self._reporter)
+        report = replay.report(Injection(supervisor, self.options.faults, overlay.inject))
         self._reporter.step("comparing what was sent with what was recorded")
-        exact = self.options.encoding == "cdr"
-        comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
-        topics = put_together(comparisons, report.topics)
+        comparisons = compare(self.bag, self.recording, exact=self.options.encoding == "cdr")
         return Result(
-            topics,
-            self.overlay.settings,
+            put_together(comparisons, report.topics),
+            overlay.settings,
             unread=report.unread,
             complaints=report.complaints,
             traffic_s=report.traffic_s,
@@ -222,13 +205,13 @@ class Ring:
         self._start_receiver(path, heard=False)
         return path
 
-    def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
+    def _start_receiver(self, record: Path, *, heard: bool = True) -> LabProcess:
         at, recorded = self.overlay.server, {"path": str(record), "format": "ros1" if self._ros == 1 else "mcap"}
         config = self.overlay.credentials.proxy(at, {"import": self._topics}, record=recorded)
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self.overlay.start(at.switch, "proxy", argv, heard=heard)
 
-    def _start_sender(self) -> Child:
+    def _start_sender(self) -> LabProcess:
         at = self.overlay.robot
         config = self.overlay.credentials.proxy(at, {"expose": self._topics})
         argv = ["-m", "proxy.cli.replay", str(self.bag), "--config", str(config), "--json"]
@@ -250,16 +233,11 @@ def _recorded_s(reader: BagReader) -> float:
     return max((max(stamps_ns) - min(stamps_ns)) / 1e9, 1e-3) if stamps_ns else 1.0
 
 
-async def make_demo(run: Run, seconds: float) -> Path:
+def make_demo(run: Run, seconds: float) -> Path:
     """Generate a demonstration recording of this length in the run's directory; return the file."""
     path = run.directory / "demo.mcap"
-    children = Children(run, kept=False)
-    try:
-        maker = children.start(
-            "recording", [sys.executable, str(_DEMO_SCRIPT), "--seconds", str(seconds), "-o", str(path)], heard=False
-        )
-        if code := await maker.wait(_MAKING_S):
-            raise maker.failed(f"ended with code {code}")
-    finally:
-        children.forget()
+    argv = [sys.executable, str(_DEMO_SCRIPT), "--seconds", str(seconds), "-o", str(path)]
+    maker = LabProcess(run, "recording", argv, heard=False)
+    if code := exit_code(maker, _MAKING_S):
+        raise failed(maker, f"ended with code {code}")
     return path

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
-from background_load import BackgroundLoad
+from background_load import load_of
 from messages import CPU, MEDIAN, case_of, targets_of
 from peers.certificates import make_certificates
 from peers.chain import NODES, address, routes
@@ -213,11 +213,10 @@ def test_a_ratio_with_the_cores_half_taken_has_a_target_of_its_own() -> None:
 
 
 def test_the_background_load_ends_with_its_block() -> None:
-    with BackgroundLoad() as load:
-        processes = list(load._processes)
+    with load_of(loaded=True) as processes:
         assert len(processes) == len(os.sched_getaffinity(0))
-        assert all(each.poll() is None for each in processes)
-    assert all(each.returncode is not None for each in processes)
+        assert all(each.code is None for each in processes)
+    assert all(each.code is not None for each in processes)
 
 
 def test_the_ends_stand_at_the_two_ends() -> None:

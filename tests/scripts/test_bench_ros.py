@@ -12,12 +12,12 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 import ros
 from report import Rounds
-from ros_row import Carried
 from skeleton import Options, Trial
 
 from gdp.metadata import Metadata
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import OWNER_PUBLIC
+from lab.credentials import Carried
 from lab.topology import LEFT, RIGHT
 from proxy.config.rule import Rule
 
@@ -29,23 +29,23 @@ def trials(options: Options) -> list[Trial]:
 
 
 def test_what_is_carried_is_named_once_and_has_a_source_at_an_end() -> None:
-    names = [each.name for each in ros.CARRIED]
+    names = [each.name for carried in ros.CARRIED.values() for each in carried]
     assert len(set(names)) == len(names)
-    assert {each.source for each in ros.CARRIED} <= {LEFT, RIGHT}
+    assert ros.CARRIED.keys() <= {LEFT, RIGHT}
     assert {topic for each in ros.STREAMS.values() for topic in each.topics} | {*ros.SERVICES.values()} == {*names}
 
 
 def test_every_rule_is_one_that_the_proxy_takes_and_means_what_the_owner_delegates(tmp_path: Path) -> None:
     make_owner(tmp_path / "owner")
     owner = tmp_path / "owner" / OWNER_PUBLIC
-    for each in ros.CARRIED:
-        rule = Rule.model_validate(each.at_proxies.rule(owner))
-        assert rule.metadata_of(each.name, each.type_name) == each.at_proxies.metadata
+    for each in (each for carried in ros.CARRIED.values() for each in carried):
+        rule = Rule.model_validate(each.rule(owner))
+        assert rule.metadata_of(each.name, each.type_name) == each.metadata
 
 
 def test_a_carried_thing_says_its_kind_name_and_type() -> None:
-    lamp = Carried("/lamp", "std_srvs/srv/SetBool", "json", source=RIGHT, kind="service")
-    assert lamp.at_proxies.metadata == Metadata({"kind": "service", "name": "/lamp", "type": "std_srvs/srv/SetBool"})
+    lamp = Carried("/lamp", "std_srvs/srv/SetBool", "service")
+    assert lamp.metadata == Metadata({"kind": "service", "name": "/lamp", "type": "std_srvs/srv/SetBool"})
 
 
 @EVERY

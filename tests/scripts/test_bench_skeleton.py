@@ -13,7 +13,7 @@ from report import Rounds, markdown_table, write_json
 from skeleton import Outcome, command_line, finish, parse
 
 from gdp.host.run_registry import RunRegistry
-from lab.process import FailedError, LabProcess, figures_of, floats_of
+from lab.process import Event, FailedError, LabProcess, until
 from lab.topology import Link, ends_of, flat_topology, make_topology, single
 
 COMMAND = "import sys; sys.path.insert(0, {!r}); from peers.jsonl import read_order, say; {}"
@@ -90,14 +90,22 @@ def test_a_process_that_refuses_is_an_error_with_its_reason(start: Callable[[str
         end.read(20.0)
 
 
-def test_figures_of_a_report_are_its_numbers() -> None:
-    assert figures_of({"p50_s": 0.5, "lost": 0, "event": "over"}) == {"p50_s": 0.5, "lost": 0}
+@pytest.mark.parametrize("line", ["", "x", "[]", "1"])
+def test_a_line_that_is_no_object_is_an_error(start: Callable[[str], LabProcess], line: str) -> None:
+    with start(f"print({line!r}, flush=True)") as end, pytest.raises(FailedError, match="said"):
+        end.read(20.0)
 
 
-def test_a_report_without_the_list_is_refused() -> None:
-    assert floats_of({"rtt_us": [1, 2.5]}, "rtt_us") == [1.0, 2.5]
-    with pytest.raises(FailedError, match="rtt_us"):
-        floats_of({"event": "over"}, "rtt_us")
+def test_a_process_that_goes_on_is_an_error_to_one_that_reaps_it(start: Callable[[str], LabProcess]) -> None:
+    with start("read_order()") as end, pytest.raises(FailedError, match="still runs"):
+        end.reap(0.01)
+
+
+def test_events_are_taken_without_waiting(start: Callable[[str], LabProcess]) -> None:
+    found = list[Event]()
+    with start("say(event='ready'); say(event='done')") as end:
+        until(lambda: end.is_silent, meanwhile=lambda: found.extend(end.take_events()))
+    assert [each["event"] for each in found] == ["ready", "done"]
 
 
 def test_a_table_in_markdown_aligns_its_last_columns_to_the_right() -> None:

@@ -24,7 +24,6 @@ from results import THIS_RUN, rows_of
 from skeleton import Outcome, command_line, parse, perform
 
 import make_catalog
-from gdp.host.run_registry import RunRegistry
 from tests.pages import ROOT
 
 DATA = ROOT / "scripts" / "data"
@@ -138,7 +137,7 @@ def test_a_bench_on_a_busy_machine_writes_no_record_but_marks_rows_where_that_is
     record = tmp_path / "record.json"
 
     def run(*words: str, is_whole: bool = True) -> None:
-        def measure(options: object, runs: RunRegistry) -> Outcome:
+        def measure(options: object) -> Outcome:
             over = Rounds()
             over.add("bridge", "case", "s", 1.0)
             return Outcome("bench", "Bench", over, [], {}, is_whole=is_whole)
@@ -183,7 +182,7 @@ def test_a_tree_without_git_writes_no_page_but_runs_quickly(tmp_path: Path) -> N
     for part in ("scripts", "gdp", "fog", "proxy"):
         shutil.copytree(ROOT / part, tree / part, ignore=shutil.ignore_patterns("__pycache__", "data"))
     argv = [sys.executable, str(tree / "scripts/experiments/table1.py")]
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    environment = {**os.environ, "PYTHONPATH": f"{tree}{os.pathsep}{tree / 'scripts'}"}
     ran = subprocess.run(argv, env=environment, capture_output=True, text=True, check=False)
     (line,) = ran.stderr.splitlines()
     assert ran.returncode == 2

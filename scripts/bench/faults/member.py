@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from member_endpoint import End
 from peers.jsonl import say
 
 from faults.records import Kind, RecordWriter
@@ -28,6 +27,7 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.runtime.memory_tuning import tune_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
+from lab.end import End
 
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
 _REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call
@@ -197,7 +197,7 @@ def main() -> None:
     settings: dict[str, Any] = json.loads(sys.argv[1])
     out, incarnation_id = RecordWriter(Path(settings["records"])), settings["incarnation_id"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
-    station = End(Path(settings["config"]), 0.0)
+    station = End.from_config(Path(settings["config"]), 0.0)
     takers: dict[Name, Reading | Serving | Caller] = {}
     for each in settings["read"]:
         takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)

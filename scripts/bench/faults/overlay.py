@@ -7,18 +7,15 @@ ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may b
 from __future__ import annotations
 
 import json
-import os
 import signal
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from pyroute2 import IPRoute
-from testbed import Lab, received, set_link
 
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
@@ -32,6 +29,8 @@ from gdp.stores.keyring import load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
+from lab.machines import Lab
+from lab.namespaces import received, set_link
 from lab.process import FailedError, LabProcess, end_processes
 
 READY_S: Final = 60.0
@@ -48,6 +47,12 @@ class Overlay:
         more: further keys of the file of every switch and RIB, by role.
         has_disk: RIBs keep snapshots on a small disk.
         in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
+
+    Attributes:
+        processes: what was started and not killed; it may have ended by itself.
+        incarnation_ids: how often each process was started.
+        at: the switch that each member, or switch that moves, is plugged into.
+        spaces: the namespaces, in which links can be cut.
 
     Raises:
         LocalError: the kernel refuses.
@@ -69,9 +74,9 @@ class Overlay:
         self._lab = Lab(run, plan.topology)
         self._run = run
         self._more = more or {}
-        self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
-        self._incarnation_ids: dict[str, int] = {}
-        self._processes: dict[str, LabProcess] = {}
+        self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
+        self.incarnation_ids: dict[str, int] = {}
+        self.processes: dict[str, LabProcess] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = self._lab.namespaces
@@ -96,7 +101,7 @@ class Overlay:
             self.store.close()
         for who in list(self._frozen):
             self.thaw(who)
-        end_processes(list(self._processes.values()))  # all at once
+        end_processes(list(self.processes.values()))  # all at once
 
     def everybody(self) -> list[str]:
         """Return every process by name."""
@@ -115,12 +120,12 @@ class Overlay:
             for who in names:
                 self.start(who)
             for who in names:
-                self._processes[who].read(READY_S)
+                self.processes[who].read(READY_S)
 
     def start(self, who: str) -> None:
         """Start a process, also one that was killed, with a new incarnation; does not wait for it."""
         role, _, node = who.partition(" ")
-        incarnation_id = self._incarnation_ids[who] = self._incarnation_ids.get(who, 0) + 1
+        incarnation_id = self.incarnation_ids[who] = self.incarnation_ids.get(who, 0) + 1
         if role == "switch":
             argv = ["gdp.cli.switch", "--json", "--config", str(self._switch_file(node))]
         elif role == "rib":
@@ -129,53 +134,27 @@ class Overlay:
             argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
-        self._processes[who] = self._lab.start(node, f"{role} {incarnation_id}", argv)
-
-    def await_ready(self, who: str) -> None:
-        """Return when a started process reports that it is ready.
-
-        Raises ``FailedError``: it ended, or reported nothing in time.
-        """
-        self._processes[who].read(READY_S)
-
-    def is_ready(self, who: str) -> bool:
-        """Return whether a process that was started is ready; waits a moment, raises as ``await_ready``."""
-        return self._processes[who].has_line(0.02)
+        self.processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
 
     def kill(self, who: str) -> None:
         """Kill a process at once (SIGKILL)."""
         self._frozen.discard(who)
-        process = self._processes.pop(who)
-        os.kill(process.pid, signal.SIGKILL)
-        process.__exit__(None, None, None)
-
-    def is_running(self, who: str) -> bool:
-        """Return whether a process was started and not killed; it may have ended by itself."""
-        return who in self._processes
+        self.processes.pop(who).kill_group()
 
     def died(self) -> list[str]:
         """Return the processes that ended by themselves."""
-        return [who for who, process in self._processes.items() if process.code is not None]
-
-    def incarnation_id(self, who: str) -> int:
-        """Return how often a process was started."""
-        return self._incarnation_ids[who]
-
-    def pid(self, who: str) -> int:
-        """Return the id of a running process."""
-        return self._processes[who].pid
+        return [who for who, process in self.processes.items() if process.code is not None]
 
     def freeze(self, who: str) -> None:
         """Stop a process (SIGSTOP)."""
         self._frozen.add(who)
-        os.kill(self._processes[who].pid, signal.SIGSTOP)
+        self.processes[who].send(signal.SIGSTOP)
 
     def thaw(self, who: str) -> None:
         """Continue a frozen process; harmless when it is not frozen."""
-        if who in self._frozen and who in self._processes:
+        if who in self._frozen and who in self.processes:
             self._frozen.discard(who)
-            with suppress(ProcessLookupError):
-                os.kill(self._processes[who].pid, signal.SIGCONT)
+            self.processes[who].send(signal.SIGCONT)
 
     def step_clock(self, who: str, seconds: float) -> None:
         """Set a process's wall clock off the machine's by so many seconds."""
@@ -183,7 +162,7 @@ class Overlay:
 
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
         """Yield, by incarnation, what a member recorded since the last call."""
-        for incarnation_id in range(1, self._incarnation_ids.get(f"member {member}", 0) + 1):
+        for incarnation_id in range(1, self.incarnation_ids.get(f"member {member}", 0) + 1):
             if (member, incarnation_id) not in self._records:
                 self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
             yield incarnation_id, self._records[member, incarnation_id].read()
@@ -198,13 +177,6 @@ class Overlay:
         for _, records in self.read(member):
             yield from records
 
-    def signal(self, who: str, number: signal.Signals) -> None:
-        """Send a signal.
-
-        SIGHUP makes a switch read its revocations, SIGUSR1 makes a member start its next spare flow.
-        """
-        os.kill(self._processes[who].pid, number)
-
     def log_tail(self, who: str, lines: int = 15) -> str:
         """Return the end of a process's log, of its latest incarnation."""
         texts = [text for _, text in self.logs(who)]
@@ -216,16 +188,12 @@ class Overlay:
 
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
-        for incarnation_id in range(1, self._incarnation_ids.get(who, 0) + 1):
+        for incarnation_id in range(1, self.incarnation_ids.get(who, 0) + 1):
             role, _, node = who.partition(" ")
-            path = self.directory / f"{role}-{incarnation_id}-at-{node}.log"
+            path = self.directory / f"{role}-{incarnation_id}-{node}.log"
             yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
 
     # links
-
-    def cut(self, a: str, b: str) -> None:
-        """Take a link down; both ends lose their carrier."""
-        self.spaces.cut(a, b)
 
     def revoke(self, member: str) -> None:
         """Revoke a member's membership: each switch receives the statement."""
@@ -236,12 +204,8 @@ class Overlay:
         wire = Revocation.make(authority.key, authority.root.subject, held.fingerprint, held.not_after_unix_s)
         (self.directory / "revocations" / f"{member}.revoke").write_bytes(wire)
         for node in self.plan.switches:
-            if self.is_running(f"switch {node}"):
-                self.signal(f"switch {node}", signal.SIGHUP)
-
-    def restore_link(self, a: str, b: str) -> None:
-        """Restore a link."""
-        self.spaces.restore_link(a, b)
+            if f"switch {node}" in self.processes:
+                self.processes[f"switch {node}"].send(signal.SIGHUP)
 
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
         """Apply faults to the frames of a link, both ways."""
@@ -262,19 +226,11 @@ class Overlay:
         """Return how many frames have come in at a node's devices towards these neighbours."""
         return self._lab.inside(node, partial(received, neighbours))
 
-    def at(self, mover: str) -> str:
-        """Return the switch that a member is plugged into."""
-        return self._at[mover]
-
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
-        there = os.open(self.spaces[to].path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self._lab.inside(self._at[mover], partial(set_link, mover, net_ns_fd=there))
-        finally:
-            os.close(there)
+        self.spaces[self.at[mover]].move(mover, self.spaces[to])
         self._lab.inside(to, partial(set_link, mover, state="up"))
-        self._at[mover] = to
+        self.at[mover] = to
 
     # files
 

@@ -194,18 +194,8 @@ class Oracle:
 
     def part_of(self, switch: str, broken: Broken) -> frozenset[str]:
         """Return the live switches that a live switch reaches, itself included."""
-        ways: dict[str, set[str]] = {}
-        for link in self._links:
-            if link not in broken.links and not link & broken.switches:
-                a, b = link
-                ways.setdefault(a, set()).add(b)
-                ways.setdefault(b, set()).add(a)
-        found, ahead = {switch}, [switch]
-        while ahead:
-            new = ways.get(ahead.pop(), set()) - found
-            found |= new
-            ahead += new
-        return frozenset(found)
+        topology, dead = self._plan.topology, {*broken.switches, *self._plan.members}
+        return topology.reached(switch, down=broken.links, dead=dead)
 
     def is_whole(self, broken: Broken) -> bool:
         """Return whether all live switches reach each other."""

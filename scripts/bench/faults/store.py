@@ -10,7 +10,6 @@ import errno
 import os
 import shutil
 import signal
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -18,17 +17,15 @@ from pathlib import Path
 from typing import Final
 
 import yaml
-from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
-from testbed import add_address, add_bridge, set_link
 
-from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
-from lab.namespaces import Namespace, Namespaces
-from lab.process import FailedError, until
+from lab.machine import LabMachine
+from lab.namespaces import Namespace, Namespaces, add_address, add_bridge, set_link
+from lab.process import until
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
 _KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
@@ -51,7 +48,8 @@ class StoreCluster:
     """Cluster of six servers.
 
     ``run``: run whose folder holds the data. ``spaces``: of the network. ``ribs``: switches in whose namespaces the
-    RIBs run that use the cluster. Raises ``LocalError``: the kernel refuses, or the servers do not start.
+    RIBs run that use the cluster. Raises ``LocalError``: the kernel refuses. Raises ``FailedError``: the servers do not
+    start.
     """
 
     def __init__(self, run: Run, spaces: Namespaces, ribs: Sequence[str]) -> None:
@@ -64,13 +62,10 @@ class StoreCluster:
         self._namespace.inside(partial(add_address, _BRIDGE, _ADDRESS))
         for at, node in enumerate(ribs, 2):
             self._join(spaces[node], f"to-{node}", _OF_RIBS.format(at))
-        started = subprocess.run(
-            self._namespace.command([str(_START_CLUSTER), str(self._folder), _ADDRESS], dies_with_us=False),
-            capture_output=True, text=True, check=False, timeout=_START_S, start_new_session=True,
-        )  # fmt: skip
-        if started.returncode:
-            raise LocalError(f"the store does not start: {started.stderr.strip()}")
-        self._config = yaml.safe_load(Path(started.stdout.strip()).read_text(encoding="utf-8"))
+        self._enter = self._namespace.command([], dies_with_us=False)
+        host = LabMachine(run.directory, self._enter)
+        config = host.output(str(_START_CLUSTER), str(self._folder), _ADDRESS, patience_s=_START_S)
+        self._config = yaml.safe_load(Path(config.strip()).read_text(encoding="utf-8"))
         self._password = (self._folder / "admin.password").read_text(encoding="ascii").strip()
         self._servers = {int(conf.parent.name): _port(conf) for conf in self._folder.glob("*/server.conf")}
         program = _program()
@@ -98,9 +93,7 @@ class StoreCluster:
         number = self._away.pop(fault)
         folder = self._folder / str(number)
         (folder / "server.pid").unlink(missing_ok=True)
-        argv = self._namespace.command([self._program, "server.conf"], dies_with_us=False)
-        if subprocess.run(argv, cwd=folder, check=False, stdout=subprocess.DEVNULL).returncode:
-            raise FailedError(f"server {number} of the store does not start again")
+        LabMachine(folder, self._enter).output(self._program, "server.conf")
         until(lambda: self._role(number) is not None, lambda: f"an answer of server {number} of the store", _WHOLE_S)
         self._run.note_process(self._pid(number))
 
@@ -140,11 +133,8 @@ class StoreCluster:
         return int((self._folder / str(number) / "server.pid").read_text(encoding="ascii"))
 
     def _join(self, rib: Namespace, ifname: str, address: str) -> None:
-        there = os.open(rib.path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self._namespace.inside(partial(_plug, ifname, there))
-        finally:
-            os.close(there)
+        self._namespace.join(rib, {"ifname": ifname}, {"ifname": _IFNAME})
+        self._namespace.inside(partial(set_link, ifname, state="up", master=_BRIDGE))
         rib.inside(partial(add_address, _IFNAME, address))
         rib.inside(partial(set_link, _IFNAME, state="up"))
 
@@ -165,13 +155,6 @@ def _program() -> str | None:
     """Return the server program that ``start_cluster.sh`` also starts, or None."""
     kinds = (kind for kind in _KINDS if shutil.which(f"{kind}-cli"))
     return next((program for kind in kinds if (program := shutil.which(f"{kind}-server"))), None)
-
-
-def _plug(ifname: str, namespace: int) -> None:
-    with IPRoute() as here:
-        here.link("add", kind="veth", ifname=ifname, peer={"ifname": _IFNAME, "net_ns_fd": namespace})
-        index = here.link_lookup(ifname=ifname)[0]
-        here.link("set", index=index, state="up", master=here.link_lookup(ifname=_BRIDGE)[0])
 
 
 def _port(conf: Path) -> int:

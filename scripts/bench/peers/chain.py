@@ -14,9 +14,10 @@ from typing import Final
 
 from machine import clear_offloads
 from pyroute2 import IPRoute
-from testbed import Lab, add_address
 
 from gdp.host.run_registry import Run
+from lab.machines import Lab
+from lab.namespaces import add_address
 from lab.topology import MIDDLE, ROW, row
 
 NODES: Final = ROW

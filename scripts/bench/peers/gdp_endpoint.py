@@ -13,12 +13,11 @@ from collections import deque
 from pathlib import Path
 from typing import Final
 
-from member_endpoint import End
-
 import gdp
 from gdp.names import Name
 from gdp.runtime.busy_poll import SPIN_US
 from gdp.runtime.memory_tuning import tune_memory
+from lab.end import End
 from peers.exchange import PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
 
@@ -54,7 +53,7 @@ class SessionEndpoint:
     """Client or server of a name under ``sign: session``: a message is a request, and an answer its response."""
 
     def __init__(self, config: Path, *, is_ping: bool) -> None:
-        self._end = End(config, SPIN_US / 1e6)
+        self._end = End.from_config(config, SPIN_US / 1e6)
         self._is_client = is_ping
         if is_ping:
             self._end.call(PING, is_session=True)

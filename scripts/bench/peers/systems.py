@@ -14,9 +14,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final, Literal, Protocol
 
-from testbed import OverlayNodes
-
 from gdp.trust.right import Right
+from lab.machines import BenchNodes
 from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
@@ -59,13 +58,12 @@ class GdpNet:
     def measure(self, chain: Chain, size: int, count: int) -> Measured:
         """Start switches, RIB, B, A; as ``Baseline.measure``."""
         with ExitStack() as stack:
-            nodes = OverlayNodes(chain, MIDDLE, plane="kernel", label=self.name)
-            stack.callback(nodes.close)
+            nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=self.name))
             own = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
-            between = [switch.pid for switch in nodes.switches]
+            between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
             return _measured(stack, chain, _GDP, own, {"between": between}, (size, count))
 
-    def _admit(self, nodes: OverlayNodes, node: str) -> object:
+    def _admit(self, nodes: BenchNodes, node: str) -> object:
         if self._sign == "session":
             return nodes.admit_member(node, {Right.CALL if node == LEFT else Right.SERVE: [PING]})
         written, read = (PING, PONG) if node == LEFT else (PONG, PING)

@@ -6,7 +6,6 @@ I/O. Starts a process in the namespace between robot and cloud.
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,9 +13,10 @@ from functools import partial
 from typing import Any, Final
 
 from machine import clear_offloads
-from testbed import Lab, add_address, add_neighbour, mac_addresses
 
 from gdp.host.run_registry import Run
+from lab.machines import Lab
+from lab.namespaces import add_address, add_neighbour, mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions
@@ -134,11 +134,7 @@ def _set_tcp_control(lab: Lab, node: str, name: str) -> None:
     Source: Linux, net/ipv4/tcp_cong.c, ``tcp_set_default_congestion_control``.
     """
     route = f"10.99.0.0/24 dev {LINE} proto kernel scope link src {ADDRESSES[node]} congctl {name}"
-    ran = subprocess.run(
-        lab.command(node, ["ip", "route", "replace", *route.split()]), capture_output=True, text=True, check=False
-    )
-    if ran.returncode:
-        raise FailedError(f"no TCP congestion control {name}: {ran.stderr.strip()}")
+    lab.machines[node].output("ip", "route", "replace", *route.split())
 
 
 @contextmanager

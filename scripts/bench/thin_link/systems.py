@@ -11,9 +11,9 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Final, TypeAlias
 
 from peers.certificates import make_certificates
-from testbed import Lab, OverlayNodes
 
 from gdp.trust.right import Right
+from lab.machines import BenchNodes, Lab
 from lab.process import LabProcess
 from thin_link.line import ADDRESSES, CLOUD, ROBOT
 from thin_link.traffic import streams
@@ -55,8 +55,7 @@ class Gdp:
         up = [each.name for each in mix if each.direction == "up"]
         down = [each.name for each in mix if each.direction == "down"]
         with ExitStack() as stack:
-            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane="kernel")
-            stack.callback(nodes.close)
+            nodes = stack.enter_context(BenchNodes(lab, (ROBOT, CLOUD), plane="kernel"))
             robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
             cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
             own = ({"config": str(robot)}, {"config": str(cloud)})

@@ -7,7 +7,6 @@ import io
 import pytest
 from rich.console import Console
 
-from lab.events import Event
 from ring.options import Options
 from ring.result import Heard, Result, rows
 from ring.table import summary, table
@@ -20,10 +19,10 @@ SENT = ["aa", "bb", "cc"]
 
 
 def result(heard: list[str] = SENT, served: int = 3, **caller: object) -> Result:
-    talker = Event({**CHATTER, "bytes": 99, "sent": SENT})
-    listener = Event({"topics": [{**CHATTER, "heard": heard, "latency_ms": LATENCY}]})
-    said = Heard((talker,), Event({"served": served}), listener, Event({**CALLER, **caller}))
-    return Result(rows(said, [Event(CARRIED)]), Options(live="ros2").settings())
+    talker = {**CHATTER, "bytes": 99, "sent": SENT}
+    listener = {"topics": [{**CHATTER, "heard": heard, "latency_ms": LATENCY}]}
+    said = Heard((talker,), {"served": served}, listener, {**CALLER, **caller})
+    return Result(rows(said, [CARRIED]), Options(live="ros2").settings())
 
 
 def test_a_live_run_passes_when_all_was_heard_and_answered() -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.children import Children
-from lab.process import FailedError
+from lab.process import FailedError, LabProcess
+from lab.supervisor import Supervisor
 from ring import live_run
 from ring.live_run import LiveNodes, LiveSession
 from ring.progress import ProgressReporter
@@ -44,36 +44,29 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 
 
 def play(run: Run, talker: str = TALKER, lamp: str = LAMP, listener: str = LISTENER, caller: str = CALLER) -> Heard:
-    async def main() -> Heard:
-        children = Children(run, kept=True)
-        try:
-            nodes = [
-                children.start(name, [sys.executable, "-c", code])
-                for name, code in (("talker", talker), ("lamp", lamp), ("listener", listener), ("caller", caller))
-            ]
-            await children.ready(nodes)
-            live_nodes = LiveNodes({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
-            session = LiveSession(children, live_nodes, ProgressReporter(Console(file=io.StringIO())))
-            await session.meet()
-            return await asyncio.wait_for(session.talk(0.1), 20)
-        finally:
-            run.end()
-            await asyncio.gather(*(child.ended for child in children._all))
-            children.forget()
-
-    return asyncio.run(main())
+    supervisor = Supervisor()
+    codes = {"talker": talker, "lamp": lamp, "listener": listener, "caller": caller}
+    with ExitStack() as stack:
+        nodes = [
+            stack.enter_context(LabProcess(run, name, [sys.executable, "-c", code])) for name, code in codes.items()
+        ]
+        supervisor.ready(*nodes)
+        live_nodes = LiveNodes({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
+        session = LiveSession(supervisor, live_nodes, ProgressReporter(Console(file=io.StringIO())))
+        session.meet()
+        return session.talk(0.1)
 
 
 def test_every_node_gets_the_start_command_and_is_asked_for_its_report(run: Run) -> None:
     heard = play(run)
-    assert [talker.texts("sent") for talker in heard.talkers] == [["aa", "bb"]]
-    assert (heard.lamp.count("served"), heard.caller.count("answered")) == (1, 1)
+    assert [talker["sent"] for talker in heard.talkers] == [["aa", "bb"]]
+    assert (heard.lamp["served"], heard.caller["answered"]) == (1, 1)
 
 
 def test_what_does_not_come_is_waited_for_only_while_something_moves(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_run, "QUIET_S", 0.2)
     heard = play(run, listener=LISTENER.replace("received=2", "received=1"))
-    assert heard.listener.name == "done"
+    assert heard.listener["event"] == "done"
 
 
 def test_a_node_that_does_not_report_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

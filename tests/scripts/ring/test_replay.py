@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.children import Child, Children
-from lab.process import FailedError
+from lab.process import FailedError, LabProcess
+from lab.supervisor import Supervisor
 from ring import run as replay_module
+from ring.faults import Cut
 from ring.overlay import Injection
 from ring.progress import ProgressReporter
 from ring.run import Replay, Report
@@ -44,32 +43,18 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = None) -> Report:
     reporter = ProgressReporter(Console(file=reported or io.StringIO(), width=120))
 
-    async def both(children: Children) -> Report:
-        far = children.start("receiver", [sys.executable, "-c", receiver])
-        await children.ready([far])
-        near = children.start("sender", [sys.executable, "-c", sender])
-        await children.guarded(near.wait_for("ready", 10))
-        return await Replay(children, near, far, 2, reporter).report(lambda: Injection(cast(Any, None), (), reporter))
-
-    return within(run, both)
-
-
-def within(run: Run, work: Callable[[Children], Awaitable[Report]]) -> Report:
-    async def main() -> Report:
-        children = Children(run, kept=True)
-        try:
-            return await asyncio.wait_for(work(children), 20)
-        finally:
-            run.end()
-            await asyncio.gather(*(child.ended for child in children._all))
-            children.forget()
-
-    return asyncio.run(main())
+    supervisor = Supervisor()
+    with LabProcess(run, "receiver", [sys.executable, "-c", receiver]) as far:
+        supervisor.ready(far)
+        with LabProcess(run, "sender", [sys.executable, "-c", sender]) as near:
+            supervisor.wait_for(near, "ready", 10)
+            replay = Replay(supervisor, near, far, 2, reporter)
+            return replay.report(Injection(supervisor, (), lambda *_: None))
 
 
 def test_when_the_sender_has_finished_the_receiver_is_asked_for_its_report(run: Run) -> None:
     report = play(run, SENDER, RECEIVER)
-    assert [topic.text("topic") for topic in report.topics] == ["/a"]
+    assert [topic["topic"] for topic in report.topics] == ["/a"]
     assert report.complaints == ()
     assert report.unread is None
 
@@ -114,14 +99,28 @@ def test_traffic_that_stands_still_ends_the_run(run: Run, monkeypatch: pytest.Mo
 
 def test_a_line_of_a_megabyte_is_read(run: Run) -> None:
     long = RECEIVER.replace("'/a'", "'/' + 'a' * 1_000_000")
-    assert len(play(run, SENDER, long).topics[0].text("topic")) == 1_000_001
+    assert len(play(run, SENDER, long).topics[0]["topic"]) == 1_000_001
 
 
-def test_a_child_that_does_not_answer_in_time_is_reported(run: Run, tmp_path: Path) -> None:
-    async def impatient(children: Children) -> Report:
-        child: Child = children.start("mute", [sys.executable, "-c", "import signal; signal.pause()"])
-        await child.wait_for("ready", 0.05)
-        raise AssertionError
+def test_a_process_that_does_not_answer_in_time_is_reported(run: Run) -> None:
+    mute = LabProcess(run, "mute", [sys.executable, "-c", "import signal; signal.pause()"])
+    with mute, pytest.raises(FailedError, match=r"mute did not say 'ready' within 0\.05 s"):
+        Supervisor().wait_for(mute, "ready", 0.05)
 
-    with pytest.raises(FailedError, match=r"mute did not say 'ready' within 0\.05 s"):
-        within(run, impatient)
+
+def test_faults_are_injected_at_their_seconds_and_those_that_come_too_late_are_complaints(run: Run) -> None:
+    supervisor, injected = Supervisor(), list[str]()
+    cuts = [Cut.from_text("a-b@0-0.05"), Cut.from_text("a-c@60")]
+    injection = Injection(supervisor, cuts, lambda fault, begins: injected.append(f"{fault} {begins}"))
+    supervisor.follow((), lambda: len(injected) == 2, patience_s=10)
+    assert injected == ["a-b@0-0.05 True", "a-b@0-0.05 False"]
+    assert injection.stop() == ["a-c@60 came too late: the traffic was over"]
+
+
+def test_a_restarted_process_is_required_once_it_is_ready(run: Run) -> None:
+    supervisor, back = Supervisor(), list[str]()
+    with LabProcess(run, "again", [sys.executable, "-c", HEAD + "say(event='ready'); sys.exit('no more')"]) as again:
+        supervisor.expect(again, lambda event: back.append(event["event"]))
+        with pytest.raises(FailedError, match=r"again ended with code 1\n    no more"):
+            supervisor.follow((), lambda: False, patience_s=10)
+    assert back == ["ready"]

@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from gdp.errors import LocalError
-from lab.events import Event
+from lab.process import Event
 from proxy.recordings.compare import TopicComparison
 from ring.options import Options
 from ring.result import Journey, Result, put_together
@@ -28,19 +27,17 @@ GOOD = TopicComparison(
     identical=True,
     in_order=True,
 )
-REPORT = Event(
-    {
-        "topic": "/imu",
-        "type": "sensor_msgs/msg/Imu",
-        "received": 1_000,
-        "lost": 0,
-        "duplicated": 0,
-        "latency_ms": {"median": 0.5, "p99": 2, "max": 9.25},
-        "parts": 1,
-        "hops": 5,
-        "hops_seen": [5, 2],
-    }
-)
+REPORT: Event = {
+    "topic": "/imu",
+    "type": "sensor_msgs/msg/Imu",
+    "received": 1_000,
+    "lost": 0,
+    "duplicated": 0,
+    "latency_ms": {"median": 0.5, "p99": 2, "max": 9.25},
+    "parts": 1,
+    "hops": 5,
+    "hops_seen": [5, 2],
+}
 SETTINGS = Options().settings()
 
 
@@ -69,7 +66,7 @@ def test_a_run_does_not_pass_with_a_single_fault(wrong: dict[str, int], fault: s
 
 
 def test_what_the_receiver_had_twice_counts_though_it_was_recorded_once() -> None:
-    assert result(report=Event({**REPORT.fields, "duplicated": 3})).faults == ["/imu: 3 duplicated"]
+    assert result(report={**REPORT, "duplicated": 3}).faults == ["/imu: 3 duplicated"]
 
 
 def test_a_complaint_about_an_end_keeps_a_run_from_passing() -> None:
@@ -150,18 +147,6 @@ def test_the_table_shows_topics_whose_names_look_like_markup() -> None:
     with console.capture() as captured:
         console.print(table(result(replace(GOOD, topic="/a[bold]b"))))
     assert "/a[bold]b" in captured.get()
-
-
-@pytest.mark.parametrize("line", ["", "x", "[]", "1", '"ready"'])
-def test_a_line_that_is_no_object_is_no_event(line: str) -> None:
-    with pytest.raises(LocalError, match="was expected"):
-        Event.from_line(line)
-
-
-@pytest.mark.parametrize("read", [Event.text, Event.count, Event.parts])
-def test_an_event_without_the_wanted_value_is_refused(read: object) -> None:
-    with pytest.raises(LocalError, match="ready: value: "):
-        read(Event({"event": "ready", "value": None}), "value")  # type: ignore[operator]
 
 
 def test_the_readme_shows_the_table_as_it_is_printed() -> None:

@@ -9,7 +9,7 @@ import pytest
 from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import RunRegistry
-from ring.cores import MachineCores
+from lab.cores import MachineCores
 
 
 def test_where_the_system_refuses_weights_no_group_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

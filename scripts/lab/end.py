@@ -1,4 +1,4 @@
-"""Member of the overlay on its plane, as the endpoint processes of benches use it. I/O."""
+"""Member of the overlay on its plane, without the library: of the endpoint processes of benches and tests. I/O."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.config.config import RibConfig
+from gdp.config.schema import Domain
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
@@ -15,25 +16,30 @@ from gdp.names import Name
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
-from gdp.stores.keyring import load_delegations
+from gdp.stores.keyring import DELEGATIONS, load_delegations
 
 
 class End:
-    """Member on its plane. ``topics``: topics and services that its delegations name."""
+    """Member on its plane; ``folder``: of its keys. ``topics``: topics and services that its delegations name."""
 
-    def __init__(self, config: Path, spin_s: float) -> None:
-        settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
-        identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
+    def __init__(self, folder: Path, domain: Domain, iface: str, spin_s: float = 0.0) -> None:
+        identity, policy = load_member(folder, domain, Role.PROXY)
         node = NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes)
         self.member = Participant(identity, policy, node)
-        self.plane = RawPlane([settings.iface])
+        self.plane = RawPlane([iface])
         self.runtime = Runtime(self.member, self.plane, spin_s=spin_s)
         self.topics: dict[str, Topic] = {}
-        for each in load_delegations(settings.identity / "delegations"):
+        for each in load_delegations(folder / DELEGATIONS):
             if each.metadata is None:
                 raise LocalError("a delegation without metadata")
             grants = {epoch: grant.secret for epoch, grant in each.open(identity).items()}
             self.topics[str(each.metadata["name"])] = Topic(each, grants)
+
+    @classmethod
+    def from_config(cls, path: Path, spin_s: float) -> End:
+        """Return the member of a configuration file; identity, domain and iface are all that it needs."""
+        settings = RibConfig.load(path)
+        return cls(settings.identity, settings.domain, settings.iface, spin_s)
 
     def advertise(self, topic: str, *, reliable: bool) -> Publisher:
         """Publish a topic."""

@@ -1,34 +1,36 @@
-"""Test bed of the benches and experiments: machines in namespaces, and the overlay's nodes on them.
+"""Machines of a topology in namespaces, and the overlay's nodes on them: of benches, experiments and the ring.
 
-I/O. ``lab.topology`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
+I/O. ``lab.topology`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIBs on a
 lab. ``run.end()`` removes namespaces and processes of a lab, and the file systems of its machines' shared memory.
 Source: shm_overview(7), mount_namespaces(7), unshare(1).
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, TypeVar
-
-from pyroute2 import IPRoute
+from typing import Any, Final, Literal, TypeVar
 
 from gdp.crypto.certificates import Role
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
+from lab.cores import MachineCores
 from lab.credentials import Carried, OverlayCredentials, Side
+from lab.machine import PROGRAMS, LabMachine
 from lab.namespaces import Namespaces
-from lab.process import FailedError, LabProcess
+from lab.process import ROOT, FailedError, LabProcess, end_processes, python_path
 from lab.topology import Attachment, Topology
-from ring.cores import MachineCores
 
 _SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
 _ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
+_BENCH: Final = ROOT / "scripts" / "bench"
+_END_S: Final = 3.0
+
+T = TypeVar("T")
+_NodesT = TypeVar("_NodesT", bound="OverlayNodes")
 
 
 class SharedMemory:
@@ -44,16 +46,12 @@ class SharedMemory:
         return ["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", _ENTER, str(self.folder), *argv]
 
 
-_BENCH: Final = Path(__file__).resolve().parent
-
-T = TypeVar("T")
-
-
 class Lab:
     """Machines of a topology, each in a namespace.
 
     ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. ``cores``: bound
-    of processor time by machine; None: the machines share all cores. Raises ``LocalError``: the kernel refuses.
+    of processor time by machine; None: the machines share all cores. ``dies_with_us``: whether the kernel kills what
+    runs on them when this process ends in any way. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(
@@ -63,13 +61,20 @@ class Lab:
         *,
         own_shared_memory: Sequence[str] = (),
         cores: Mapping[str, int] | None = None,
+        dies_with_us: bool = True,
     ) -> None:
         self.run = run
         self.directory = run.directory
         self.topology = topology
         self.namespaces = Namespaces(topology, run)
         self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
-        self._cores = MachineCores(run, dict(cores)) if cores else None
+        self.cores = MachineCores(run, dict(cores)) if cores else None
+        self._dies_with_us = dies_with_us
+        path = {"PYTHONPATH": python_path(_BENCH)}
+        self.machines = {
+            node: LabMachine(run.directory, self.command(node, []), run=run, environment=path)
+            for node in topology.nodes
+        }
 
     def has_shared_memory(self, node: str) -> bool:
         """Return whether a machine has a ``/dev/shm`` of its own."""
@@ -83,7 +88,8 @@ class Lab:
         """Return the command line that runs ``argv`` on a machine; ``environment`` holds ``KEY=value``."""
         inner = ["env", *environment, *argv] if environment else list(argv)
         memory = self._memories.get(node)
-        return self.namespaces[node].command(memory.command(inner) if memory else inner)
+        entered = memory.command(inner) if memory else inner
+        return self.namespaces[node].command(entered, dies_with_us=self._dies_with_us)
 
     def start(
         self,
@@ -92,19 +98,55 @@ class Lab:
         arguments: Sequence[str],
         environment: Sequence[str] = (),
         *,
+        heard: bool = True,
         has_orders: bool = False,
     ) -> LabProcess:
-        """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
-        argv = self.command(node, [sys.executable, *arguments], environment)
-        paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))}
-        started = LabProcess(self.run, f"{what} at {node}", argv, environment=paths, has_orders=has_orders)
-        if self._cores is not None:
-            self._cores.add(node, started.pid)
+        """Start Python on a machine; with it ``what`` names its log, ``environment`` holds ``KEY=value``."""
+        argv = [*(["env", *environment] if environment else []), sys.executable, *arguments]
+        started = self.machines[node].launch(argv, f"{what}-{node}", heard=heard, has_orders=has_orders)
+        if self.cores is not None:
+            self.cores.add(node, started.pid)
         return started
 
 
 class OverlayNodes:
-    """Switches and RIBs of a lab, running, with keys of their own; a context manager that ends them.
+    """Switches and RIBs of a lab, with keys of their own; a context manager that ends them.
+
+    ``credentials``: of the overlay; the files of the nodes are there before a node starts.
+    """
+
+    def __init__(self, lab: Lab, credentials: OverlayCredentials) -> None:
+        self.lab = lab
+        self.credentials = credentials
+        self.running: dict[tuple[str, str], LabProcess] = {}  # by role and node
+
+    def __enter__(self: _NodesT) -> _NodesT:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all processes."""
+        end_processes(self.running.values(), _END_S)
+        self.running.clear()
+
+    def start(self, role: Literal["switch", "rib"], node: str, *words: str) -> LabProcess:
+        """Start a node, also one that was killed; ``words``: more of its command line."""
+        argv = ["-m", PROGRAMS[role], "--json", "--config", str(self.credentials.file(role, node)), *words]
+        process = self.running[role, node] = self.lab.start(node, role, argv)
+        return process
+
+    def start_all(
+        self, role: Literal["switch", "rib"], nodes: Iterable[str], *words: str, ready_s: float = 60.0
+    ) -> list[dict[str, Any]]:
+        """Start nodes; return what each says when it is ready. Raises ``FailedError``: one does not come up."""
+        started = [self.start(role, node, *words) for node in nodes]
+        return [each.read(ready_s) for each in started]
+
+
+class BenchNodes(OverlayNodes):
+    """All switches and RIBs of an overlay, running, and the members and proxies that it admits.
 
     Args:
         switches: nodes with one, in the order in which they start. A member at one of them is attached to it; another
@@ -112,6 +154,9 @@ class OverlayNodes:
         plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
         label: of the folder with keys; one lab may have several in turn.
         overlay: the lab's topology without what is no part of the overlay; None: all of it is.
+
+    Attributes:
+        planes: the data planes that the switches took.
 
     Raises:
         FailedError: a process did not come up.
@@ -127,35 +172,28 @@ class OverlayNodes:
         label: str = "keys",
         overlay: Topology | None = None,
     ) -> None:
-        self.lab = lab
         self._topology = overlay or lab.topology
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        self.credentials = credentials = OverlayCredentials(self._topology, self.files)
+        super().__init__(lab, OverlayCredentials(self._topology, self.files))
         self._switch_nodes = tuple(switches)
-        self.planes: set[str] = set()
-        self.undo = ExitStack()
-        with ExitStack() as undo:
-            self.switches = []
-            for node in switches:
-                config = str(credentials.switch(node, "auto"))
-                data_plane = [] if plane == "auto" else ["--data-plane", plane]
-                argv = ["-m", "gdp.cli.switch", "--json", *data_plane, "--config", config]
-                self.switches.append(undo.enter_context(lab.start(node, "switch", argv)))
-            for switch in self.switches:
-                taken = str(switch.read(ready_s).get("data_plane"))
+        ribs = self._topology.attached("rib")
+        for node in switches:
+            self.credentials.switch(node, "auto")
+        for at in ribs:
+            self.credentials.rib(at)
+        try:
+            words = [] if plane == "auto" else ["--data-plane", plane]
+            said = self.start_all("switch", switches, *words, ready_s=ready_s)
+            self.planes = {str(each.get("data_plane")) for each in said}
+            for taken in self.planes:
                 if plane != "auto" and not taken.startswith(plane):
                     raise FailedError(f"the switch took the data plane {taken} instead of {plane}")
-                self.planes.add(taken)
-            for at in self._topology.attached("rib"):
-                rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
-                undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
-            self.undo = undo.pop_all()
-
-    def close(self) -> None:
-        """End all processes, the last one first."""
-        self.undo.close()
+            self.start_all("rib", [at.switch for at in ribs], ready_s=ready_s)
+        except FailedError:
+            self.close()
+            raise
 
     def admit_member(self, node: str, topics: Mapping[Right, Iterable[str]]) -> Path:
         """Delegate topics to a member without ROS; return its configuration file."""
@@ -175,47 +213,3 @@ class OverlayNodes:
             (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
             return iface
         return next(self._topology.links_of(node)).other(node)
-
-
-def add_address(device: str, address: str) -> None:
-    """Give a device an IPv4 address of a network of 24 bits."""
-    with IPRoute() as here:
-        (index,) = here.link_lookup(ifname=device)
-        here.addr("add", index=index, address=address, prefixlen=24)
-
-
-def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
-    """Join devices by a new bridge without spanning tree."""
-    with IPRoute() as here:
-        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
-        (bridge,) = here.link_lookup(ifname=name)
-        for device in devices:
-            here.link("set", index=here.link_lookup(ifname=device)[0], master=bridge)
-        here.link("set", index=bridge, state="up")
-
-
-def add_neighbour(device: str, address: str, mac: bytes) -> None:
-    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
-    with IPRoute() as here:
-        (index,) = here.link_lookup(ifname=device)
-        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=index, state="permanent")
-
-
-def set_link(device: str, **change: str | int) -> None:
-    """Change a device: ``state``, ``mtu`` in bytes, or ``net_ns_fd``, the namespace of a descriptor to move it to."""
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], **change)
-
-
-def received(devices: Sequence[str]) -> dict[str, int]:
-    """Return how many frames have come in, by device."""
-    with IPRoute() as here:
-        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
-    return {device: links[device]["rx_packets"] for device in devices}
-
-
-def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
-    """Return the MAC addresses, by device."""
-    with IPRoute() as here:
-        links = {link.get("ifname"): link.get("address") for link in here.get_links()}
-    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
