@@ -51,5 +51,5 @@ class EnrolmentConfig(Section):
     """Section ``enrolment:`` of ``fog.yaml``."""
 
     revoke_misused: bool = Field(
-        default=True, description="Revoke and replace a machine whose ticket was used again with another key."
+        default=True, description="Revoke and replace a machine whose token was used again with another key."
     )

@@ -2,11 +2,13 @@
 
 I/O, one SQLite file, private. The commands ``gdp domain token``, ``ls`` and ``remove`` and the running server use it at
 the same time. A token is marked as used, on disk, before anything is issued for it: a crash at any point never lets a
-second key use it. Of a token the file holds the id and the MAC key, not the secret.
+second key use it. Of a token the file holds the id and the MAC key, not the secret. A launcher's plan of a machine
+belongs to its token, and so does a misuse of the token, which is reported until the launcher has handled it.
 """
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +17,14 @@ from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StoreError
+from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.files import write_all
 from gdp.stores.transactions import TransactionFile
 from gdp.trust.enrolment_wire import EnrolmentError, Refusal
+from gdp.trust.right import Right
 
-__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "StoredMail", "TokenRow"]
+__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Plan", "Registry", "StoredMail", "TokenRow"]
 
 MAILBOX_MAX: Final = 1_024  # mails that wait for one node
 MAILBOX_MAX_BYTES: Final = 4 << 20
@@ -34,6 +38,10 @@ CREATE TABLE IF NOT EXISTS tokens (
   id BLOB PRIMARY KEY, mac BLOB NOT NULL, role TEXT NOT NULL, label TEXT NOT NULL,
   made_unix_s REAL NOT NULL, expires_unix_s REAL NOT NULL,
   keys BLOB, used_unix_s REAL, machine INTEGER, answer BLOB
+) STRICT;
+CREATE TABLE IF NOT EXISTS plans (
+  token BLOB PRIMARY KEY, machine INTEGER, grants TEXT NOT NULL, until_unix_s REAL NOT NULL,
+  misuse TEXT, is_reported INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE TABLE IF NOT EXISTS machines (
   id INTEGER PRIMARY KEY AUTOINCREMENT, label TEXT NOT NULL, role TEXT NOT NULL, joined_unix_s REAL NOT NULL,
@@ -57,6 +65,21 @@ _SAME_MACHINE: Final = "(SELECT name FROM nodes WHERE machine = (SELECT machine 
 _MACHINE: Final = (
     "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double FROM machines m"
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """A launcher's plan of a machine, which no request changes.
+
+    Args:
+        grants: names that its proxy is delegated, each with its right.
+        until_unix_s: end of everything that is issued for it.
+        is_misused: its token was misused; further requests are refused.
+    """
+
+    grants: Sequence[tuple[Metadata, Right]]
+    until_unix_s: float
+    is_misused: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,11 +169,29 @@ class Registry(TransactionFile):
     # tokens
 
     def add_token(
-        self, identifier: bytes, mac: bytes, *, role: str, label: str, unix_s: float, expires_unix_s: float
+        self,
+        identifier: bytes,
+        mac: bytes,
+        *,
+        role: str,
+        label: str,
+        unix_s: float,
+        expires_unix_s: float,
+        plan: Plan | None = None,
     ) -> None:
-        """Store a token; those that ended long ago are deleted."""
+        """Store a token, and the plan of its machine; those that ended long ago are deleted."""
         with self.writing() as file:
-            file.execute("DELETE FROM tokens WHERE expires_unix_s < ?", (unix_s - _TOKEN_KEPT_S,))
+            file.execute("DELETE FROM plans WHERE until_unix_s < ?", (unix_s,))
+            file.execute(
+                "DELETE FROM tokens WHERE expires_unix_s < ? AND id NOT IN (SELECT token FROM plans)",
+                (unix_s - _TOKEN_KEPT_S,),
+            )
+            if plan is not None:
+                grants = json.dumps([[dict(metadata), right.value] for metadata, right in plan.grants])
+                file.execute(
+                    "INSERT INTO plans (token, grants, until_unix_s) VALUES (?, ?, ?)",
+                    (identifier, grants, plan.until_unix_s),
+                )
             file.execute(
                 "INSERT INTO tokens (id, mac, role, label, made_unix_s, expires_unix_s) VALUES (?, ?, ?, ?, ?, ?)",
                 (identifier, mac, role, label, unix_s, expires_unix_s),
@@ -199,12 +240,50 @@ class Registry(TransactionFile):
                 "UPDATE tokens SET keys = ?, used_unix_s = ?, machine = ? WHERE id = ?",
                 (keys, unix_s, machine, identifier),
             )
+            file.execute("UPDATE plans SET machine = ? WHERE token = ?", (machine, identifier))
             return machine
 
     def withdraw_tokens(self, label: str) -> None:
-        """Delete the unused tokens for machines with this label."""
+        """Delete the unused tokens for machines with this label, and the plans of these machines."""
         with self.writing() as file:
+            file.execute("DELETE FROM plans WHERE token IN (SELECT id FROM tokens WHERE label = ?)", (label,))
             file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
+
+    def plan_of(self, identifier: bytes) -> Plan | None:
+        """Return the plan of a token's machine; None: there is none, or it was withdrawn."""
+        query = "SELECT grants, until_unix_s, misuse IS NOT NULL FROM plans WHERE token = ?"
+        with self.reading() as file:
+            row = file.execute(query, (identifier,)).fetchone()
+        if row is None:
+            return None
+        grants = [(Metadata(metadata), Right(right)) for metadata, right in json.loads(row[0])]
+        return Plan(grants=grants, until_unix_s=row[1], is_misused=bool(row[2]))
+
+    def end_of(self, machine: int) -> float | None:
+        """Return when everything that is issued for a machine ends (Unix time); None: no launcher planned that."""
+        with self.reading() as file:
+            row = file.execute("SELECT until_unix_s FROM plans WHERE machine = ?", (machine,)).fetchone()
+        return None if row is None else float(row[0])
+
+    def set_misused(self, identifier: bytes, detail: str) -> None:
+        """Invalidate the token of a planned machine, and report that once; an earlier report stays."""
+        with self.writing() as file:
+            file.execute("UPDATE plans SET misuse = ? WHERE token = ? AND misuse IS NULL", (detail, identifier))
+
+    def misuses(self) -> list[tuple[str, str]]:
+        """Return label and detail of each misused token that was not yet ``reported``."""
+        query = (
+            "SELECT t.label, p.misuse FROM plans p JOIN tokens t ON t.id = p.token"
+            " WHERE p.misuse IS NOT NULL AND p.is_reported = 0"
+        )
+        with self.reading() as file:
+            return [(label, detail) for label, detail in file.execute(query).fetchall()]
+
+    def reported(self, label: str) -> None:
+        """Note that the misuse of a machine's token was handled."""
+        with self.writing() as file:
+            query = "UPDATE plans SET is_reported = 1 WHERE token IN (SELECT id FROM tokens WHERE label = ?)"
+            file.execute(query, (label,))
 
     def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
         """Store what was issued for a token, and the response to a repeat of its request.
@@ -257,9 +336,11 @@ class Registry(TransactionFile):
         """Return the machine with this id, also a removed one."""
         return self._machine("SELECT id FROM machines WHERE id = ?", machine)
 
-    def machine_with(self, label: str) -> MachineRow | None:
-        """Return the member machine with this label."""
-        return self._machine("SELECT id FROM machines WHERE label = ? AND removed_unix_s IS NULL", label)
+    def machine_with(self, label: str, *, with_removed: bool = False) -> MachineRow | None:
+        """Return the member machine with this label, or else the one that was removed last."""
+        condition = "" if with_removed else " AND removed_unix_s IS NULL"
+        order = "ORDER BY removed_unix_s IS NULL DESC, id DESC LIMIT 1"
+        return self._machine(f"SELECT id FROM machines WHERE label = ?{condition} {order}", label)
 
     def machines(self, *, after: str = "", limit: int = 1 << 20, with_removed: bool = False) -> list[MachineRow]:
         """Return machines in the order of their labels, beginning after a label."""
