@@ -26,7 +26,7 @@ from typing import Annotated, ClassVar, Final, Literal, TypedDict
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.bootstrap.bundles import RobotDevices, robot_boot
-from fog.bootstrap.config import EnrolmentConfig, host_and_port
+from fog.bootstrap.config import EnrolmentConfig
 from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
@@ -34,7 +34,7 @@ from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.providers.skypilot.config import SkyPilotConfig
-from fog.software.config import SOFTWARE_PORT, SoftwareConfig
+from fog.software.config import SOFTWARE_PORT, SoftwareConfig, listening_host_port
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.config.config import LeaseSeconds, SwitchConfig
 from gdp.config.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
@@ -42,6 +42,7 @@ from gdp.crypto.certificates import Role
 from gdp.enrolment.domain_files import DomainConfig, DomainFiles
 from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
+from gdp.host_port import split_host_port
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, read_private, write_all
@@ -251,8 +252,8 @@ class Site:
     def software_listens(self) -> tuple[str, int]:
         """Return host and port on which the supervisor serves software; an empty host: every address."""
         if self.software.listen is not None:
-            return host_and_port(self.software.listen)
-        return "", host_and_port(self.software_address)[1]
+            return listening_host_port(self.software.listen)
+        return "", split_host_port(self.software_address)[1]
 
     @property
     def enrolment_socket(self) -> Path:

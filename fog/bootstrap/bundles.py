@@ -124,22 +124,19 @@ def node_names(plan: ClusterPlan) -> list[str]:
 
 def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, days: float) -> MachineBundle:
     """Enrol a gateway: a switch between its devices."""
-    switch = authority.enrol(Role.SWITCH, f"gateway-{label}", days=days)
+    switch = authority.enrol(Role.SWITCH, f"gateway-{label}", SWITCH, days=days)
     content = _yaml({**_who("switch"), "ports": [{"iface": iface} for iface in ifaces]})
-    return MachineBundle({**switch.below("switch"), "switch.yaml": content}, (_switch(),))
+    return MachineBundle({**switch, "switch.yaml": content}, (_switch(),))
 
 
 def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> MachineBundle:
     """Enrol the robot's side of a site without ``fog.yaml``: switch, RIB and proxy."""
-    members = {role: authority.enrol(role, "robot", days=days) for role in (Role.SWITCH, Role.RIB, Role.PROXY)}
-    watch = authority.enrol(Role.PROXY, "supervisor", days=days)
     attach = [devices.proxy, devices.rib, devices.watch]
     switch = {"ports": [{"iface": devices.uplink}], "attach": attach, "revocations": "revocations"}
-    files: dict[str, bytes] = {}
-    for role, enrolled in members.items():
-        files |= enrolled.below(role.value)
+    files = authority.enrol(Role.PROXY, "supervisor", "watch", days=days)
+    for role in (Role.SWITCH, Role.RIB, Role.PROXY):
+        files |= authority.enrol(role, "robot", role.value, days=days)
     files |= {
-        **watch.below("watch"),
         _OWNER: authority.owner_key.read_bytes(),
         "switch.yaml": _yaml({**_who("switch"), **switch}),
         "rib.yaml": _yaml({**_who("rib"), "iface": devices.rib}),

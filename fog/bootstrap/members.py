@@ -7,38 +7,22 @@ disk; machines generate their own keys, and join (``domain_members``).
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fog.cluster import ExportedInterface
-from gdp.crypto.certificates import Membership, Role
+from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, make_node
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
 from gdp.trust.right import Right
 
-__all__ = ["Authority", "Enrolled", "metadata_of", "right_of"]
+__all__ = ["Authority", "metadata_of", "right_of"]
 
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
 _CALLS: Final = (Right.SERVE, Right.CALL)
-
-
-@dataclass(frozen=True, slots=True)
-class Enrolled:
-    """New member on this host: a gateway, or a node of the robot's side.
-
-    Args:
-        files: contents of its directory, private.
-    """
-
-    member: Membership
-    files: Mapping[str, bytes]
-
-    def below(self, folder: str) -> dict[str, bytes]:
-        """Return its files with this folder prefixed to their names."""
-        return {f"{folder}/{name}": data for name, data in self.files.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +37,17 @@ class Authority:
     owner: Path
     scratch: Path | None = None
 
-    def enrol(self, role: Role, label: str, *, days: float) -> Enrolled:
-        """Return a new member whose keys are generated here.
+    def enrol(self, role: Role, label: str, folder: str, *, days: float) -> dict[str, bytes]:
+        """Return the files of a new member whose keys are generated here, private, by their paths below ``folder``.
 
         Raises:
             LocalError: the domain or the owner is missing, or the root certificate has expired.
         """
         with tempfile.TemporaryDirectory(prefix="gdp-fog-", dir=self.scratch) as scratch:
             node = Path(scratch) / "node"
-            identity = make_node(node, role, label, self.domain, days=days)
-            files = {str(path.relative_to(node)): path.read_bytes() for path in node.rglob("*") if path.is_file()}
-        return Enrolled(identity.member, files)
+            make_node(node, role, label, self.domain, days=days)
+            paths = [each for each in node.rglob("*") if each.is_file()]
+            return {f"{folder}/{each.relative_to(node)}": each.read_bytes() for each in paths}
 
     def grant_access(self, node: Path, delegations: Path, carried: Iterable[ExportedInterface], *, days: float) -> None:
         """Delegate to a node of the robot's side to use (call, read) interfaces; earlier delegations are replaced.

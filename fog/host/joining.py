@@ -19,7 +19,6 @@ from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
 from gdp.enrolment.domain_join import JoinRequest, join_domain
 from gdp.errors import LocalError
 from gdp.stores.files import read_private
-from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["join", "join_file"]
@@ -28,8 +27,6 @@ log = logging.getLogger(__name__)
 
 _DEADLINE_S: Final = 900.0  # the token has expired by then
 _KEYS: Final = "keys"  # until the machine has joined
-_PAUSE_MIN_S: Final = 0.2
-_PAUSE_MAX_S: Final = 5.0
 
 
 def join_file(token: JoinToken, label: str) -> bytes:
@@ -50,32 +47,19 @@ def join(home: Path, *, deadline_s: float = _DEADLINE_S, wait: Callable[[float],
     if not path.exists():
         return False
     if not member.exists():  # else it was stopped before the file was deleted
-        _join(_request(path, member, home / _KEYS), deadline_s, wait)
+        joined = join_domain(_request(path, member, home / _KEYS, deadline_s), wait=wait)
+        log.info("machine joined domain=%s nodes=%d", joined.root.label, len(joined.identities))
     shutil.rmtree(home / _KEYS, ignore_errors=True)
     path.unlink()
     return True
 
 
-def _request(path: Path, member: Path, keys: Path) -> JoinRequest:
+def _request(path: Path, member: Path, keys: Path, patience_s: float) -> JoinRequest:
     try:
         document = json.loads(read_private(path))
         token, label = str(document["token"]), str(document["label"])
     except (ValueError, KeyError, TypeError) as error:
         raise LocalError(f"{path}: token and label are expected: {error!r}") from error
-    return JoinRequest(token=JoinToken.from_text(token), label=label, directory=member, keys=keys)
-
-
-def _join(request: JoinRequest, deadline_s: float, wait: Callable[[float], None]) -> None:
-    end_s, pause_s = time.monotonic() + deadline_s, _PAUSE_MIN_S
-    while True:
-        try:
-            joined = join_domain(request)
-        except UnreachableError as error:
-            if time.monotonic() >= end_s:
-                raise
-            log.info("machine not joined yet reason=%s", error)
-            wait(pause_s)
-            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
-            continue
-        log.info("machine joined domain=%s nodes=%d", joined.root.label, len(joined.identities))
-        return
+    return JoinRequest(
+        token=JoinToken.from_text(token), label=label, directory=member, keys=keys, patience_s=patience_s
+    )

@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +36,7 @@ from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import DAY_S, admit, delegate, renew
 from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment_wire import (
@@ -61,13 +61,19 @@ __all__ = ["OPENED_MAX", "PAGE", "EnrolmentDesk", "MemberConnection", "refusal_o
 log = logging.getLogger(__name__)
 
 PAGE: Final = 64  # machines or mails in one response
-OPENED_MAX: Final = 64  # requests per token whose keys are verified; a machine needs one, or a few after losses
-_OPENED_TOKENS: Final = 1_024
+OPENED_MAX: Final = 64  # requests per token, an hour, whose keys are verified; a machine needs one, or a few
+_HOUR_S: Final = 3_600.0
 _PROOF_BYTES: Final = 32
 _EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
 _WHAT: Final = "enrolment"
 _KNOWN: Final = "somebody has read its user data"
-_MISUSES: Final = (Refusal.USED, Refusal.WRONG_NODES, Refusal.WRONG_PROOF, Refusal.IDENTITY_TAKEN)
+_MISUSES: Final = (
+    Refusal.USED,
+    Refusal.WRONG_NODES,
+    Refusal.WRONG_PROOF,
+    Refusal.IDENTITY_TAKEN,
+    Refusal.MALFORMED,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +114,7 @@ class EnrolmentDesk:
         self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
         self._border_certificate = b""
-        self._opened: OrderedDict[bytes, int] = OrderedDict()  # requests, by the id of their token
+        self._opened = TokenBuckets(OPENED_MAX / _HOUR_S, OPENED_MAX)  # requests, by the id of their token
 
     @property
     def root(self) -> Root:
@@ -133,21 +139,20 @@ class EnrolmentDesk:
             raise EnrolmentError(Refusal.USED, "this token was misused, and is good for nothing", token.label)
         try:
             return self._admitted(token, plan, fields, unix_s)
-        except EnrolmentError as error:
-            error.about = token.label
-            if plan is not None and error.code in _MISUSES:
-                self._registry.set_misused(token.id, self._misuse(token, error))
-            raise
-        except StatementError as error:
-            if plan is not None:
-                self._registry.set_misused(token.id, self._misuse(token, error))
+        except (EnrolmentError, StatementError) as error:
+            code = error.code if isinstance(error, EnrolmentError) else Refusal.MALFORMED
+            if plan is not None and code in _MISUSES:
+                self._registry.set_misused(token.id, self._misuse(token, code, error))
+            if isinstance(error, EnrolmentError):
+                error.about = token.label
             raise
 
     def _admitted(self, token: TokenRow, plan: Plan | None, fields: Fields, unix_s: float) -> Fields:
         role = JoinRole(token.role)
         if role.is_of_cluster and plan is None:
             raise EnrolmentError(Refusal.USED, "the launcher of this machine has withdrawn its token")
-        self._open(token.id)
+        if not self._opened.spend(token.id, time.monotonic()):
+            raise EnrolmentError(Refusal.UNAVAILABLE, "too many requests with this token")
         applications, holders = _applications(fields, role, token.id)
         label, keys = holders[0].label, _keys_digest(applications, holders)
         self._check_token(token, keys, label, unix_s)
@@ -186,23 +191,14 @@ class EnrolmentDesk:
         days = self._config.member_days
         return days if until_unix_s is None else min(days, (until_unix_s - unix_s) / DAY_S)
 
-    def _open(self, token: bytes) -> None:
-        """Count a request whose keys are verified. Raises ``EnrolmentError``: there were too many."""
-        self._opened[token] = opened = self._opened.pop(token, 0) + 1
-        if len(self._opened) > _OPENED_TOKENS:
-            self._opened.popitem(last=False)
-        if opened > OPENED_MAX:
-            raise EnrolmentError(Refusal.UNAVAILABLE, "too many requests with this token")
-
-    def _misuse(self, token: TokenRow, error: Exception) -> str:
+    def _misuse(self, token: TokenRow, code: Refusal | None, error: Exception) -> str:
         """Return for the launcher what happened with the token of one of its machines."""
-        if isinstance(error, EnrolmentError) and error.code is Refusal.USED:
-            machine = None if token.machine is None else self._registry.machine(token.machine)
-            first = machine.nodes[-1].name.to_text()[:16] if machine is not None and machine.nodes else ""
-            return f"{_KNOWN}: the token was used again with another key" + (
-                f"; enrolled first is {first}" if first else ""
-            )
-        return f"{_KNOWN}, and asked for what was not planned: {error}"
+        if code is not Refusal.USED:
+            return f"{_KNOWN}, and asked for what was not planned: {error}"
+        machine = None if token.machine is None else self._registry.machine(token.machine)
+        nodes = () if machine is None else machine.nodes
+        first = f"; enrolled first is {nodes[-1].name.to_text()[:16]}" if nodes else ""
+        return f"{_KNOWN}: the token was used again with another key{first}"
 
     def news(self, unix_s: float) -> dict[str, object]:
         """Return what every member follows: the root, roots of other domains, borders, the owner's key."""

@@ -49,8 +49,9 @@ log = logging.getLogger(__name__)
 _UNUSED: Final = "the token was not used"
 _TRUSTS_MAX: Final = 64
 _BORDERS_MAX: Final = 16
-_RETRY_S: Final = 30.0
-_RETRY_EACH_S: Final = 1.0
+_RETRY_S: Final = 30.0  # after a connection
+_PAUSE_MIN_S: Final = 0.2
+_PAUSE_MAX_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +64,7 @@ class JoinRequest:
         listen: UDP port of the tunnels; 0: any.
         keys: folder that keeps the keys until the caller removes it, so that a machine that is stopped meanwhile
             sends the same ones again; None: they are made for one call.
+        patience_s: how long a server that cannot be reached at all is tried again.
     """
 
     token: JoinToken
@@ -71,6 +73,7 @@ class JoinRequest:
     uplinks: Sequence[str] = ()
     listen: int = 0
     keys: Path | None = None
+    patience_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +101,7 @@ def join_domain(
 
     Raises:
         EnrolmentError: the server refused, is another domain's, or the clocks differ; nothing was left behind.
-        UnreachableError: no server answered for ``_RETRY_S``.
+        UnreachableError: no server answered in time.
         LocalError: the directory exists already, the label is not valid, or the disk is full.
     """
     if request.directory.exists() and (not request.directory.is_dir() or any(request.directory.iterdir())):
@@ -115,7 +118,7 @@ def join_domain(
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]
-        _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
+        _announce(request, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
         publish_draft(draft, request.directory)
     return Joined(
         root=root,
@@ -138,7 +141,7 @@ def _ask(request: JoinRequest, nodes: Sequence[NodeKeys], wait: Callable[[float]
         proof = join_proof(join_key(token.secret), channel.binding, channel.nonce, encode(untagged))
         return channel.request({**untagged, "mac": proof})
 
-    return _repeated(token, send, wait)
+    return _repeated(request, send, wait)
 
 
 def _node_keys(request: JoinRequest, draft: Path, folder: str, role: Role) -> NodeKeys:
@@ -155,29 +158,33 @@ def _node_keys(request: JoinRequest, draft: Path, folder: str, role: Role) -> No
     return load_node_keys(draft / folder)
 
 
-def _announce(token: JoinToken, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]) -> None:
+def _announce(
+    request: JoinRequest, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]
+) -> None:
     def send(channel: Channel) -> Fields:
         channel.identify(identity, secrets.token_bytes(INSTANCE_BYTES))
         return channel.request(fields)
 
-    _repeated(token, send, wait)
+    _repeated(request, send, wait)
 
 
 def _repeated(
-    token: JoinToken, send: Callable[[Channel], Fields], wait: Callable[[float], None]
+    request: JoinRequest, send: Callable[[Channel], Fields], wait: Callable[[float], None]
 ) -> tuple[Fields, Root, str]:
-    """Send a request until a response comes; a first server that cannot be reached at all is not waited for."""
-    end_s, has_connected = time.monotonic() + _RETRY_S, False
+    """Send a request until a response comes."""
+    token, patience_s = request.token, request.patience_s
+    begun_s, pause_s = time.monotonic(), _PAUSE_MIN_S
     while True:
         try:
             with connect_any(token.servers, token.root) as channel:
-                has_connected = True
+                patience_s = max(patience_s, _RETRY_S)
                 return send(channel), channel.root, channel.server
         except UnreachableError as error:
-            if not has_connected or time.monotonic() >= end_s:
+            if time.monotonic() >= begun_s + patience_s:
                 raise
             log.info("enrolment repeated reason=%s", error)
-            wait(_RETRY_EACH_S)
+            wait(pause_s)
+            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
 
 
 def _install(

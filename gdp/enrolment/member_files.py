@@ -42,7 +42,9 @@ class MemberConfig(Section):
     rib: Directory | None = Field(default=None, description="Directory of its RIB. `null`: none.")
     peers: Directory = Field(description="Directory of endpoint records.")
     servers: Annotated[tuple[Annotated[str, AfterValidator(checked_server)], ...], Unique] = Field(
-        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` or `unix:PATH` of the domain's enrolment servers."
+        min_length=1,
+        max_length=SERVERS_MAX,
+        description="`HOST:PORT` or `unix:PATH` of the domain's enrolment servers.",
     )
 
 
