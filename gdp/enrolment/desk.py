@@ -134,11 +134,11 @@ class EnrolmentDesk:
             StoreError, LocalError: files cannot be written now; the same request may be repeated.
         """
         token = self._proven_token(fields, binding, nonce)
-        plan = self._registry.plan_of(token.id)
+        plan = token.plan
         if plan is not None and plan.is_misused:
             raise EnrolmentError(Refusal.USED, "this token was misused, and is good for nothing", token.label)
         try:
-            return self._admitted(token, plan, fields, unix_s)
+            return self._admitted(token, fields, unix_s)
         except (EnrolmentError, StatementError) as error:
             code = error.code if isinstance(error, EnrolmentError) else Refusal.MALFORMED
             if plan is not None and code in _MISUSES:
@@ -147,8 +147,8 @@ class EnrolmentDesk:
                 error.about = token.label
             raise
 
-    def _admitted(self, token: TokenRow, plan: Plan | None, fields: Fields, unix_s: float) -> Fields:
-        role = JoinRole(token.role)
+    def _admitted(self, token: TokenRow, fields: Fields, unix_s: float) -> Fields:
+        role, plan = JoinRole(token.role), token.plan
         if role.is_of_cluster and plan is None:
             raise EnrolmentError(Refusal.USED, "the launcher of this machine has withdrawn its token")
         if not self._opened.spend(token.id, time.monotonic()):
@@ -280,8 +280,8 @@ class EnrolmentDesk:
             StatementError: malformed, or not issued here.
         """
         self._refuse_revoked(session.machine)
-        nodes = {each.name: each for each in self._member(session.machine).nodes}
-        end_s = self._registry.end_of(session.machine)
+        machine = self._member(session.machine)
+        nodes, end_s = {each.name: each for each in machine.nodes}, machine.end_unix_s
         wires, new = list[bytes](), list[Membership]()
         for wire in fields.byte_strings("certificates", MEMBERS_MAX):
             stranger = Unverified.from_wire(wire)

@@ -63,7 +63,8 @@ CREATE INDEX IF NOT EXISTS mailboxes ON mail (recipient, id);
 _MAILBOX: Final = "SELECT count(*), coalesce(sum(length(wire)), 0) FROM mail WHERE recipient = ?"
 _SAME_MACHINE: Final = "(SELECT name FROM nodes WHERE machine = (SELECT machine FROM nodes WHERE name = ?))"
 _MACHINE: Final = (
-    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double FROM machines m"
+    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double, p.until_unix_s"
+    " FROM machines m LEFT JOIN plans p ON p.machine = m.id"
 )
 
 
@@ -91,6 +92,7 @@ class TokenRow:
         label: the one that its machine must have; empty: any.
         keys: SHA-256 of the keys that used it; None: not used.
         answer: the response to these keys; None: not complete.
+        plan: of a launcher; None: there is none, or it was withdrawn.
     """
 
     id: bytes
@@ -102,6 +104,7 @@ class TokenRow:
     used_unix_s: float | None
     machine: int | None
     answer: bytes | None = field(repr=False)
+    plan: Plan | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,6 +126,7 @@ class MachineRow:
         seen_unix_s: when its agent was last connected; 0: never.
         removed_unix_s: when it was removed; None: it is a member.
         has_double: two machines were seen with its identity.
+        end_unix_s: when everything that is issued for it ends; None: no launcher planned that.
     """
 
     id: int
@@ -132,6 +136,7 @@ class MachineRow:
     seen_unix_s: float
     removed_unix_s: float | None
     has_double: bool
+    end_unix_s: float | None
     nodes: tuple[NodeRow, ...]
 
     @property
@@ -200,13 +205,14 @@ class Registry(TransactionFile):
     def find_token(self, identifier: bytes) -> TokenRow | None:
         """Return the token with this id."""
         query = (
-            "SELECT id, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer FROM tokens WHERE id = ?"
+            "SELECT t.id, mac, role, label, expires_unix_s, keys, used_unix_s, t.machine, answer, grants, until_unix_s,"
+            " misuse FROM tokens t LEFT JOIN plans p ON p.token = t.id WHERE t.id = ?"
         )
         with self.reading() as file:
             row = file.execute(query, (identifier,)).fetchone()
         if row is None:
             return None
-        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer = row
+        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer, *planned = row
         return TokenRow(
             id=id_,
             mac=mac,
@@ -217,6 +223,7 @@ class Registry(TransactionFile):
             used_unix_s=used_unix_s,
             machine=machine,
             answer=answer,
+            plan=None if planned[0] is None else _plan(*planned),
         )
 
     def use_token(self, identifier: bytes, keys: bytes, label: str, unix_s: float) -> int:
@@ -248,22 +255,6 @@ class Registry(TransactionFile):
         with self.writing() as file:
             file.execute("DELETE FROM plans WHERE token IN (SELECT id FROM tokens WHERE label = ?)", (label,))
             file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
-
-    def plan_of(self, identifier: bytes) -> Plan | None:
-        """Return the plan of a token's machine; None: there is none, or it was withdrawn."""
-        query = "SELECT grants, until_unix_s, misuse IS NOT NULL FROM plans WHERE token = ?"
-        with self.reading() as file:
-            row = file.execute(query, (identifier,)).fetchone()
-        if row is None:
-            return None
-        grants = [(Metadata(metadata), Right(right)) for metadata, right in json.loads(row[0])]
-        return Plan(grants=grants, until_unix_s=row[1], is_misused=bool(row[2]))
-
-    def end_of(self, machine: int) -> float | None:
-        """Return when everything that is issued for a machine ends (Unix time); None: no launcher planned that."""
-        with self.reading() as file:
-            row = file.execute("SELECT until_unix_s FROM plans WHERE machine = ?", (machine,)).fetchone()
-        return None if row is None else float(row[0])
 
     def set_misused(self, identifier: bytes, detail: str) -> None:
         """Invalidate the token of a planned machine, and report that once; an earlier report stays."""
@@ -440,7 +431,7 @@ class Registry(TransactionFile):
         found = file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
         if found is None:
             raise StoreError(f"{self.path}: a node of no machine")
-        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double = found
+        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double, end_unix_s = found
         rows = file.execute(
             "SELECT name, role, certificate, until_unix_s, card FROM nodes WHERE machine = ? ORDER BY rowid", (machine,)
         ).fetchall()
@@ -456,8 +447,14 @@ class Registry(TransactionFile):
             seen_unix_s=seen_unix_s,
             removed_unix_s=removed_unix_s,
             has_double=bool(has_double),
+            end_unix_s=end_unix_s,
             nodes=nodes,
         )
+
+
+def _plan(grants: str, until_unix_s: float, misuse: str | None) -> Plan:
+    named = [(Metadata(metadata), Right(right)) for metadata, right in json.loads(grants)]
+    return Plan(grants=named, until_unix_s=until_unix_s, is_misused=misuse is not None)
 
 
 def _refuse_removed(file: sqlite3.Connection, machine: int) -> None:
