@@ -1,4 +1,4 @@
-"""Record of a machine's credentials: holder, end of validity, and fingerprints for revocation.
+"""Record of a machine's credentials: holder and end of validity.
 
 Sans-I/O.
 """
@@ -17,9 +17,7 @@ class IssuedCredentials:
     Args:
         proxy: overlay name of the machine's proxy, 64 hex digits; empty: not enrolled yet.
         until_unix_s: end of validity of its certificates and delegations.
-        fingerprints: of its memberships, in hex, for their revocation.
     """
 
     proxy: str
     until_unix_s: float
-    fingerprints: tuple[str, ...] = ()

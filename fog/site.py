@@ -5,7 +5,7 @@ I/O. ``fog.yaml`` describes it; without this file a self-contained site is creat
     state/  site.json                 its id, which devices and runs carry
             domain/ owner/            keys, as of ``gdp lab``
             robot/                    bundle of the robot's side: switch, RIB, proxy; keys of the supervisor's watch
-            enrolment/                enrolment tickets of machines, and the responder's key
+            enrolment/                registry and socket of the enrolment server for machines of this host
             journal.sqlite3  supervisor.*  site.lock
 """
 
@@ -26,7 +26,7 @@ from typing import Annotated, ClassVar, Final, Literal, TypedDict
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.bootstrap.bundles import RobotDevices, robot_boot
-from fog.bootstrap.config import EnrolmentConfig, host_and_port
+from fog.bootstrap.config import EnrolmentConfig
 from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
@@ -34,14 +34,15 @@ from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.providers.skypilot.config import SkyPilotConfig
-from fog.software.config import SOFTWARE_PORT, SoftwareConfig
+from fog.software.config import SOFTWARE_PORT, SoftwareConfig, listening_host_port
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.config.config import LeaseSeconds, SwitchConfig
 from gdp.config.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.crypto.certificates import Role
-from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.domain_files import DomainConfig, DomainFiles
 from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
+from gdp.host_port import split_host_port
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, read_private, write_all
@@ -102,7 +103,7 @@ class SiteConfig(Section):
     lease_s: LeaseSeconds = Field(
         default=ADVERTISEMENT_LEASE_S, description="Lease of the machines' advertisements, in seconds."
     )
-    enrolment: EnrolmentConfig = Field(default=EnrolmentConfig(), description="`local`: enrolment of machines.")
+    enrolment: EnrolmentConfig = Field(default=EnrolmentConfig(), description="Enrolment of machines.")
     software: SoftwareConfig = Field(
         default=SoftwareConfig(), description="What rented machines fetch from the supervisor."
     )
@@ -251,23 +252,37 @@ class Site:
     def software_listens(self) -> tuple[str, int]:
         """Return host and port on which the supervisor serves software; an empty host: every address."""
         if self.software.listen is not None:
-            return host_and_port(self.software.listen)
-        return "", host_and_port(self.software_address)[1]
-
-    @property
-    def enrolment_folder(self) -> Path:
-        """Return the folder of tickets, and of the socket for machines of this host."""
-        return self.state / "enrolment"
-
-    @property
-    def enrolment_url(self) -> str:
-        """Return the address of enrolment that tickets contain."""
-        return f"unix:{self.enrolment_socket}"
+            return listening_host_port(self.software.listen)
+        return "", split_host_port(self.software_address)[1]
 
     @property
     def enrolment_socket(self) -> Path:
-        """Return the socket for machines of this host."""
-        return self.enrolment_folder / "socket"
+        """Return the socket of the enrolment server for machines of this host."""
+        return self.state / "enrolment" / "socket"
+
+    @property
+    def domain_files(self) -> DomainFiles:
+        """Return the files of the domain that machines join: the border's, or those of a server for this host.
+
+        Raises:
+            ConfigError, LocalError: there is no border's domain, or a folder cannot be made.
+        """
+        if self.border is not None:
+            return DomainFiles.load(self.border)
+        folder = self.enrolment_socket.parent
+        write_all(folder, {})
+        config = DomainConfig.model_construct(  # its paths were checked as those of the site
+            domain=self.authority.domain,
+            owner=self.authority.owner,
+            switch=None,
+            state=folder,
+            peers=folder,
+            revocations=folder / "revocations" if self.revocations is None else self.revocations[0],
+            listen=0,
+            servers=(f"unix:{self.enrolment_socket}",),
+            member_days=self.credential_days,
+        )
+        return DomainFiles(directory=folder, config=config)
 
     @property
     def latencies(self) -> Latencies:

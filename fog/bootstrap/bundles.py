@@ -1,8 +1,7 @@
 """Bootstrap bundles of a cluster's machines, of gateways and of the robot's side: their files and programs.
 
-I/O, through ``members``. A machine's bundle contains no key, only the ticket with which a machine of this host enrols,
-or the token with which a rented one joins the border's domain. Every file refers to others by relative paths, so a
-bundle works in any folder.
+I/O, through ``members``. A machine's bundle contains no key, only the token with which it joins the domain. Every file
+refers to others by relative paths, so a bundle works in any folder.
 Errors are those of ``Authority.enrol``.
 ::
 
@@ -22,19 +21,17 @@ from typing import Final
 import yaml
 
 from fog.bootstrap.members import Authority
-from fog.bootstrap.tickets import PlannedSeat
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
-from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER, TICKET_FILE
+from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
 from fog.host.joining import join_file
 from fog.machine import MachineBundle, Program
 from gdp.crypto.certificates import Role
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.stores.keyring import DELEGATIONS
-from gdp.trust.bootstrap_ticket import Seat, Ticket
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["PROXY", "SWITCH", "RobotDevices", "gateway_boot", "joining_boot", "machine_boot", "machine_label"]
-__all__ += ["machine_seats", "node_names", "robot_boot", "robot_rule"]
+__all__ = ["PROXY", "SWITCH", "RobotDevices", "gateway_boot", "machine_boot", "machine_label"]
+__all__ += ["node_names", "robot_boot", "robot_rule"]
 
 PROXY: Final = "proxy"
 SWITCH: Final = "switch"
@@ -75,72 +72,27 @@ def machine_label(cluster: str, name: str) -> str:
     return f"{cluster}-{name}"
 
 
-def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> tuple[PlannedSeat, PlannedSeat]:
-    """Return the planned seats of a machine: a leaf, and a proxy that serves the exported interfaces.
-
-    Args:
-        is_gateway: it may become the gateway of its group. Its switch is then not a leaf, because it carries transit
-            traffic.
-    """
-    title = machine_label(plan.name, name)
-    switch = Seat(SWITCH, Role.SWITCH if is_gateway else Role.LEAF, title)
-    return PlannedSeat(switch), PlannedSeat(Seat(PROXY, Role.PROXY, title), plan.carried)
-
-
 def machine_boot(
-    authority: Authority,
-    plan: ClusterPlan,
-    name: str,
-    command: Callable[[CloudNode], Sequence[str]],
-    ticket: Ticket,
-    *,
-    iface: str,
-    lease_s: float = ADVERTISEMENT_LEASE_S,
-    uplink: str = "",
-    software: Mapping[str, bytes] | None = None,
-) -> MachineBundle:
-    """Return the bootstrap bundle of a machine of this host; its only secret is the ticket's token.
-
-    Args:
-        uplink: device that the machine has while it is the gateway of its group; empty: it never is the gateway.
-        software: further files, by which the machine fetches its software.
-    """
-    ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
-    proxy = {**_who(PROXY), "delegations": f"{PROXY}/{DELEGATIONS}"}
-    files = {
-        TICKET_FILE: ticket.to_json(),
-        _OWNER: authority.owner_key.read_bytes(),
-        _PROFILE: _OFTEN,
-        **(software or {}),
-        "switch.yaml": _yaml({**_who("switch"), "ports": ports, "attach": [_PROXY_IFACE], "table_max": _TABLE_MAX}),
-        "proxy.yaml": _yaml(_serving_proxy(proxy, plan, name, _OWNER, lease_s)),
-    }
-    environment = _environment(plan, name) | _UDP_ONLY
-    return MachineBundle(files, (*_nodes(plan, command, environment), _switch(), _proxy(environment)))
-
-
-def joining_boot(
     plan: ClusterPlan,
     name: str,
     command: Callable[[CloudNode], Sequence[str]],
     token: JoinToken,
     *,
+    iface: str = "",
+    uplink: str = "",
     lease_s: float = ADVERTISEMENT_LEASE_S,
     has_relay: bool = False,
     software: Mapping[str, bytes] | None = None,
 ) -> MachineBundle:
-    """Return the bootstrap bundle of a machine that joins the border's domain; its only secret is the token.
+    """Return the bootstrap bundle of a machine that joins a domain; its only secret is the token.
 
     Args:
-        has_relay: the border relays through TLS; the machine then runs the member's end of it, too.
+        iface: device of a machine of this host; empty: a rented one, which has a tunnel to the border, and an agent.
+        uplink: device that a machine of this host has while it is the gateway of its group; empty: it never is.
+        has_relay: the border relays through TLS; a rented machine then runs the member's end of it, too.
         software: further files, by which the machine fetches its software.
     """
-    identity = f"{MEMBER_FOLDER}/{PROXY}"
-    proxy = {
-        "identity": identity,
-        "domain": {"root": f"{identity}/root.crt"},
-        "delegations": f"{identity}/{DELEGATIONS}",
-    }
+    proxy = {**_who(f"{MEMBER_FOLDER}/{PROXY}"), "delegations": f"{MEMBER_FOLDER}/{PROXY}/{DELEGATIONS}"}
     files = {
         JOIN_FILE: join_file(token, machine_label(plan.name, name)),
         _PROFILE: _OFTEN,
@@ -148,6 +100,12 @@ def joining_boot(
         "proxy.yaml": _yaml(_serving_proxy(proxy, plan, name, f"{MEMBER_FOLDER}/{_OWNER}", lease_s)),
     }
     environment = _environment(plan, name)
+    if iface:
+        ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
+        switch = {**_who(f"{MEMBER_FOLDER}/{SWITCH}"), "ports": ports}
+        files["switch.yaml"] = _yaml({**switch, "attach": [_PROXY_IFACE], "table_max": _TABLE_MAX})
+        environment |= _UDP_ONLY
+        return MachineBundle(files, (*_nodes(plan, command, environment), _switch(), _proxy(environment)))
     relay = [_member_program("relay", "gdp.cli.relay", "--config", "relay.yaml")] if has_relay else []
     programs = (
         *_nodes(plan, command, environment),
@@ -166,22 +124,19 @@ def node_names(plan: ClusterPlan) -> list[str]:
 
 def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, days: float) -> MachineBundle:
     """Enrol a gateway: a switch between its devices."""
-    switch = authority.enrol(Role.SWITCH, f"gateway-{label}", days=days)
+    switch = authority.enrol(Role.SWITCH, f"gateway-{label}", SWITCH, days=days)
     content = _yaml({**_who("switch"), "ports": [{"iface": iface} for iface in ifaces]})
-    return MachineBundle({**switch.below("switch"), "switch.yaml": content}, (_switch(),))
+    return MachineBundle({**switch, "switch.yaml": content}, (_switch(),))
 
 
 def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> MachineBundle:
     """Enrol the robot's side of a site without ``fog.yaml``: switch, RIB and proxy."""
-    members = {role: authority.enrol(role, "robot", days=days) for role in (Role.SWITCH, Role.RIB, Role.PROXY)}
-    watch = authority.enrol(Role.PROXY, "supervisor", days=days)
     attach = [devices.proxy, devices.rib, devices.watch]
     switch = {"ports": [{"iface": devices.uplink}], "attach": attach, "revocations": "revocations"}
-    files: dict[str, bytes] = {}
-    for role, enrolled in members.items():
-        files |= enrolled.below(role.value)
+    files = authority.enrol(Role.PROXY, "supervisor", "watch", days=days)
+    for role in (Role.SWITCH, Role.RIB, Role.PROXY):
+        files |= authority.enrol(role, "robot", role.value, days=days)
     files |= {
-        **watch.below("watch"),
         _OWNER: authority.owner_key.read_bytes(),
         "switch.yaml": _yaml({**_who("switch"), **switch}),
         "rib.yaml": _yaml({**_who("rib"), "iface": devices.rib}),

@@ -1,24 +1,20 @@
-"""Machines of a cluster as members of the border's domain: their tokens, delegations and removal.
+"""Machines of a cluster as members of a domain: their tokens, what they become, and removal.
 
-I/O, on the border: the domain's registry and the owner's keys. Delegations go as mail through the enrolment server to
-the machine's agent, which installs them. A token admits one leaf switch and one proxy with the machine's label, once.
+I/O, on the host of the domain's registry. A token has the role of the planned machine: the enrolment server admits one
+switch and one proxy with its label, once, and delegates to the proxy what the plan states.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 
 from fog.bootstrap.members import metadata_of, right_of
 from fog.cluster import ExportedInterface
 from gdp.crypto.certificates import Role
-from gdp.enrolment.agent import DELEGATION_KIND
 from gdp.enrolment.create import make_token
-from gdp.enrolment.domain_client import DomainClient
 from gdp.enrolment.domain_files import DomainFiles
-from gdp.enrolment.registry import MachineRow, Registry
+from gdp.enrolment.registry import MachineRow, Plan, Registry
 from gdp.enrolment.removal import remove_machine
-from gdp.stores.issue import DAY_S, delegate
 from gdp.trust.join_token import JoinRole, JoinToken
 from gdp.trust.node_descriptor import NodeDescriptor
 
@@ -26,29 +22,50 @@ __all__ = ["DomainMembers"]
 
 
 class DomainMembers:
-    """Members of the domain whose directory ``gdp domain create`` made on this host.
+    """Members of the domain with these files on this host.
 
     Raises:
-        LocalError, ConfigError: no domain was created there.
         StoreError: the registry cannot be opened or read now; every method may raise this too.
     """
 
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
-        self._files = DomainFiles.load(directory)
-        self._registry = Registry(self._files.config.state)
+    def __init__(self, files: DomainFiles) -> None:
+        self._files = files
+        self._registry = Registry(files.config.state)
 
     def close(self) -> None:
         """Close the registry."""
         self._registry.close()
 
-    def issue_token(self, label: str, *, valid_s: float, unix_s: float) -> JoinToken:
+    def issue_token(
+        self,
+        label: str,
+        carried: Iterable[ExportedInterface],
+        *,
+        is_gateway: bool = False,
+        valid_s: float,
+        until_unix_s: float,
+        unix_s: float,
+    ) -> JoinToken:
         """Return a token with which one machine of this label joins once.
+
+        Args:
+            carried: what the machine's proxy may provide (serve, publish).
+            is_gateway: it may become the gateway of its group. Its switch is then not a leaf, because it carries
+                transit traffic.
+            until_unix_s: end of validity of everything issued for it.
 
         Raises:
             LocalError: another machine has the label, or the domain's files cannot be read.
         """
-        return make_token(self._files, JoinRole.ROBOT, valid_s=valid_s, label=label, unix_s=unix_s)
+        grants = [(metadata_of(each), right_of(each, gives=True)) for each in carried]
+        return make_token(
+            self._files,
+            JoinRole.GATEWAY if is_gateway else JoinRole.MACHINE,
+            valid_s=valid_s,
+            label=label,
+            unix_s=unix_s,
+            plan=Plan(grants=grants, until_unix_s=until_unix_s),
+        )
 
     @property
     def has_relay(self) -> bool:
@@ -60,41 +77,25 @@ class DomainMembers:
         row = self._registry.machine_with(label)
         return None if row is None else _joined(row)
 
-    def delegate(
-        self, proxy: NodeDescriptor, carried: Iterable[ExportedInterface], *, until_unix_s: float, unix_s: float
-    ) -> None:
-        """Send a machine delegations to provide (serve, publish) the exported interfaces.
+    def misuses(self) -> list[tuple[str, str]]:
+        """Return label and detail of each token that somebody else knows, until it is ``reported``."""
+        return self._registry.misuses()
 
-        Raises:
-            EnrolmentError: the enrolment server cannot be reached, or refuses.
-            LocalError: the owner's keys cannot be read.
-        """
-        days = (until_unix_s - unix_s) / DAY_S
-        given = [
-            delegate(
-                self._files.config.owner,
-                proxy,
-                metadata_of(each),
-                [right_of(each, gives=True)],
-                days=days,
-                unix_s=unix_s,
-            )
-            for each in carried
-        ]
-        with DomainClient.open(self._directory) as client:
-            for each in given:
-                client.send(proxy.name, DELEGATION_KIND, each.to_wire())
+    def reported(self, label: str) -> None:
+        """Note that the misuse of a machine's token was handled."""
+        self._registry.reported(label)
 
     def remove(self, label: str, *, unix_s: float) -> bool:
-        """Withdraw a machine's token, and remove the machine from the domain; return whether it was a member.
+        """Withdraw a machine's token, and remove the machine from the domain; return whether it ever was a member.
 
-        Its memberships are revoked, and its endpoint record leaves the border's peers, which closes the tunnel.
+        Its memberships are revoked, and its endpoint record leaves the border's peers, which closes the tunnel. A
+        repeat completes an interrupted removal.
 
         Raises:
             LocalError: the domain's files cannot be read or written.
         """
         self._registry.withdraw_tokens(label)
-        if self._registry.machine_with(label) is None:
+        if self._registry.machine_with(label, with_removed=True) is None:
             return False
         remove_machine(self._files, label, unix_s=unix_s)
         return True

@@ -107,15 +107,16 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
 
 
 def _remove_members(site: Site, cluster: str, machines: Sequence[str], now_s: float) -> None:
-    """Remove machines from the border's domain that no supervisor has removed."""
-    if site.border is None or not machines:
+    """Remove machines from the domain that no supervisor has removed."""
+    if not machines:
         return
     from fog.bootstrap.bundles import machine_label
     from fog.bootstrap.domain_members import DomainMembers
+    from fog.supervisor.machine_credentials import remove_member
 
-    with closing(DomainMembers(site.border)) as members:
+    with closing(DomainMembers(site.domain_files)) as members:
         for each in machines:
-            members.remove(machine_label(cluster, each), unix_s=now_s)
+            remove_member(site, members, machine_label(cluster, each), now_s)
 
 
 def _release(site: Site, name: str) -> int:

@@ -15,12 +15,11 @@ from fog.machine import MachineBundle, Program
 from gdp.errors import LocalError
 from gdp.stores.files import private, write_all
 
-__all__ = ["BOOT_FILE", "JOIN_FILE", "MEMBER_FOLDER", "TICKET_FILE", "install", "pack", "read_programs", "unpack"]
+__all__ = ["BOOT_FILE", "JOIN_FILE", "MEMBER_FOLDER", "install", "pack", "read_programs", "unpack"]
 
 BOOT_FILE: Final = "boot.json"
-TICKET_FILE: Final = "enrolment.json"  # until the machine has enrolled
 JOIN_FILE: Final = "join.json"  # token and label, until the machine has joined
-MEMBER_FOLDER: Final = "member"  # what `gdp join` makes
+MEMBER_FOLDER: Final = "member"  # keys and, of a rented machine, what else `gdp join` makes
 
 
 def pack(boot: MachineBundle) -> dict[str, bytes]:

@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from fog.host.agent import MachineAgent
-from fog.host.bundle import JOIN_FILE, TICKET_FILE
+from fog.host.bundle import JOIN_FILE
 from gdp.cli.node import Logs, report, running
 from gdp.cli.program import Program
 
@@ -41,8 +41,8 @@ def machine(
     logs: Logs,
     await_go: AwaitGo = False,
 ) -> None:
-    """Be a machine of a cluster: enrol if there is a ticket, join if there is a token, run the programs of boot.json
-    until SIGTERM. SIGUSR1 drains it first.
+    """Be a machine of a cluster: join if there is a token, run the programs of boot.json until SIGTERM. SIGUSR1
+    drains it first.
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
@@ -52,7 +52,7 @@ def machine(
             log.warning("no start command came, so no record of this machine exists")
             raise typer.Exit(1)
         reason = ""
-        if (home / TICKET_FILE).exists() or (home / JOIN_FILE).exists():
+        if (home / JOIN_FILE).exists():
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # until the agent handles them
             reason = _become_member(home.resolve())
         reason = reason or asyncio.run(host.run())
@@ -60,25 +60,20 @@ def machine(
 
 
 def _become_member(home: Path) -> str:
-    """Enrol with the ticket, or join with the token; return why the machine never can; empty: it has.
+    """Join with the token; return why the machine never can; empty: it has.
 
     A machine whose token is used, unknown or expired ends, so that another one replaces it. Later starts do not need
     these imports.
     """
-    if (home / TICKET_FILE).exists():
-        from fog.host.enrolment import enrol
+    from fog.host.joining import join
+    from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 
-        enrol(home)
-    if (home / JOIN_FILE).exists():
-        from fog.host.joining import join
-        from gdp.trust.enrolment_wire import EnrolmentError, Refusal
-
-        try:
-            join(home)
-        except EnrolmentError as error:
-            if error.code not in (Refusal.USED, Refusal.UNKNOWN_TOKEN, Refusal.EXPIRED):
-                raise
-            return f"the domain refuses it: {error}"
+    try:
+        join(home)
+    except EnrolmentError as error:
+        if error.code not in (Refusal.USED, Refusal.UNKNOWN_TOKEN, Refusal.EXPIRED):
+            raise
+        return f"the domain refuses it: {error}"
     return ""
 
 

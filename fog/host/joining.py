@@ -1,13 +1,15 @@
-"""Joining of a machine at its first start: it becomes a member of the border's domain with its token.
+"""Joining of a machine at its first start: it becomes a member of the domain with its token.
 
-I/O. It does what ``gdp join --no-start`` does: keys are made here, and the domain's root is pinned by the token.
-Afterwards the file with the token is deleted; a machine without one does not join.
+I/O. It does what ``gdp join --no-start`` does: keys are made here, and the domain's root is pinned by the token. Keys
+are on disk before they are sent, so a restarted machine uses the same keys. Afterwards the file with the token is
+deleted; a machine without one does not join.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,10 +17,8 @@ from typing import Final
 
 from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
 from gdp.enrolment.domain_join import JoinRequest, join_domain
-from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import LocalError
 from gdp.stores.files import read_private
-from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["join", "join_file"]
@@ -26,8 +26,7 @@ __all__ = ["join", "join_file"]
 log = logging.getLogger(__name__)
 
 _DEADLINE_S: Final = 900.0  # the token has expired by then
-_PAUSE_MIN_S: Final = 0.2
-_PAUSE_MAX_S: Final = 5.0
+_KEYS: Final = "keys"  # until the machine has joined
 
 
 def join_file(token: JoinToken, label: str) -> bytes:
@@ -47,32 +46,20 @@ def join(home: Path, *, deadline_s: float = _DEADLINE_S, wait: Callable[[float],
     path, member = home / JOIN_FILE, home / MEMBER_FOLDER
     if not path.exists():
         return False
-    if not (member / MEMBER_FILE).exists():  # else it was stopped before the file was deleted
-        _join(_request(path, member), deadline_s, wait)
+    if not member.exists():  # else it was stopped before the file was deleted
+        joined = join_domain(_request(path, member, home / _KEYS, deadline_s), wait=wait)
+        log.info("machine joined domain=%s nodes=%d", joined.root.label, len(joined.identities))
+    shutil.rmtree(home / _KEYS, ignore_errors=True)
     path.unlink()
     return True
 
 
-def _request(path: Path, member: Path) -> JoinRequest:
+def _request(path: Path, member: Path, keys: Path, patience_s: float) -> JoinRequest:
     try:
         document = json.loads(read_private(path))
         token, label = str(document["token"]), str(document["label"])
     except (ValueError, KeyError, TypeError) as error:
         raise LocalError(f"{path}: token and label are expected: {error!r}") from error
-    return JoinRequest(token=JoinToken.from_text(token), label=label, directory=member)
-
-
-def _join(request: JoinRequest, deadline_s: float, wait: Callable[[float], None]) -> None:
-    end_s, pause_s = time.monotonic() + deadline_s, _PAUSE_MIN_S
-    while True:
-        try:
-            joined = join_domain(request)
-        except UnreachableError as error:
-            if time.monotonic() >= end_s:
-                raise
-            log.info("machine not joined yet reason=%s", error)
-            wait(pause_s)
-            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
-            continue
-        log.info("machine joined domain=%s nodes=%d", joined.root.label, len(joined.identities))
-        return
+    return JoinRequest(
+        token=JoinToken.from_text(token), label=label, directory=member, keys=keys, patience_s=patience_s
+    )

@@ -254,11 +254,7 @@ def _record(items: dict[str, object]) -> Record:
                     wanted["is_spot"],
                     wanted.get("may_be_on_demand", False),
                 ),
-                issued_credentials=IssuedCredentials(
-                    issued_credentials["proxy"],
-                    issued_credentials["until_unix_s"],
-                    tuple(issued_credentials["fingerprints"]),
-                ),
+                issued_credentials=IssuedCredentials(issued_credentials["proxy"], issued_credentials["until_unix_s"]),
                 state=MachineState(rest["state"]),
                 ending=None if rest["ending"] is None else Outcome(rest["ending"]),
             )

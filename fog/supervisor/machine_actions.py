@@ -25,7 +25,7 @@ from fog.supervisor.core.record import Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
-from fog.supervisor.machine_credentials import CredentialIssuer
+from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.placement import place, stopgap
 from gdp.errors import LocalError
 
@@ -72,7 +72,7 @@ class MachineActions:
         site: Site,
         journal: Journal,
         events: EventLog,
-        credentials: CredentialIssuer,
+        credentials: MachineCredentials,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         wake: Callable[[], None],

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,9 +19,6 @@ from types import FrameType
 from typing import Final
 
 from fog.bootstrap.domain_members import DomainMembers
-from fog.bootstrap.listener import Listener, bind_tcp, bind_unix
-from fog.bootstrap.responder import Responder
-from fog.bootstrap.tickets import Tickets
 from fog.site import Site, topology_now
 from fog.software.server import SoftwareServer
 from fog.supervisor.background import held
@@ -31,10 +29,12 @@ from fog.supervisor.snapshot import supervisor_snapshot
 from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch
 from fog.topology import Gateway
-from gdp.errors import StoreError
+from gdp.enrolment.server import bind_unix, serve_domain_in_thread
+from gdp.errors import LocalError, StoreError
 from gdp.host.processes import Process
 from gdp.host.service_notifier import service_notifier
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.ports.listening import listen_tcp
 
 __all__ = ["supervise"]
 
@@ -58,24 +58,22 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
         held(site, lock),
         closing(Journal(site.journal)) as journal,
         service_notifier() as notifier,
-        _enrolment(site) as enrolment,
+        _members(site) as members,
         _software(site, timeouts.boot_s) as software,
     ):
-        _run(site, journal, enrolment, timeouts, software, notifier.beat, stays=stays)
+        _run(site, journal, members, timeouts, software, notifier.beat, stays=stays)
 
 
 @contextmanager
-def _enrolment(site: Site) -> Iterator[Tickets | DomainMembers]:
-    """Yield how machines become members: by tickets on this host, served while within, or by joining the domain."""
-    if site.border is not None:
-        with closing(DomainMembers(site.border)) as members:
-            yield members
-        return
-    with (
-        closing(Tickets(site.enrolment_folder)) as tickets,
-        closing(Listener(bind_unix(site.enrolment_socket), Responder(tickets, site.authority))),
-    ):
-        yield tickets
+def _members(site: Site) -> Iterator[DomainMembers]:
+    """Yield the domain's members; the enrolment server runs while within, unless a border runs it."""
+    files = site.domain_files
+    with ExitStack() as stack:
+        members = stack.enter_context(closing(DomainMembers(files)))
+        if site.border is None:
+            listening = bind_unix(site.enrolment_socket, socket.SOCK_STREAM)
+            stack.enter_context(serve_domain_in_thread(files, listening))
+        yield members
 
 
 @contextmanager
@@ -84,7 +82,11 @@ def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[st
     if site.provider == "local" or site.software.is_empty:
         yield dict
         return
-    listening = bind_tcp(*site.software_listens)
+    host, port = site.software_listens
+    try:
+        listening = listen_tcp(host, port)
+    except OSError as error:
+        raise LocalError(f"software: listen on {host or '*'}:{port}: {error.strerror or error}") from error
     with ExitStack() as stack:
         stack.callback(listening.close)
         url = f"https://{site.software_address}"
@@ -96,7 +98,7 @@ def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[st
 def _run(
     site: Site,
     journal: Journal,
-    enrolment: Tickets | DomainMembers,
+    members: DomainMembers,
     timeouts: Timeouts,
     software: Callable[[], Mapping[str, bytes]],
     beat: Callable[[], None],
@@ -110,7 +112,7 @@ def _run(
     supervisor = Supervisor(
         site=site,
         journal=journal,
-        enrolment=enrolment,
+        members=members,
         provider=provider,
         command=partial(command_of, site),
         heard=watch.serving_proxies if watch is not None else lambda: None,

@@ -15,7 +15,6 @@ from typing import Final, TypeAlias
 
 from fog.bootstrap.domain_members import DomainMembers
 from fog.bootstrap.members import metadata_of
-from fog.bootstrap.tickets import Tickets
 from fog.cluster import CloudNode, ClusterPlan
 from fog.machine import Machine, MachineState
 from fog.providers.provider import Provider
@@ -26,10 +25,9 @@ from fog.supervisor.core.record import Record, update_record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
-from fog.supervisor.join_credentials import JoinCredentials
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
-from fog.supervisor.machine_credentials import CredentialIssuer, MachineCredentials
+from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
 from gdp.errors import GdpError
@@ -50,7 +48,7 @@ class Supervisor:
     """Supervisor that keeps the clusters of a site in their desired state; ``StoreError``: the journal is unusable.
 
     Args:
-        enrolment: tickets for machines of this host, or the border's domain, which rented machines join.
+        members: of the domain, which machines join.
         heard: servers that the overlay reports; None: the overlay cannot be queried.
         software: returns the files by which a new machine fetches its software.
     """
@@ -60,7 +58,7 @@ class Supervisor:
         *,
         site: Site,
         journal: Journal,
-        enrolment: Tickets | DomainMembers,
+        members: DomainMembers,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         heard: Callable[[], Heard | None],
@@ -75,11 +73,7 @@ class Supervisor:
         self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
         self._woken = threading.Event()
         self._events = EventLog(journal)
-        self._credentials: CredentialIssuer
-        if isinstance(enrolment, Tickets):
-            self._credentials = MachineCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
-        else:
-            self._credentials = JoinCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
+        self._credentials = MachineCredentials(site, journal, self._events, members, boot_s=patience.boot_s)
         self._actions = MachineActions(
             site=site,
             journal=journal,

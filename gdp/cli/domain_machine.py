@@ -109,8 +109,9 @@ def token(
       gdp domain token lab
       gdp domain token lab --role switch --valid 1d --label gateway
     """
-    if role not in [each.value for each in JoinRole]:
-        raise LocalError(f"domain token: --role is {', '.join(each.value for each in JoinRole)}, not {role!r}")
+    roles = [each.value for each in JoinRole if not each.is_of_cluster]
+    if role not in roles:
+        raise LocalError(f"domain token: --role is {', '.join(roles)}, not {role!r}")
     files = DomainFiles.load(directory_of(name, directory))
     made = make_token(files, JoinRole(role), valid_s=duration_s(valid), label=label)
     until = moment(made.expires_unix_s)

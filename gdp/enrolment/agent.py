@@ -53,10 +53,9 @@ from gdp.stores.keyring import (
     parsed,
     save_identity,
 )
-from gdp.trust.bootstrap_ticket import MEMBERS_MAX
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, MEMBERS_MAX, EnrolmentError, UnreachableError
 from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]

@@ -11,6 +11,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Root
@@ -19,6 +20,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.server_certificate import channel_binding, verify_server_certificate
 from gdp.errors import StatementError
 from gdp.host_port import split_host_port
+from gdp.management.control_socket import connect_control
 from gdp.relay.client_hello import ENROLMENT_ALPN
 from gdp.trust.enrolment_wire import (
     CLOCKS_APART_MAX_S,
@@ -59,7 +61,7 @@ class Channel:
     Attributes:
         root: the domain's, as the server sent it; its founder has the expected fingerprint.
         binding, nonce: what proofs of this connection's client are bound to.
-        server: ``host:port``.
+        server: ``host:port``, or ``unix:`` and a path.
     """
 
     def __init__(self, peer: ssl.SSLSocket, root: Root, *, binding: bytes, nonce: bytes, server: str) -> None:
@@ -151,8 +153,7 @@ def connect(
     end_s = time.monotonic() + timeout_s
     with contextlib.ExitStack() as stack:
         try:
-            plain = stack.enter_context(socket.create_connection(split_host_port(server), timeout=timeout_s))
-            plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            plain = stack.enter_context(_connected(server, timeout_s))
             peer = stack.enter_context(client_context().wrap_socket(plain))
             greeting = _receive(peer, end_s, _GREETING_MAX_BYTES)
         except ssl.SSLError as error:
@@ -165,6 +166,14 @@ def connect(
         channel = _verified(peer, certificate, greeting, fingerprint, server, clock())
         stack.pop_all()
         return channel
+
+
+def _connected(server: str, timeout_s: float) -> socket.socket:
+    if server.startswith("unix:"):
+        return connect_control(Path(server.removeprefix("unix:")), timeout_s)
+    peer = socket.create_connection(split_host_port(server), timeout=timeout_s)
+    peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return peer
 
 
 def _verified(

@@ -19,11 +19,12 @@ from gdp.crypto.identity import Identity
 from gdp.enrolment.domain_files import DOMAIN_FILE, HANDOVER_SOCKET, MEMBER_DAYS, DomainFiles
 from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, write_configuration
-from gdp.enrolment.registry import Registry
+from gdp.enrolment.registry import Plan, Registry
 from gdp.errors import LocalError
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, ROOT_CERTIFICATE, load_root
+from gdp.trust.enrolment_wire import DELEGATIONS_MAX
 from gdp.trust.join_token import JOIN_SECRET_BYTES, SERVERS_MAX, JoinRole, JoinToken, fingerprint_of, join_id, join_key
 
 __all__ = ["BORDER", "DomainPlan", "create_domain", "make_token"]
@@ -72,16 +73,25 @@ def create_domain(plan: DomainPlan, *, unix_s: float | None = None) -> DomainFil
 
 
 def make_token(
-    files: DomainFiles, role: JoinRole, *, valid_s: float, label: str = "", unix_s: float | None = None
+    files: DomainFiles,
+    role: JoinRole,
+    *,
+    valid_s: float,
+    label: str = "",
+    unix_s: float | None = None,
+    plan: Plan | None = None,
 ) -> JoinToken:
     """Make a token that lets one machine join once, and store its id and MAC key.
 
     Args:
         label: the machine must have this one; empty: any.
+        plan: of a machine of a cluster.
 
     Raises:
-        LocalError: the label is taken, or the registry cannot be written.
+        LocalError: the label is taken, the plan has too many names, or the registry cannot be written.
     """
+    if plan is not None and len(plan.grants) > DELEGATIONS_MAX:
+        raise LocalError(f"{label}: a machine serves at most {DELEGATIONS_MAX} names, not {len(plan.grants)}")
     now = time.time() if unix_s is None else unix_s
     secret = secrets.token_bytes(JOIN_SECRET_BYTES)
     root = load_root(files.config.domain / ROOT_CERTIFICATE)
@@ -90,7 +100,13 @@ def make_token(
             raise LocalError(f"the label {label!r} is taken by another machine of this domain")
         expires = int(now + valid_s)
         registry.add_token(
-            join_id(secret), join_key(secret), role=role.value, label=label, unix_s=now, expires_unix_s=expires
+            join_id(secret),
+            join_key(secret),
+            role=role.value,
+            label=label,
+            unix_s=now,
+            expires_unix_s=expires,
+            plan=plan,
         )
     return JoinToken(
         root=fingerprint_of(root), secret=secret, role=role, expires_unix_s=expires, servers=files.config.servers

@@ -21,27 +21,31 @@ from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.fields import Fields
 from gdp.crypto.identity import node_metadata
-from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
+from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import SIGNATURE_BYTES
 from gdp.crypto.statements import parse
+from gdp.crypto.subject import Subject
 from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
-from gdp.enrolment.registry import MachineRow, Registry, TokenRow
+from gdp.enrolment.registry import MachineRow, Plan, Registry, TokenRow
 from gdp.errors import LocalError, RemoteError, StatementError, StoreError
 from gdp.links.endpoint_files import own_record, public_candidates
 from gdp.names import Name
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import admit, renew
+from gdp.stores.issue import DAY_S, admit, delegate, renew
 from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.audit import Action, AuditTrail
-from gdp.trust.bootstrap_ticket import MEMBERS_MAX, Application, token_id
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment_wire import (
     INSTANCE_BYTES,
+    MEMBERS_MAX,
     NONCE_BYTES,
+    RESPONSE_MAX_BYTES,
     VERSION,
+    Application,
     EnrolmentError,
     Refusal,
     read_message,
@@ -52,14 +56,24 @@ from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["PAGE", "EnrolmentDesk", "MemberConnection", "refusal_of"]
+__all__ = ["OPENED_MAX", "PAGE", "EnrolmentDesk", "MemberConnection", "refusal_of"]
 
 log = logging.getLogger(__name__)
 
 PAGE: Final = 64  # machines or mails in one response
+OPENED_MAX: Final = 64  # requests per token, an hour, whose keys are verified; a machine needs one, or a few
+_HOUR_S: Final = 3_600.0
 _PROOF_BYTES: Final = 32
 _EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
 _WHAT: Final = "enrolment"
+_KNOWN: Final = "somebody has read its user data"
+_MISUSES: Final = (
+    Refusal.USED,
+    Refusal.WRONG_NODES,
+    Refusal.WRONG_PROOF,
+    Refusal.IDENTITY_TAKEN,
+    Refusal.MALFORMED,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +88,14 @@ class MemberConnection:
     name: Name
     machine: int
     instance: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """Node that receives delegations; its application proved both of its keys."""
+
+    subject: Subject
+    kem: KemPublicKey
 
 
 class EnrolmentDesk:
@@ -92,6 +114,7 @@ class EnrolmentDesk:
         self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
         self._border_certificate = b""
+        self._opened = TokenBuckets(OPENED_MAX / _HOUR_S, OPENED_MAX)  # requests, by the id of their token
 
     @property
     def root(self) -> Root:
@@ -111,7 +134,25 @@ class EnrolmentDesk:
             StoreError, LocalError: files cannot be written now; the same request may be repeated.
         """
         token = self._proven_token(fields, binding, nonce)
-        role = JoinRole(token.role)
+        plan = token.plan
+        if plan is not None and plan.is_misused:
+            raise EnrolmentError(Refusal.USED, "this token was misused, and is good for nothing", token.label)
+        try:
+            return self._admitted(token, fields, unix_s)
+        except (EnrolmentError, StatementError) as error:
+            code = error.code if isinstance(error, EnrolmentError) else Refusal.MALFORMED
+            if plan is not None and code in _MISUSES:
+                self._registry.set_misused(token.id, self._misuse(token, code, error))
+            if isinstance(error, EnrolmentError):
+                error.about = token.label
+            raise
+
+    def _admitted(self, token: TokenRow, fields: Fields, unix_s: float) -> Fields:
+        role, plan = JoinRole(token.role), token.plan
+        if role.is_of_cluster and plan is None:
+            raise EnrolmentError(Refusal.USED, "the launcher of this machine has withdrawn its token")
+        if not self._opened.spend(token.id, time.monotonic()):
+            raise EnrolmentError(Refusal.UNAVAILABLE, "too many requests with this token")
         applications, holders = _applications(fields, role, token.id)
         label, keys = holders[0].label, _keys_digest(applications, holders)
         self._check_token(token, keys, label, unix_s)
@@ -125,34 +166,61 @@ class EnrolmentDesk:
         machine = self._registry.use_token(token.id, keys, label, unix_s)
         if token.answer is not None:
             return read_message(token.answer)
-        members = [
-            admit(self._config.domain, each.request, days=self._config.member_days, unix_s=unix_s)
-            for each in applications
-        ]
-        answer = {"ok": True, "members": [each.wire for each in members], "label": label, **self.news(unix_s)}
-        self._registry.complete_token(token.id, machine, members, encode(answer))
-        self._trail.record(Action.ACCEPTED, _WHAT, who=members[0].name.to_text())
+        days = self._days(None if plan is None else plan.until_unix_s, unix_s)
+        members = [admit(self._config.domain, each.request, days=days, unix_s=unix_s) for each in applications]
+        issued = {"members": [each.wire for each in members]}
+        if plan is not None:
+            issued["delegations"] = self._delegations(plan, _Node(members[-1].subject, applications[-1].kem), unix_s)
+        answer = encode({"ok": True, **issued, "label": label, **self.news(unix_s)})
+        if len(answer) > RESPONSE_MAX_BYTES:
+            raise LocalError(f"{label}: a response of {len(answer)} bytes; at most {RESPONSE_MAX_BYTES} are allowed")
+        self._registry.complete_token(token.id, machine, members, answer)
+        self._trail.record(Action.ACCEPTED, _WHAT, who=members[-1].name.to_text(), about=label)
         log.info("machine enrolled role=%s nodes=%d", role.value, len(members))
-        return read_message(encode(answer))
+        return read_message(answer)
+
+    def _delegations(self, plan: Plan, node: _Node, unix_s: float) -> list[bytes]:
+        days = (plan.until_unix_s - unix_s) / DAY_S
+        return [
+            delegate(self._config.owner, node, metadata, [right], days=days, unix_s=unix_s).to_wire()
+            for metadata, right in plan.grants
+        ]
+
+    def _days(self, until_unix_s: float | None, unix_s: float) -> float:
+        """Return how long a membership that begins now is valid."""
+        days = self._config.member_days
+        return days if until_unix_s is None else min(days, (until_unix_s - unix_s) / DAY_S)
+
+    def _misuse(self, token: TokenRow, code: Refusal | None, error: Exception) -> str:
+        """Return for the launcher what happened with the token of one of its machines."""
+        if code is not Refusal.USED:
+            return f"{_KNOWN}, and asked for what was not planned: {error}"
+        machine = None if token.machine is None else self._registry.machine(token.machine)
+        nodes = () if machine is None else machine.nodes
+        first = f"; enrolled first is {nodes[-1].name.to_text()[:16]}" if nodes else ""
+        return f"{_KNOWN}: the token was used again with another key{first}"
 
     def news(self, unix_s: float) -> dict[str, object]:
         """Return what every member follows: the root, roots of other domains, borders, the owner's key."""
         return {
             "root": self.root.to_pem(),
             "trusts": [read_public(each) for each in self._config.trusts],
-            "borders": [self.border_record(unix_s).wire],
+            "borders": [each.wire for each in self.borders(unix_s)],
             "relays": list(self._config.relays),
             "owner": read_public(self._config.owner / OWNER_PUBLIC),
         }
 
-    def border_record(self, unix_s: float) -> EndpointRecord:
-        """Return the border's endpoint record, which it signs itself."""
-        certificate = read_public(self._config.switch / NODE_CERTIFICATE)
+    def borders(self, unix_s: float) -> list[EndpointRecord]:
+        """Return the border's endpoint record, which it signs itself; none: machines have links of their own."""
+        switch = self._config.switch
+        if switch is None:
+            return []
+        certificate = read_public(switch / NODE_CERTIFICATE)
         if self._border is None or certificate != self._border_certificate:
-            identity = load_identity(self._config.switch, unix_s)
+            identity = load_identity(switch, unix_s)
             candidates = public_candidates([Endpoint.from_text(each) for each in self._config.public])
             self._border, self._border_certificate = own_record(identity, 1, candidates), certificate
-        return self._border
+        return [self._border]
 
     def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> MemberConnection:
         """Return the session of a member that proves its key; its membership may have expired, to be renewed.
@@ -194,24 +262,26 @@ class EnrolmentDesk:
             )
         for each in cards:
             self._registry.set_card(each.name, each.wire)
-        if record.name != self.border_record(unix_s).name:
+        peers, borders = self._config.peers, self.borders(unix_s)
+        if borders and record.name not in [each.name for each in borders]:
             file = record_file_name(record.name)
-            write_all(self._config.peers, {file: public(record.wire)}, force=True)
+            write_all(peers, {file: public(record.wire)}, force=True)
             try:
                 self._member(session.machine)
             except EnrolmentError:  # removed in the meantime, perhaps before the file was there to be deleted
-                (self._config.peers / file).unlink(missing_ok=True)
+                (peers / file).unlink(missing_ok=True)
                 raise
 
     def renew(self, session: MemberConnection, fields: Fields, unix_s: float) -> dict[str, object]:
-        """Return new memberships of a machine's nodes; one that has just begun is returned as it is.
+        """Return new memberships of a machine's nodes; one that can gain little is returned as it is.
 
         Raises:
             EnrolmentError: WRONG_NODES, or NO_MEMBER: it was removed, or the root revoked a membership of it.
             StatementError: malformed, or not issued here.
         """
         self._refuse_revoked(session.machine)
-        nodes = {each.name: each for each in self._member(session.machine).nodes}
+        machine = self._member(session.machine)
+        nodes, end_s = {each.name: each for each in machine.nodes}, machine.end_unix_s
         wires, new = list[bytes](), list[Membership]()
         for wire in fields.byte_strings("certificates", MEMBERS_MAX):
             stranger = Unverified.from_wire(wire)
@@ -220,10 +290,11 @@ class EnrolmentDesk:
                 raise EnrolmentError(Refusal.WRONG_NODES, "a membership of another machine's node")
             held = Unverified.from_wire(known.certificate).validity
             used_s = unix_s - held.not_before_unix_s
-            if used_s < _EARLY_SHARE * (held.not_after_unix_s - held.not_before_unix_s):
+            is_last = end_s is not None and held.not_after_unix_s >= int(end_s)
+            if is_last or used_s < _EARLY_SHARE * (held.not_after_unix_s - held.not_before_unix_s):
                 wires.append(known.certificate)
                 continue
-            new.append(renew(self._config.domain, wire, days=self._config.member_days, unix_s=unix_s))
+            new.append(renew(self._config.domain, wire, days=self._days(end_s, unix_s), unix_s=unix_s))
             wires.append(new[-1].wire)
         self._registry.renewed(new)
         return {"ok": True, "members": wires}
@@ -283,9 +354,9 @@ class EnrolmentDesk:
         self._registry.set_double(session.machine)
         self.refused("two machines with one identity", session.name)
 
-    def refused(self, reason: str, who: Name | None = None) -> None:
-        """Note a refusal in the audit log."""
-        self._trail.record(Action.REFUSED, _WHAT, who="" if who is None else who.to_text(), reason=reason)
+    def refused(self, reason: str, who: Name | None = None, about: str = "") -> None:
+        """Note a refusal in the audit log; ``about``: label of the machine."""
+        self._trail.record(Action.REFUSED, _WHAT, who="" if who is None else who.to_text(), about=about, reason=reason)
 
     def flush(self) -> None:
         """Write the pending lines of the audit log. Raises ``LocalError``: it cannot be written."""
@@ -354,14 +425,7 @@ class EnrolmentDesk:
 
 def _applications(fields: Fields, role: JoinRole, identifier: bytes) -> tuple[list[Application], list[SubjectInfo]]:
     """Return the applications and their subjects: exactly the nodes of the role, each with a valid key proof."""
-    applications = [
-        Application(
-            each.bytes_("request"),
-            KemPublicKey(each.bytes_("kem", KEM_PUBLIC_BYTES)),
-            each.bytes_("proof", SIGNATURE_BYTES),
-        )
-        for each in fields.maps("nodes", MEMBERS_MAX)
-    ]
+    applications = [Application.from_fields(each) for each in fields.maps("nodes", MEMBERS_MAX)]
     holders = [read_request(each.request) for each in applications]
     wanted = [(node_role.value, holders[0].label if holders else "") for _, node_role in role.nodes]
     if [(each.unit, each.label) for each in holders] != wanted:
@@ -370,7 +434,7 @@ def _applications(fields: Fields, role: JoinRole, identifier: bytes) -> tuple[li
         if holder.subject.digest != node_metadata(node_role, holder.label).digest():
             raise EnrolmentError(Refusal.WRONG_NODES, "a node with further metadata")
         try:
-            application.verify(holder.key, token_id(identifier))
+            application.verify(holder.key, identifier)
         except StatementError as error:
             raise EnrolmentError(Refusal.WRONG_PROOF, "a node's key did not sign the request") from error
     if len({each.subject.name for each in holders}) != len(holders):

@@ -19,7 +19,7 @@ from gdp.config.schema import Directory, ExistingFile, Section, Unique, load
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port
-from gdp.trust.join_token import SERVERS_MAX
+from gdp.trust.join_token import SERVERS_MAX, checked_server
 
 __all__ = ["DOMAIN_FILE", "HANDOVER_SOCKET", "MEMBER_DAYS", "DomainConfig", "DomainFiles"]
 
@@ -41,13 +41,13 @@ class DomainConfig(Section):
 
     domain: Directory = Field(description="Directory of the domain's root key.")
     owner: Directory = Field(description="Directory of the owner of names.")
-    switch: Directory = Field(description="Directory of the border's switch.")
+    switch: Directory | None = Field(description="Directory of the border's switch. `null`: no border.")
     state: Directory = Field(description="Private directory of registry and TLS key.")
     peers: Directory = Field(description="Where a record of each member is written.")
     revocations: Directory = Field(description="Where revocations are written.")
     listen: int = Field(ge=0, le=65_535, description="TCP port of the server.")
-    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
-        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` of the server, for tokens."
+    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_server)], ...], Unique] = Field(
+        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` or `unix:PATH` of the server, for tokens."
     )
     public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = Field(
         default=(), description="Numeric `ADDRESS:PORT` of the border's tunnels."

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,11 +28,18 @@ from gdp.errors import LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import install_membership, make_node_keys
-from gdp.stores.keyring import CARD, OWNER_PUBLIC
-from gdp.trust.bootstrap_ticket import MEMBERS_MAX, apply
+from gdp.stores.issue import install_delegation, install_membership, make_node_keys
+from gdp.stores.keyring import CARD, OWNER_PUBLIC, REQUEST, load_node_keys
+from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
+from gdp.trust.enrolment_wire import (
+    DELEGATIONS_MAX,
+    INSTANCE_BYTES,
+    MEMBERS_MAX,
+    EnrolmentError,
+    UnreachableError,
+    apply,
+)
 from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 
 __all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
@@ -41,8 +49,9 @@ log = logging.getLogger(__name__)
 _UNUSED: Final = "the token was not used"
 _TRUSTS_MAX: Final = 64
 _BORDERS_MAX: Final = 16
-_RETRY_S: Final = 30.0
-_RETRY_EACH_S: Final = 1.0
+_RETRY_S: Final = 30.0  # after a connection
+_PAUSE_MIN_S: Final = 0.2
+_PAUSE_MAX_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +62,9 @@ class JoinRequest:
         directory: is made, with its parents; an empty one may exist.
         uplinks: devices that each get a tunnel; none: routing decides.
         listen: UDP port of the tunnels; 0: any.
+        keys: folder that keeps the keys until the caller removes it, so that a machine that is stopped meanwhile
+            sends the same ones again; None: they are made for one call.
+        patience_s: how long a server that cannot be reached at all is tried again.
     """
 
     token: JoinToken
@@ -60,6 +72,8 @@ class JoinRequest:
     directory: Path
     uplinks: Sequence[str] = ()
     listen: int = 0
+    keys: Path | None = None
+    patience_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +101,7 @@ def join_domain(
 
     Raises:
         EnrolmentError: the server refused, is another domain's, or the clocks differ; nothing was left behind.
-        UnreachableError: no server answered for ``_RETRY_S``.
+        UnreachableError: no server answered in time.
         LocalError: the directory exists already, the label is not valid, or the disk is full.
     """
     if request.directory.exists() and (not request.directory.is_dir() or any(request.directory.iterdir())):
@@ -96,9 +110,7 @@ def join_domain(
         )
     with draft_of(request.directory) as draft:
         reserve_space(draft, _UNUSED).unlink()
-        members = [
-            (folder, make_node_keys(draft / folder, role, request.label)) for folder, role in request.token.role.nodes
-        ]
+        members = [(folder, _node_keys(request, draft, folder, role)) for folder, role in request.token.role.nodes]
         reserved = reserve_space(draft, _UNUSED)  # while the request is under way: what comes back then fits the disk
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
         reserved.unlink()
@@ -106,7 +118,7 @@ def join_domain(
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]
-        _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
+        _announce(request, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
         publish_draft(draft, request.directory)
     return Joined(
         root=root,
@@ -121,46 +133,58 @@ def join_domain(
 
 def _ask(request: JoinRequest, nodes: Sequence[NodeKeys], wait: Callable[[float], None]) -> tuple[Fields, Root, str]:
     """Return the response of the domain, its root, and the server that answered."""
-    token = request.token
-    applications = [_application(token, each) for each in nodes]
-    untagged = {"op": "join", "id": join_id(token.secret), "nodes": applications}
+    token, identifier = request.token, join_id(request.token.secret)
+    applications = [apply(identifier, each.key, each.request(), each.kem.public).to_fields() for each in nodes]
+    untagged = {"op": "join", "id": identifier, "nodes": applications}
 
     def send(channel: Channel) -> Fields:
         proof = join_proof(join_key(token.secret), channel.binding, channel.nonce, encode(untagged))
         return channel.request({**untagged, "mac": proof})
 
-    return _repeated(token, send, wait)
+    return _repeated(request, send, wait)
 
 
-def _application(token: JoinToken, keys: NodeKeys) -> dict[str, object]:
-    """Return the application of one node, with the proof that its key wants this token."""
-    made = apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public)
-    return {"request": made.request, "kem": made.kem.wire, "proof": made.proof}
+def _node_keys(request: JoinRequest, draft: Path, folder: str, role: Role) -> NodeKeys:
+    """Return a node's keys, which are in the draft then: new ones, or those of an earlier start."""
+    if request.keys is None:
+        return make_node_keys(draft / folder, role, request.label)
+    kept = request.keys / folder
+    if not (kept / REQUEST).exists():  # this file is written last
+        make_node_keys(kept, role, request.label, force=True)
+    try:
+        shutil.copytree(kept, draft / folder)
+    except OSError as error:
+        raise LocalError(f"{draft / folder}: {error.strerror or error}") from error
+    return load_node_keys(draft / folder)
 
 
-def _announce(token: JoinToken, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]) -> None:
+def _announce(
+    request: JoinRequest, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]
+) -> None:
     def send(channel: Channel) -> Fields:
         channel.identify(identity, secrets.token_bytes(INSTANCE_BYTES))
         return channel.request(fields)
 
-    _repeated(token, send, wait)
+    _repeated(request, send, wait)
 
 
 def _repeated(
-    token: JoinToken, send: Callable[[Channel], Fields], wait: Callable[[float], None]
+    request: JoinRequest, send: Callable[[Channel], Fields], wait: Callable[[float], None]
 ) -> tuple[Fields, Root, str]:
-    """Send a request until a response comes; a first server that cannot be reached at all is not waited for."""
-    end_s, has_connected = time.monotonic() + _RETRY_S, False
+    """Send a request until a response comes."""
+    token, patience_s = request.token, request.patience_s
+    begun_s, pause_s = time.monotonic(), _PAUSE_MIN_S
     while True:
         try:
             with connect_any(token.servers, token.root) as channel:
-                has_connected = True
+                patience_s = max(patience_s, _RETRY_S)
                 return send(channel), channel.root, channel.server
         except UnreachableError as error:
-            if not has_connected or time.monotonic() >= end_s:
+            if time.monotonic() >= begun_s + patience_s:
                 raise
             log.info("enrolment repeated reason=%s", error)
-            wait(_RETRY_EACH_S)
+            wait(pause_s)
+            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
 
 
 def _install(
@@ -182,16 +206,22 @@ def _install(
         for each in relays:
             split_host_port(each)
         borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
+        of_cluster = request.token.role.is_of_cluster
+        granted = fields.byte_strings("delegations", DELEGATIONS_MAX) if of_cluster else []
         if len(certificates) != len(nodes):
             raise LocalError("another number of memberships")
         identities = tuple(
             install_membership(draft / folder, certificate, root, unix_s=unix_s)
             for (folder, _), certificate in zip(nodes, certificates, strict=True)
         )
+        for wire in granted:
+            install_delegation(draft / Role.PROXY.value, Delegation.from_wire(wire), unix_s=unix_s)
     except RemoteError as error:
         raise EnrolmentError(None, f"the server's response is not valid: {error}") from error
     files = {f"trusts-{number}.crt": public(each.to_pem()) for number, each in enumerate(trusts, 1)}
     write_all(draft, {OWNER_PUBLIC: public(owner.to_pem()), **files})
+    if not borders:
+        return identities, borders  # the machine has links of its own, and a configuration for them
     plan = MachinePlan(
         label=request.label,
         role=request.token.role.value,

@@ -22,10 +22,9 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from gdp.config.schema import Directory, Domain, Section, Unique, load
-from gdp.host_port import checked_host_port
 from gdp.stores.keyring import load_root
 from gdp.trust.enrolment_wire import EnrolmentError
-from gdp.trust.join_token import SERVERS_MAX, fingerprint_of
+from gdp.trust.join_token import SERVERS_MAX, checked_server, fingerprint_of
 
 __all__ = ["MEMBER_FILE", "MemberConfig", "MemberFiles"]
 
@@ -42,8 +41,10 @@ class MemberConfig(Section):
     proxy: Directory | None = Field(default=None, description="Directory of its proxy. `null`: none.")
     rib: Directory | None = Field(default=None, description="Directory of its RIB. `null`: none.")
     peers: Directory = Field(description="Directory of endpoint records.")
-    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
-        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` of the domain's enrolment servers."
+    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_server)], ...], Unique] = Field(
+        min_length=1,
+        max_length=SERVERS_MAX,
+        description="`HOST:PORT` or `unix:PATH` of the domain's enrolment servers.",
     )
 
 

@@ -2,11 +2,13 @@
 
 I/O, one SQLite file, private. The commands ``gdp domain token``, ``ls`` and ``remove`` and the running server use it at
 the same time. A token is marked as used, on disk, before anything is issued for it: a crash at any point never lets a
-second key use it. Of a token the file holds the id and the MAC key, not the secret.
+second key use it. Of a token the file holds the id and the MAC key, not the secret. A launcher's plan of a machine
+belongs to its token, and so does a misuse of the token, which is reported until the launcher has handled it.
 """
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +17,14 @@ from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StoreError
+from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.files import write_all
 from gdp.stores.transactions import TransactionFile
 from gdp.trust.enrolment_wire import EnrolmentError, Refusal
+from gdp.trust.right import Right
 
-__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "StoredMail", "TokenRow"]
+__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Plan", "Registry", "StoredMail", "TokenRow"]
 
 MAILBOX_MAX: Final = 1_024  # mails that wait for one node
 MAILBOX_MAX_BYTES: Final = 4 << 20
@@ -34,6 +38,10 @@ CREATE TABLE IF NOT EXISTS tokens (
   id BLOB PRIMARY KEY, mac BLOB NOT NULL, role TEXT NOT NULL, label TEXT NOT NULL,
   made_unix_s REAL NOT NULL, expires_unix_s REAL NOT NULL,
   keys BLOB, used_unix_s REAL, machine INTEGER, answer BLOB
+) STRICT;
+CREATE TABLE IF NOT EXISTS plans (
+  token BLOB PRIMARY KEY, machine INTEGER, grants TEXT NOT NULL, until_unix_s REAL NOT NULL,
+  misuse TEXT, is_reported INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE TABLE IF NOT EXISTS machines (
   id INTEGER PRIMARY KEY AUTOINCREMENT, label TEXT NOT NULL, role TEXT NOT NULL, joined_unix_s REAL NOT NULL,
@@ -55,8 +63,24 @@ CREATE INDEX IF NOT EXISTS mailboxes ON mail (recipient, id);
 _MAILBOX: Final = "SELECT count(*), coalesce(sum(length(wire)), 0) FROM mail WHERE recipient = ?"
 _SAME_MACHINE: Final = "(SELECT name FROM nodes WHERE machine = (SELECT machine FROM nodes WHERE name = ?))"
 _MACHINE: Final = (
-    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double FROM machines m"
+    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double, p.until_unix_s"
+    " FROM machines m LEFT JOIN plans p ON p.machine = m.id"
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """A launcher's plan of a machine, which no request changes.
+
+    Args:
+        grants: names that its proxy is delegated, each with its right.
+        until_unix_s: end of everything that is issued for it.
+        is_misused: its token was misused; further requests are refused.
+    """
+
+    grants: Sequence[tuple[Metadata, Right]]
+    until_unix_s: float
+    is_misused: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,6 +92,7 @@ class TokenRow:
         label: the one that its machine must have; empty: any.
         keys: SHA-256 of the keys that used it; None: not used.
         answer: the response to these keys; None: not complete.
+        plan: of a launcher; None: there is none, or it was withdrawn.
     """
 
     id: bytes
@@ -79,6 +104,7 @@ class TokenRow:
     used_unix_s: float | None
     machine: int | None
     answer: bytes | None = field(repr=False)
+    plan: Plan | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +126,7 @@ class MachineRow:
         seen_unix_s: when its agent was last connected; 0: never.
         removed_unix_s: when it was removed; None: it is a member.
         has_double: two machines were seen with its identity.
+        end_unix_s: when everything that is issued for it ends; None: no launcher planned that.
     """
 
     id: int
@@ -109,6 +136,7 @@ class MachineRow:
     seen_unix_s: float
     removed_unix_s: float | None
     has_double: bool
+    end_unix_s: float | None
     nodes: tuple[NodeRow, ...]
 
     @property
@@ -146,11 +174,29 @@ class Registry(TransactionFile):
     # tokens
 
     def add_token(
-        self, identifier: bytes, mac: bytes, *, role: str, label: str, unix_s: float, expires_unix_s: float
+        self,
+        identifier: bytes,
+        mac: bytes,
+        *,
+        role: str,
+        label: str,
+        unix_s: float,
+        expires_unix_s: float,
+        plan: Plan | None = None,
     ) -> None:
-        """Store a token; those that ended long ago are deleted."""
+        """Store a token, and the plan of its machine; those that ended long ago are deleted."""
         with self.writing() as file:
-            file.execute("DELETE FROM tokens WHERE expires_unix_s < ?", (unix_s - _TOKEN_KEPT_S,))
+            file.execute("DELETE FROM plans WHERE until_unix_s < ?", (unix_s,))
+            file.execute(
+                "DELETE FROM tokens WHERE expires_unix_s < ? AND id NOT IN (SELECT token FROM plans)",
+                (unix_s - _TOKEN_KEPT_S,),
+            )
+            if plan is not None:
+                grants = json.dumps([[dict(metadata), right.value] for metadata, right in plan.grants])
+                file.execute(
+                    "INSERT INTO plans (token, grants, until_unix_s) VALUES (?, ?, ?)",
+                    (identifier, grants, plan.until_unix_s),
+                )
             file.execute(
                 "INSERT INTO tokens (id, mac, role, label, made_unix_s, expires_unix_s) VALUES (?, ?, ?, ?, ?, ?)",
                 (identifier, mac, role, label, unix_s, expires_unix_s),
@@ -159,13 +205,14 @@ class Registry(TransactionFile):
     def find_token(self, identifier: bytes) -> TokenRow | None:
         """Return the token with this id."""
         query = (
-            "SELECT id, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer FROM tokens WHERE id = ?"
+            "SELECT t.id, mac, role, label, expires_unix_s, keys, used_unix_s, t.machine, answer, grants, until_unix_s,"
+            " misuse FROM tokens t LEFT JOIN plans p ON p.token = t.id WHERE t.id = ?"
         )
         with self.reading() as file:
             row = file.execute(query, (identifier,)).fetchone()
         if row is None:
             return None
-        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer = row
+        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer, *planned = row
         return TokenRow(
             id=id_,
             mac=mac,
@@ -176,6 +223,7 @@ class Registry(TransactionFile):
             used_unix_s=used_unix_s,
             machine=machine,
             answer=answer,
+            plan=None if planned[0] is None else _plan(*planned),
         )
 
     def use_token(self, identifier: bytes, keys: bytes, label: str, unix_s: float) -> int:
@@ -199,12 +247,34 @@ class Registry(TransactionFile):
                 "UPDATE tokens SET keys = ?, used_unix_s = ?, machine = ? WHERE id = ?",
                 (keys, unix_s, machine, identifier),
             )
+            file.execute("UPDATE plans SET machine = ? WHERE token = ?", (machine, identifier))
             return machine
 
     def withdraw_tokens(self, label: str) -> None:
-        """Delete the unused tokens for machines with this label."""
+        """Delete the unused tokens for machines with this label, and the plans of these machines."""
         with self.writing() as file:
+            file.execute("DELETE FROM plans WHERE token IN (SELECT id FROM tokens WHERE label = ?)", (label,))
             file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
+
+    def set_misused(self, identifier: bytes, detail: str) -> None:
+        """Invalidate the token of a planned machine, and report that once; an earlier report stays."""
+        with self.writing() as file:
+            file.execute("UPDATE plans SET misuse = ? WHERE token = ? AND misuse IS NULL", (detail, identifier))
+
+    def misuses(self) -> list[tuple[str, str]]:
+        """Return label and detail of each misused token that was not yet ``reported``."""
+        query = (
+            "SELECT t.label, p.misuse FROM plans p JOIN tokens t ON t.id = p.token"
+            " WHERE p.misuse IS NOT NULL AND p.is_reported = 0"
+        )
+        with self.reading() as file:
+            return [(label, detail) for label, detail in file.execute(query).fetchall()]
+
+    def reported(self, label: str) -> None:
+        """Note that the misuse of a machine's token was handled."""
+        with self.writing() as file:
+            query = "UPDATE plans SET is_reported = 1 WHERE token IN (SELECT id FROM tokens WHERE label = ?)"
+            file.execute(query, (label,))
 
     def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
         """Store what was issued for a token, and the response to a repeat of its request.
@@ -257,9 +327,11 @@ class Registry(TransactionFile):
         """Return the machine with this id, also a removed one."""
         return self._machine("SELECT id FROM machines WHERE id = ?", machine)
 
-    def machine_with(self, label: str) -> MachineRow | None:
-        """Return the member machine with this label."""
-        return self._machine("SELECT id FROM machines WHERE label = ? AND removed_unix_s IS NULL", label)
+    def machine_with(self, label: str, *, with_removed: bool = False) -> MachineRow | None:
+        """Return the member machine with this label, or else the one that was removed last."""
+        condition = "" if with_removed else " AND removed_unix_s IS NULL"
+        order = "ORDER BY removed_unix_s IS NULL DESC, id DESC LIMIT 1"
+        return self._machine(f"SELECT id FROM machines WHERE label = ?{condition} {order}", label)
 
     def machines(self, *, after: str = "", limit: int = 1 << 20, with_removed: bool = False) -> list[MachineRow]:
         """Return machines in the order of their labels, beginning after a label."""
@@ -359,7 +431,7 @@ class Registry(TransactionFile):
         found = file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
         if found is None:
             raise StoreError(f"{self.path}: a node of no machine")
-        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double = found
+        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double, end_unix_s = found
         rows = file.execute(
             "SELECT name, role, certificate, until_unix_s, card FROM nodes WHERE machine = ? ORDER BY rowid", (machine,)
         ).fetchall()
@@ -375,8 +447,14 @@ class Registry(TransactionFile):
             seen_unix_s=seen_unix_s,
             removed_unix_s=removed_unix_s,
             has_double=bool(has_double),
+            end_unix_s=end_unix_s,
             nodes=nodes,
         )
+
+
+def _plan(grants: str, until_unix_s: float, misuse: str | None) -> Plan:
+    named = [(Metadata(metadata), Right(right)) for metadata, right in json.loads(grants)]
+    return Plan(grants=named, until_unix_s=until_unix_s, is_misused=misuse is not None)
 
 
 def _refuse_removed(file: sqlite3.Connection, machine: int) -> None:

@@ -1,7 +1,8 @@
 """Enrolment server: accepts TLS connections of joiners and members, bounded in number, rate, size and time.
 
-I/O. Any host may connect. A stranger's whole connection lasts at most ``STRANGER_S``; where too many strangers are
-connected, the oldest one is closed. The desk's work runs in one thread, so that a slow disk delays no handshake.
+I/O. Any host may connect; a Unix socket is for machines of this host, which share no address. A stranger's whole
+connection lasts at most ``STRANGER_S``; where too many strangers are connected, the oldest one is closed. The desk's
+work runs in one thread, so that a slow disk delays no handshake.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import functools
 import logging
 import os
 import socket
+import threading
 import time
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +28,7 @@ from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.management.control_socket import short_path
 from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
 from gdp.token_bucket import TokenBucket, TokenBuckets
@@ -41,13 +44,14 @@ from gdp.trust.enrolment_wire import (
     read_message,
 )
 
-__all__ = ["STRANGER_S", "EnrolmentServer", "bind_handover", "bind_server", "serve_domain"]
+__all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "bind_unix", "serve_domain", "serve_domain_in_thread"]
 
 log = logging.getLogger(__name__)
 
 STRANGER_S: Final = 10.0
 POLL_MAX_S: Final = 60.0
 _STRANGERS_MAX: Final = 64
+_BACKLOG: Final = 128
 _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
@@ -74,17 +78,25 @@ def bind_server(port: int, host: str = "") -> socket.socket:
         ) from error
 
 
-def bind_handover(path: Path) -> socket.socket:
-    """Return the socket at which a relay hands over connections. Raises ``LocalError``: it cannot be made."""
-    receiver = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+def bind_unix(path: Path, kind: socket.SocketKind) -> socket.socket:
+    """Return a non-blocking socket at a path, in place of an earlier one, for this user alone; a stream listens.
+
+    Raises:
+        LocalError: the system refuses.
+    """
+    made = socket.socket(socket.AF_UNIX, kind)
     try:
         path.unlink(missing_ok=True)
-        receiver.bind(str(path))
+        with short_path(path) as short:
+            made.bind(short)
         path.chmod(0o600)
+        made.setblocking(False)
+        if kind is socket.SOCK_STREAM:
+            made.listen(_BACKLOG)
     except OSError as error:
-        receiver.close()
+        made.close()
         raise LocalError(f"enrolment server: {path}: {error.strerror or error}") from error
-    return receiver
+    return made
 
 
 @dataclass(slots=True, eq=False)
@@ -93,7 +105,7 @@ class _Connection:
 
     task: asyncio.Task[None] = field(init=False)
     peer: socket.socket
-    host: bytes  # as of ``client_network``
+    host: bytes  # as of ``client_network``; empty: of this host, at a Unix socket
     session: MemberConnection | None = None
     is_attended: bool = False
     nonce: bytes = field(default_factory=lambda: os.urandom(NONCE_BYTES))
@@ -104,7 +116,7 @@ class EnrolmentServer:
 
     Args:
         make_tls: returns a fresh context; called at the start, and each day.
-        handover: of ``bind_handover``; None: no relay hands connections over.
+        handover: datagram socket of ``bind_unix``; None: no relay hands connections over.
     """
 
     def __init__(
@@ -162,8 +174,8 @@ class EnrolmentServer:
             log.warning("enrolment connection not accepted reason=%s", error.strerror)
             await asyncio.sleep(1.0)
             return
-        host = client_network(str(address[0]))
-        if not self._each.spend(host, time.monotonic()):
+        host = client_network(str(address[0])) if isinstance(address, tuple) else b""
+        if host and not self._each.spend(host, time.monotonic()):
             peer.close()
             await asyncio.sleep(_LOOK_S)
             return
@@ -188,7 +200,7 @@ class EnrolmentServer:
 
     def _begin(self, peer: socket.socket, host: bytes) -> None:
         connection = _Connection(peer=peer, host=host)
-        same = [each for each in self._strangers if each.host == connection.host]
+        same = [each for each in self._strangers if host and each.host == host]
         if len(same) >= _EACH_MAX:
             same[0].task.cancel()
         elif len(self._strangers) >= _STRANGERS_MAX:
@@ -254,7 +266,8 @@ class EnrolmentServer:
             if refusal is None or refusal["code"] == Refusal.UNAVAILABLE.value:
                 log.error("enrolment request failed reason=%s", error)
             elif not isinstance(error, EnrolmentError) or connection.session is None:
-                await self._work(self._desk.refused, f"{refusal['code']}")
+                about = error.about if isinstance(error, EnrolmentError) else ""
+                await self._work(self._desk.refused, f"{refusal['code']}", None, about)
             response = refusal or {"ok": False, "code": Refusal.UNAVAILABLE.value, "error": "try again later"}
             goes_on = connection.session is not None and not isinstance(error, StatementError)
         await self._write(writer, response)
@@ -405,7 +418,8 @@ async def serve_domain(files: DomainFiles, listening: socket.socket) -> None:
     with contextlib.closing(listening), Registry(config.state) as registry:
         desk = EnrolmentDesk(files, registry)
         try:
-            handover = bind_handover(config.state / HANDOVER_SOCKET)
+            if config.switch is not None:
+                handover = bind_unix(config.state / HANDOVER_SOCKET, socket.SOCK_DGRAM)
         except LocalError as error:
             log.warning("the relay's port does not enrol machines reason=%s", error)
         server = EnrolmentServer(
@@ -415,3 +429,30 @@ async def serve_domain(files: DomainFiles, listening: socket.socket) -> None:
             await server.accept_connections()
         finally:
             desk.flush()
+
+
+@contextlib.contextmanager
+def serve_domain_in_thread(files: DomainFiles, listening: socket.socket) -> Iterator[None]:
+    """Serve a domain in a thread while within; the listening socket is closed then. An error ends it, and is logged."""
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(serve_domain(files, listening))
+
+    def serve() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            pass
+        except Exception:  # an error of this server must not end the process that keeps the machines
+            log.exception("enrolment server failed")
+        finally:
+            loop.run_until_complete(loop.shutdown_asyncgens())
+            loop.close()
+
+    thread = threading.Thread(target=serve, name="enrolment server")
+    thread.start()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(RuntimeError):  # the server has ended, and its loop is closed
+            loop.call_soon_threadsafe(task.cancel)
+        thread.join()

@@ -42,6 +42,7 @@ __all__ = [
     "ControlServer",
     "connect_control",
     "serve_control_in_thread",
+    "short_path",
 ]
 
 log = logging.getLogger(__name__)
@@ -283,7 +284,7 @@ def connect_control(path: Path, timeout_s: float) -> socket.socket:
     try:
         # A non-blocking connect would fail while the node has other connections to accept; unix(7), SO_SNDTIMEO.
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(timeout_s), int(timeout_s % 1 * 1e6)))
-        with _short_path(path) as short:
+        with short_path(path) as short:
             made.connect(short)
         made.settimeout(timeout_s)
     except BlockingIOError as error:
@@ -299,7 +300,7 @@ def _bind(path: Path) -> socket.socket:
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         _remove_stale(path)
-        with _short_path(path) as short:
+        with short_path(path) as short:
             made.bind(short)
         path.chmod(_MODE)  # before listen: until then no process can connect
         made.listen(_BACKLOG)
@@ -338,7 +339,7 @@ def _remove_stale(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _short_path(path: Path) -> Iterator[str]:
+def short_path(path: Path) -> Iterator[str]:
     """Yield a path of at most 107 bytes, the limit of unix(7), that leads to ``path``."""
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:

@@ -4,7 +4,7 @@ Sans-I/O. Source: base32 (RFC 4648, section 6), HKDF (RFC 5869). The text is ``g
 padding, of::
 
     version (1) || role (1) || expires, Unix seconds (5) || SHA-256 of the founding root certificate, DER (32)
-    || secret (16) || number of servers (1) || for each: length (1) || "host:port", ASCII
+    || secret (16) || number of servers (1) || for each: length (1) || "host:port" or "unix:" and a path, UTF-8
     || first 5 bytes of SHA-256 of all bytes before
 
 The secret is never sent. Its holder proves it by a MAC (``join_proof``) over what binds the TLS connection, and the
@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.certificates import Role, Root
 from gdp.errors import LocalError
-from gdp.host_port import split_host_port
+from gdp.host_port import checked_host_port, split_host_port
 
 __all__ = [
     "JOIN_ID_BYTES",
@@ -34,6 +34,7 @@ __all__ = [
     "SERVERS_MAX",
     "JoinRole",
     "JoinToken",
+    "checked_server",
     "fingerprint_of",
     "join_id",
     "join_key",
@@ -43,6 +44,8 @@ __all__ = [
 JOIN_SECRET_BYTES: Final = 16
 JOIN_ID_BYTES: Final = 16
 SERVERS_MAX: Final = 8
+_UNIX: Final = "unix:"
+_SERVER_MAX_BYTES: Final = 255
 _PREFIX: Final = "gdp1"
 _VERSION: Final = 1
 _KEY_BYTES: Final = 32
@@ -59,16 +62,23 @@ class JoinRole(str, Enum):
     ROBOT = "robot"  # a leaf switch and a proxy
     SWITCH = "switch"  # a switch that forwards for others, and a proxy
     LEAF = "leaf"  # a leaf switch alone, for a program that brings its own node
+    MACHINE = "machine"  # of a cluster: a leaf switch, and a proxy with delegations
+    GATEWAY = "gateway"  # of a cluster: the same, and its switch may forward for others
+
+    @property
+    def is_of_cluster(self) -> bool:
+        """Return whether a launcher plans the machine: it receives delegations, and any other request is misuse."""
+        return self in (JoinRole.MACHINE, JoinRole.GATEWAY)
 
     @property
     def nodes(self) -> tuple[tuple[str, Role], ...]:
         """Return the folder and the role of each node of the machine; the switch is the first."""
-        switch = Role.SWITCH if self is JoinRole.SWITCH else Role.LEAF
+        switch = Role.SWITCH if self in (JoinRole.SWITCH, JoinRole.GATEWAY) else Role.LEAF
         proxy = () if self is JoinRole.LEAF else ((Role.PROXY.value, Role.PROXY),)
         return ((Role.SWITCH.value, switch), *proxy)
 
 
-_ROLES: Final = (JoinRole.ROBOT, JoinRole.SWITCH, JoinRole.LEAF)  # the number on the wire is the index
+_ROLES: Final = tuple(JoinRole)  # the number on the wire is the index
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +89,7 @@ class JoinToken:
         root: ``fingerprint_of`` the domain.
         secret: ``JOIN_SECRET_BYTES``, random.
         expires_unix_s: the domain refuses the token from then on.
-        servers: ``host:port`` of the enrolment server, to be tried in this order.
+        servers: ``host:port`` of the enrolment server, or ``unix:`` and its path, to be tried in this order.
     """
 
     root: bytes
@@ -92,13 +102,16 @@ class JoinToken:
         if not 0 < len(self.servers) <= SERVERS_MAX:
             raise LocalError(f"a token names 1 to {SERVERS_MAX} servers")
         for each in self.servers:
-            split_host_port(each)
+            if not each.startswith(_UNIX):
+                split_host_port(each)
+            elif len(_encoded(each)) > _SERVER_MAX_BYTES:
+                raise LocalError(f"{each}: a token's path of a socket has at most {_SERVER_MAX_BYTES} bytes")
         if len(self.root) != _FINGERPRINT_BYTES or len(self.secret) != JOIN_SECRET_BYTES:
             raise LocalError("a token has a fingerprint of 32 bytes and a secret of 16")
 
     def to_text(self) -> str:
         """Return the text that a person copies."""
-        servers = [each.encode("ascii") for each in self.servers]
+        servers = [_encoded(each) for each in self.servers]
         body = b"".join(
             [
                 bytes([_VERSION, _ROLES.index(self.role)]),
@@ -140,13 +153,22 @@ class JoinToken:
             servers, count, at = [], body[at], at + 1
             for _ in range(count):
                 end = at + 1 + body[at]
-                servers.append(body[at + 1 : end].decode("ascii"))
+                servers.append(body[at + 1 : end].decode(errors="surrogateescape"))
                 at = end
-        except (IndexError, UnicodeDecodeError) as error:
+        except IndexError as error:
             raise LocalError(_MISTYPED) from error
         if at != len(body):
             raise LocalError(_MISTYPED)
         return cls(root=root, secret=secret, role=role, expires_unix_s=expires, servers=tuple(servers))
+
+
+def checked_server(text: str) -> str:
+    """Return ``host:port``, or ``unix:`` and a path, unchanged, as a validator of pydantic.
+
+    Raises:
+        ValueError: another form.
+    """
+    return text if text.startswith(_UNIX) else checked_host_port(text)
 
 
 def fingerprint_of(root: Root) -> bytes:
@@ -173,6 +195,10 @@ def join_proof(key: bytes, binding: bytes, nonce: bytes, request: bytes) -> byte
         nonce: of the server, for this connection.
     """
     return hmac.digest(key, b"gdp-join-1" + binding + nonce + hashlib.sha256(request).digest(), "sha256")
+
+
+def _encoded(server: str) -> bytes:
+    return server.encode(errors="surrogateescape")
 
 
 def _decoded(text: str) -> bytes:

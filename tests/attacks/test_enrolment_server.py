@@ -28,8 +28,7 @@ from gdp.errors import StoreError
 from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
-from gdp.trust.bootstrap_ticket import apply
-from gdp.trust.enrolment_wire import EnrolmentError, Refusal, prove_member
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal, apply, prove_member
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
@@ -79,7 +78,7 @@ class Machine:
 
     def ask(self, desk: EnrolmentDesk) -> Fields:
         made = [apply(join_id(self.token.secret), each.key, each.request(), each.kem.public) for each in self.keys]
-        nodes: list[Value] = [{"request": each.request, "kem": each.kem.wire, "proof": each.proof} for each in made]
+        nodes: list[Value] = [each.to_fields() for each in made]
         untagged: dict[str, Value] = {"op": "join", "id": join_id(self.token.secret), "nodes": nodes}
         proof = join_proof(join_key(self.token.secret), BINDING, NONCE, encode(untagged))
         return desk.join(Fields({**untagged, "mac": proof}), BINDING, NONCE, NOW)

@@ -1,57 +1,55 @@
-"""One-time enrolment of machines: content of user data, and limits of a token."""
+"""Joining of a cluster's machines: content of user data, and limits of a token."""
 
 from __future__ import annotations
 
 import base64
 import gzip
+import json
 import os
 import secrets
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from fog.bootstrap.bundles import joining_boot
-from fog.bootstrap.listener import CONNECTION_S, CONNECTIONS_MAX, Listener, bind_tcp
-from fog.bootstrap.responder import OPENED_MAX, Responder
-from fog.bootstrap.tickets import Report, Tickets
-from fog.host.bundle import JOIN_FILE, TICKET_FILE, install, pack
-from fog.host.enrolment import enrol
+from fog.bootstrap.bundles import machine_boot
+from fog.host.bundle import JOIN_FILE, install, pack
+from fog.host.joining import join
 from fog.machine import MachineBundle, MachineSpec
 from fog.providers.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup, placed, shell_script, user_data
 from fog.site import Site
 from fog.supervisor.journal import Journal
-from gdp.crypto.certificates import Membership, Role, Root
+from fog.supervisor.supervisor import Supervisor
+from gdp.crypto.certificates import Role
+from gdp.crypto.fields import Fields
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.kem import KemPrivateKey
 from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
-from gdp.errors import LocalError, StatementError
+from gdp.enrolment import desk as desk_module
+from gdp.enrolment.channel import client_context, connect
+from gdp.enrolment.desk import OPENED_MAX, EnrolmentDesk
+from gdp.enrolment.registry import Registry
+from gdp.management.control_socket import connect_control
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.keyring import load_domain, load_owner
-from gdp.trust.bootstrap_ticket import (
-    HEAD_BYTES,
-    REFUSED,
-    REQUEST_MAX_BYTES,
-    Ticket,
-    answer_bytes,
-    apply,
-    open_answer,
-    open_request,
-    seal_answer,
-)
-from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken
-from tests.fog.bootstrap.desk import CLUSTER, Desk, Machine, made_desk
+from gdp.trust.enrolment_wire import STRANGER_MAX_BYTES, EnrolmentError, Refusal, apply, encode_message
+from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, join_id
+from tests.fog.bootstrap.desk import BINDING, CLUSTER, NONCE, Desk, Machine, desk_of, made_desk, memberships
 from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, journal, site, supervisor, work
+from tests.gdp.enrolment.lab import running_lab
 
 __all__ = ["aws", "cloud", "journal", "site"]
+
+_END_S = 15.0  # of a stranger's connection, with reserve
 
 
 @pytest.fixture
@@ -60,19 +58,15 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
         yield made
 
 
-def asked(desk: Desk, request: bytes, *, at_s: float | None = None) -> bytes:
-    return desk.responder.answer(request, time.time() if at_s is None else at_s)
+def refused(desk: Desk, machine: Machine, applications: object = None, *, at_s: float | None = None) -> Refusal | None:
+    """Return why a request is refused."""
+    with pytest.raises(EnrolmentError) as refusal:
+        machine.ask(desk.desk, applications, at_s=at_s)  # type: ignore[arg-type]
+    return refusal.value.code
 
 
-def members(desk: Desk, machine: Machine, request: bytes, answer: bytes) -> list[Membership]:
-    opened = machine.opened(request, answer)
-    root = Root.from_wire(opened.root)
-    assert root == load_domain(desk.authority.domain).root
-    return [Membership.from_wire(each.member, root, time.time()) for each in opened.granted]
-
-
-def reports(tickets: Tickets) -> list[Report]:
-    return [each.report for each in tickets.pending_reports()]
+def misused(desk: Desk) -> list[str]:
+    return [label for label, _ in desk.members.misuses()]
 
 
 # content of user data
@@ -81,7 +75,7 @@ def reports(tickets: Tickets) -> list[Report]:
 def launchers_secrets(desk: Desk) -> list[bytes]:
     """Return every private key that the launcher has, in each form in which it might be written."""
     owner, domain = load_owner(desk.authority.owner), load_domain(desk.authority.domain)
-    found = [owner.master, desk.tickets.responder.wire]
+    found = [owner.master]
     for key in (owner.key, domain.key):
         numbers = key.private.private_numbers()  # type: ignore[attr-defined]
         found += [numbers.private_value.to_bytes(32, "big"), key.to_pem()]  # type: ignore[attr-defined]
@@ -93,11 +87,11 @@ def rented() -> MachineBundle:
     token = JoinToken(
         root=bytes(32),
         secret=secrets.token_bytes(JOIN_SECRET_BYTES),
-        role=JoinRole.ROBOT,
+        role=JoinRole.MACHINE,
         expires_unix_s=int(time.time()) + 900,
         servers=("198.51.100.7:51820",),
     )
-    return joining_boot(CLUSTER, "m7", lambda node: ("run", node.package), token)
+    return machine_boot(CLUSTER, "m7", lambda node: ("run", node.package), token)
 
 
 @pytest.mark.parametrize("provider", ["aws", "skypilot", "local"])
@@ -147,13 +141,13 @@ def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvi
 
 
 def test_a52_an_enrolled_machine_keeps_no_token(desk: Desk, tmp_path: Path) -> None:
-    ticket = desk.ticket()
-    install(tmp_path / "home", desk.boot(ticket=ticket))
+    token = desk.token()
+    install(tmp_path / "home", desk.boot(token=token))
     with desk.listening():
-        enrol(tmp_path / "home")
+        join(tmp_path / "home")
     left = b"\n".join(path.read_bytes() for path in (tmp_path / "home").rglob("*") if path.is_file())
-    assert ticket.token not in left
-    assert ticket.token.hex().encode() not in left
+    assert token.secret not in left
+    assert token.to_text().encode() not in left
     assert all(path.stat().st_mode & 0o077 == 0 for path in (tmp_path / "home").rglob("*.key"))
 
 
@@ -161,222 +155,283 @@ def test_a52_an_enrolled_machine_keeps_no_token(desk: Desk, tmp_path: Path) -> N
 
 
 def test_a52_a_token_admits_one_machine_as_it_was_planned(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
-    request = machine.request()
-    got = members(desk, machine, request, asked(desk, request))
+    got = memberships(desk, Machine(desk.token()).ask(desk.desk))
     assert [(each.role, each.label) for each in got] == [(Role.LEAF, "c-m7"), (Role.PROXY, "c-m7")]
     assert all(each.not_after_unix_s <= time.time() + 86_401 for each in got)
-    (news,) = desk.tickets.pending_reports()
-    assert news.report is Report.ENROLLED
-    assert news.issued_credentials is not None
-    assert news.issued_credentials.fingerprints == tuple(each.fingerprint.hex() for each in got)
-    assert verify_audit(desk.authority.domain).events["accepted", "membership leaf"] == 1
+    row = desk.registry.machine_with("c-m7")
+    assert row is not None
+    assert [each.name for each in row.nodes] == [each.name for each in got]
+    assert misused(desk) == []
+    desk.desk.flush()
+    events = verify_audit(desk.authority.domain).events
+    assert (events["accepted", "membership leaf"], events["accepted", "enrolment"]) == (1, 1)
 
 
 def test_a52_who_uses_a_token_after_the_machine_gets_nothing_and_is_reported(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
-    asked(desk, machine.request())
-    (enrolled,) = desk.tickets.pending_reports()
-    thief = Machine(machine.ticket)
-    assert asked(desk, thief.request()) == REFUSED
-    misused = desk.tickets.pending_reports()[-1]
-    assert misused.report is Report.MISUSED
-    assert misused.issued_credentials == enrolled.issued_credentials
-    assert enrolled.issued_credentials is not None
-    assert enrolled.issued_credentials.proxy[:16] in misused.detail
-    assert asked(desk, thief.request()) == asked(desk, machine.request()) == REFUSED
-    assert reports(desk.tickets) == [Report.ENROLLED, Report.MISUSED]  # once
-    desk.responder.flush()
-    assert verify_audit(desk.authority.domain).events["refused", "enrolment"] == 3
+    machine = Machine(desk.token())
+    proxy = memberships(desk, machine.ask(desk.desk))[-1].name.to_text()
+    thief = Machine(machine.token)
+    assert refused(desk, thief) is Refusal.USED
+    ((label, detail),) = desk.members.misuses()
+    assert label == "c-m7"
+    assert proxy[:16] in detail
+    desk.members.reported(label)
+    assert refused(desk, thief) is refused(desk, machine) is Refusal.USED
+    assert desk.members.misuses() == []  # reported once
+
+
+def test_a52_each_refusal_of_a_machines_token_is_in_the_audit_log(desk: Desk) -> None:
+    token = desk.token()
+    with desk.listening():
+        for _ in range(3):
+            with connect(token.servers[0], token.root) as channel, suppress(EnrolmentError):
+                channel.request(Machine(token).request(None, channel.binding, channel.nonce))
+    assert verify_audit(desk.authority.domain).events["refused", "enrolment"] == 2
+    lines = [json.loads(each) for each in (desk.authority.domain / "audit.jsonl").read_text().splitlines()]
+    about = [(each["action"], each["about"]) for each in lines if each["what"] == "enrolment"]
+    assert about == [("accepted", "c-m7"), ("refused", "c-m7"), ("refused", "c-m7")]
 
 
 def test_a52_a_machine_that_comes_after_a_thief_is_the_alarm(desk: Desk, tmp_path: Path) -> None:
-    ticket = desk.ticket()
-    install(tmp_path / "home", desk.boot(ticket=ticket))
-    asked(desk, Machine(ticket).request())
-    with desk.listening(), pytest.raises(LocalError, match="refuses this machine's ticket"):
-        enrol(tmp_path / "home")
-    assert reports(desk.tickets) == [Report.ENROLLED, Report.MISUSED]
+    token = desk.token()
+    install(tmp_path / "home", desk.boot(token=token))
+    Machine(token).ask(desk.desk)
+    with desk.listening(), pytest.raises(EnrolmentError, match="used already by 'c-m7'") as refusal:
+        join(tmp_path / "home")
+    assert refusal.value.code is Refusal.USED
+    assert misused(desk) == ["c-m7"]
 
 
-def test_a52_a_lost_answer_is_given_again_to_the_same_request_byte_for_byte(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
-    request = machine.request()
-    first = asked(desk, request)
-    assert asked(desk, request) == first
-    after_restart = Responder(desk.tickets, desk.authority)
-    assert after_restart.answer(request, time.time()) == first
-    assert reports(desk.tickets) == [Report.ENROLLED]
-
-
-def test_a52_a_machine_that_starts_again_gets_the_same_memberships(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
-    request = machine.request()
-    first = members(desk, machine, request, asked(desk, request))
-    again = replace(machine, secret=secrets.token_bytes(32))
-    request = again.request()
-    assert members(desk, again, request, asked(desk, request)) == first
-    assert reports(desk.tickets) == [Report.ENROLLED]
+def test_a52_a_lost_answer_is_given_again_to_the_same_keys(desk: Desk) -> None:
+    machine = Machine(desk.token())
+    first = machine.ask(desk.desk)
+    assert machine.ask(desk.desk) == first
+    assert machine.ask(desk.restarted()) == first
+    assert misused(desk) == []
 
 
 def test_a52_a_token_is_used_before_anything_is_issued(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = Machine(desk.ticket())
+    machine = Machine(desk.token())
 
     def die(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(desk.authority), "grant", die)
+        patch.setattr(desk_module, "admit", die)
         with pytest.raises(KeyboardInterrupt):
-            asked(desk, machine.request())
-    restarted = Responder(desk.tickets, desk.authority)
-    assert restarted.answer(Machine(machine.ticket).request(), time.time()) == REFUSED  # another key
-    assert reports(desk.tickets) == [Report.MISUSED]
+            machine.ask(desk.desk)
+    with pytest.raises(EnrolmentError, match="used already"):
+        Machine(machine.token).ask(desk.restarted())  # another key
+    assert misused(desk) == ["c-m7"]
 
 
 def test_a52_the_machine_itself_goes_on_where_its_launcher_was_killed(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine = Machine(desk.ticket())
+    machine = Machine(desk.token())
     with monkeypatch.context() as patch:
-        patch.setattr(Tickets, "complete", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Registry, "complete_token", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            asked(desk, machine.request())
-    request = machine.request()
-    with closing(Tickets(desk.folder / "enrolment")) as tickets:
-        answer = Responder(tickets, desk.authority).answer(request, time.time())
-        assert len(members(desk, machine, request, answer)) == 2
+            machine.ask(desk.desk)
+    with Registry(desk.files.config.state) as registry:
+        answer = machine.ask(EnrolmentDesk(desk.files, registry))
+        assert len(memberships(desk, answer)) == 2
+        assert len(answer.byte_strings("delegations", 4)) == 2
 
 
 def test_a52_a_token_is_good_for_minutes(desk: Desk) -> None:
-    machine = Machine(desk.ticket(minutes=10))
-    assert asked(desk, machine.request(), at_s=time.time() + 601) == REFUSED
-    assert asked(desk, machine.request(), at_s=time.time() + 599) != REFUSED
-    assert asked(desk, Machine(machine.ticket).request(), at_s=time.time() + 7_200) == REFUSED
-    assert reports(desk.tickets) == [Report.ENROLLED, Report.MISUSED]  # also long after it ran out
+    machine = Machine(desk.token(minutes=10))
+    assert refused(desk, machine, at_s=time.time() + 601) is Refusal.EXPIRED
+    assert misused(desk) == []
+    assert machine.ask(desk.desk, at_s=time.time() + 590)
+    assert refused(desk, Machine(machine.token), at_s=time.time() + 7_200) is Refusal.USED
+    assert misused(desk) == ["c-m7"]  # also long after it ran out
 
 
 def test_a52_the_token_of_a_machine_that_was_given_back_is_good_for_nothing(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
-    desk.tickets.delete(CLUSTER.name, "m7")
-    assert asked(desk, machine.request()) == b""
+    unused, used = Machine(desk.token()), Machine(desk.token("m8"), "c-m8")
+    used.ask(desk.desk)
+    for label in ("c-m7", "c-m8"):
+        desk.members.remove(label, unix_s=time.time())
+    assert refused(desk, unused) is Refusal.UNKNOWN_TOKEN
+    assert refused(desk, used) is refused(desk, Machine(used.token, "c-m8")) is Refusal.USED
+    assert misused(desk) == []
 
 
 # exactly the planned requests
 
 
-def other_seats(ticket: Ticket, role: Role, label: str) -> list[NodeKeys]:
-    return [NodeKeys.generate(ticket.seats[0].role, ticket.seats[0].label), NodeKeys.generate(role, label)]
+def other_nodes(token: JoinToken, role: Role, label: str) -> list[NodeKeys]:
+    return [NodeKeys.generate(token.role.nodes[0][1], "c-m7"), NodeKeys.generate(role, label)]
 
 
 @pytest.mark.parametrize(("role", "label"), [(Role.RIB, "c-m7"), (Role.PROXY, "robot"), (Role.SWITCH, "c-m7")])
 def test_a52_a_machine_becomes_nothing_but_what_was_planned(desk: Desk, role: Role, label: str) -> None:
-    ticket = desk.ticket()
-    machine = Machine(ticket, other_seats(ticket, role, label))
-    before = (desk.authority.domain / "issued.jsonl").exists()
-    assert asked(desk, machine.request()) == REFUSED
-    assert (desk.authority.domain / "issued.jsonl").exists() == before
-    assert reports(desk.tickets) == [Report.MISUSED]
+    token = desk.token()
+    ledger = desk.authority.domain / "issued.jsonl"
+    before = ledger.read_bytes()
+    assert refused(desk, Machine(token, keys=other_nodes(token, role, label))) is Refusal.WRONG_NODES
+    assert ledger.read_bytes() == before
+    assert misused(desk) == ["c-m7"]
+    assert refused(desk, Machine(token)) is Refusal.USED
 
 
 @pytest.mark.parametrize("role", [Role.SWITCH, Role.RIB])
 def test_l09_a_machine_that_is_to_be_a_leaf_becomes_no_switch(desk: Desk, role: Role) -> None:
-    ticket = desk.ticket()
-    proxy = NodeKeys.generate(ticket.seats[1].role, ticket.seats[1].label)
-    assert asked(desk, Machine(ticket, [NodeKeys.generate(role, ticket.seats[0].label), proxy]).request()) == REFUSED
-    assert reports(desk.tickets) == [Report.MISUSED]
+    keys = [NodeKeys.generate(role, "c-m7"), NodeKeys.generate(Role.PROXY, "c-m7")]
+    assert refused(desk, Machine(desk.token(), keys=keys)) is Refusal.WRONG_NODES
+    assert misused(desk) == ["c-m7"]
 
 
-def test_a52_metadata_of_another_name_are_refused(desk: Desk) -> None:
-    ticket = desk.ticket()
-    keys = [NodeKeys.generate(each.role, each.label, {"site": "elsewhere"}) for each in ticket.seats]
-    assert asked(desk, Machine(ticket, keys).request()) == REFUSED
+def test_a52_another_label_or_metadata_of_another_name_are_refused(desk: Desk) -> None:
+    for name, label, more in (("m7", "c-m8", None), ("m9", "c-m9", {"site": "elsewhere"})):
+        token = desk.token(name)
+        keys = [NodeKeys.generate(role, label, more) for _, role in token.role.nodes]
+        assert refused(desk, Machine(token, label, keys)) is Refusal.WRONG_NODES
+    assert misused(desk) == ["c-m7", "c-m9"]
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a52_neither_fewer_nor_more_members_are_admitted(desk: Desk, count: int) -> None:
-    machine = Machine(desk.ticket())
-    assert asked(desk, machine.request((machine.applications() * 2)[:count])) == REFUSED
+    machine = Machine(desk.token())
+    assert refused(desk, machine, (machine.applications() * 2)[:count]) is Refusal.WRONG_NODES
 
 
 def test_a52_a_request_that_another_key_made_is_refused(desk: Desk) -> None:
-    ticket = desk.ticket()
-    machine, victim = Machine(ticket), Machine(ticket)
+    token = desk.token()
+    machine, victim = Machine(token), Machine(token)
     stolen = [
-        apply(ticket.token, own.key, theirs.request(), own.kem.public)
+        apply(machine.identifier, own.key, theirs.request(), own.kem.public)
         for own, theirs in zip(machine.keys, victim.keys, strict=True)
     ]
-    assert asked(desk, machine.request(stolen)) == REFUSED
+    assert refused(desk, machine, stolen) is Refusal.WRONG_PROOF
 
 
 def test_a52_a_proof_for_another_token_or_kem_key_is_refused(desk: Desk) -> None:
-    ticket = desk.ticket()
-    machine, elsewhere = Machine(ticket), secrets.token_bytes(32)
+    machine, elsewhere = Machine(desk.token()), join_id(secrets.token_bytes(JOIN_SECRET_BYTES))
     foreign = [apply(elsewhere, each.key, each.request(), each.kem.public) for each in machine.keys]
-    assert asked(desk, machine.request(foreign)) == REFUSED
-    again = Machine(desk.ticket("m8"))
+    assert refused(desk, machine, foreign) is Refusal.WRONG_PROOF
+    again = Machine(desk.token("m8"), "c-m8")
     swapped = [replace(each, kem=KemPrivateKey.generate().public) for each in again.applications()]
-    assert asked(desk, again.request(swapped)) == REFUSED
+    assert refused(desk, again, swapped) is Refusal.WRONG_PROOF
 
 
 # the parties that listen and answer
 
 
-def test_a52_a_request_shows_neither_token_nor_machine_and_is_good_for_its_ticket_alone(desk: Desk) -> None:
-    machine, other = Machine(desk.ticket()), Machine(desk.ticket("m8"))
-    request = machine.request()
-    for secret in (machine.ticket.token, machine.secret, b"c-m7", machine.keys[0].key.public.compressed):
-        assert secret not in request
-    moved = request[:8] + other.request()[8:HEAD_BYTES] + request[HEAD_BYTES:]
-    assert asked(desk, moved) == b""
-    assert reports(desk.tickets) == []
+class Wiretap:
+    """Relay between a machine and the server's socket that keeps each byte of each connection."""
+
+    def __init__(self, listening: socket.socket, server: str) -> None:
+        self._listening, self._server = listening, server
+        self.sent = list[bytes]()  # by the machine
+        self.received = list[bytes]()
+
+    def run(self, connections: int) -> None:
+        for _ in range(connections):
+            peer, _ = self._listening.accept()
+            with closing(peer), closing(plain(self._server)) as server, ThreadPoolExecutor(1) as pool:
+                answers = pool.submit(self._copy, server, peer)
+                self.sent.append(self._copy(peer, server))
+                self.received.append(answers.result())
+
+    @staticmethod
+    def _copy(source: socket.socket, sink: socket.socket) -> bytes:
+        kept = b""
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                kept += data
+                sink.sendall(data)
+            sink.shutdown(socket.SHUT_WR)
+        return kept
+
+
+def plain(server: str) -> socket.socket:
+    return connect_control(Path(server.removeprefix("unix:")), 10.0)
 
 
 def test_a52_an_observer_who_replays_a_request_learns_nothing_and_changes_nothing(desk: Desk) -> None:
-    machine = Machine(desk.ticket())
+    machine = Machine(desk.token())
+    with desk.listening(), socket.create_server(("127.0.0.1", 0)) as listening:
+        tap = Wiretap(listening, machine.token.servers[0])
+        thread = threading.Thread(target=tap.run, args=(1,))
+        thread.start()
+        with connect(f"127.0.0.1:{listening.getsockname()[1]}", machine.token.root) as channel:
+            answer = channel.request(machine.request(None, channel.binding, channel.nonce))
+        thread.join()
+        with closing(plain(machine.token.servers[0])) as replay:
+            with suppress(OSError):
+                replay.sendall(tap.sent[0])
+            replay.settimeout(_END_S)
+            replayed = until_closed(replay)
+        assert machine.ask(desk.desk) == answer
+    secrets_ = [
+        machine.token.secret,
+        machine.identifier,
+        b"c-m7",
+        *(each.key.public.compressed for each in machine.keys),
+    ]
+    for secret in [*secrets_, *answer.byte_strings("members", 4), *answer.byte_strings("delegations", 4)]:
+        assert all(secret not in seen for seen in (tap.sent[0], tap.received[0], replayed))
+    assert misused(desk) == []
+
+
+def until_closed(peer: socket.socket) -> bytes:
+    kept = b""
+    with suppress(ConnectionResetError):
+        while data := peer.recv(1 << 16):
+            kept += data
+    return kept
+
+
+def test_a52_a_request_is_good_for_its_connection_and_its_token_alone(desk: Desk) -> None:
+    machine, other = Machine(desk.token()), Machine(desk.token("m8"), "c-m8")
     request = machine.request()
-    answer = asked(desk, request)
-    replayed = asked(desk, request)
-    assert replayed == answer
-    got = machine.opened(request, answer)
-    assert all(each.member not in replayed for each in got.granted)
-    with pytest.raises(StatementError):
-        open_answer(machine.ticket.token, request, bytes(32), replayed[4:])  # with the token, without the answer secret
-    assert reports(desk.tickets) == [Report.ENROLLED]
+    moved = [
+        (Fields({**request, "id": other.identifier}), BINDING, NONCE),
+        (Fields(request), bytes([1]) * 32, NONCE),
+        (Fields(request), BINDING, bytes([1]) * 32),
+    ]
+    for each in moved:
+        with pytest.raises(EnrolmentError, match="not by the holder of the token"):
+            desk.desk.join(*each, time.time())
+    assert misused(desk) == []
+    assert machine.ask(desk.desk)
 
 
-class Impostor:
-    """Machine in the middle that has read its victim's user data and lacks the responder's private key."""
+def test_a52_who_knows_the_token_alone_cannot_answer_in_the_launchers_place(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine in the middle has read its victim's user data, and lacks the domain's key."""
+    token, stolen = desk.token(), desk.desk.root.to_pem()
+    asked = list[object]()
 
-    def __init__(self, ticket: Ticket, answer: bytes) -> None:
-        self._ticket, self._answer = ticket, answer
-        self.asked = 0
+    def greeting(self: EnrolmentDesk, nonce: bytes, unix_s: float) -> dict[str, object]:
+        return {"v": 1, "root": stolen, "nonce": nonce, "now": int(unix_s)}
 
-    def is_expected(self, _: bytes) -> bool:
-        return True
-
-    def answer(self, request: bytes, _: float) -> bytes:
-        self.asked += 1
-        with pytest.raises(StatementError):
-            open_request(KemPrivateKey.generate(), request)
-        return seal_answer(self._ticket.token, request, bytes(32), self._answer)
-
-    def flush(self) -> None:
-        pass
-
-
-def test_a52_who_knows_the_token_alone_cannot_answer_in_the_launchers_place(desk: Desk, tmp_path: Path) -> None:
-    ticket = desk.ticket()
-    install(tmp_path / "home", desk.boot(ticket=ticket))
-    machine = Machine(ticket)
-    request = machine.request()
-    forged = machine.opened(request, asked(desk, request)).to_wire()
-    impostor = Impostor(ticket, forged)
-    desk.responder = impostor  # type: ignore[assignment]
-    with desk.listening(), pytest.raises(LocalError, match="an answer that the responder did not make"):
-        enrol(tmp_path / "home", patience_s=0.5)
-    assert impostor.asked
+    with running_lab(tmp_path, "evil") as evil:
+        monkeypatch.setattr(EnrolmentDesk, "greeting", greeting)
+        monkeypatch.setattr(EnrolmentDesk, "join", lambda *args: asked.append(args))
+        boot = desk.boot(token=replace(token, servers=evil.token().servers))
+        install(tmp_path / "home", boot)
+        with pytest.raises(EnrolmentError, match=r"not its key.*nothing was sent"):
+            join(tmp_path / "home")
+    assert asked == []
     assert not list((tmp_path / "home").rglob("node.crt"))
+
+
+def test_a52_an_answer_of_a_wrong_form_is_refused(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "home", desk.boot())
+    right = EnrolmentDesk.join
+
+    def wrong(self: EnrolmentDesk, *args: object) -> Fields:
+        answer = right(self, *args)  # type: ignore[arg-type]
+        return Fields({**answer, "delegations": [b"none"]})
+
+    monkeypatch.setattr(EnrolmentDesk, "join", wrong)
+    with desk.listening(), pytest.raises(EnrolmentError, match="the server's response is not valid"):
+        join(tmp_path / "home")
+    assert not (tmp_path / "home" / "member").exists()
 
 
 # requests that cost nothing
@@ -402,112 +457,94 @@ def dear(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a52_a_wrong_token_draws_neither_decapsulation_nor_signature(desk: Desk, dear: list[str]) -> None:
-    machine = Machine(desk.ticket())
+    machine = Machine(desk.token())
     request = machine.request()
+    guessed = Machine(replace(machine.token, secret=secrets.token_bytes(JOIN_SECRET_BYTES))).request()
+    mac = request["mac"]
+    assert isinstance(mac, bytes)
     dear.clear()
     for index in range(1_000):
-        wrong = bytearray(request)
+        wrong = bytearray(mac)
         wrong[-1 - index % 32] ^= 1 + index // 32
-        assert asked(desk, bytes(wrong)) == b""
-    guessed = Machine(replace(machine.ticket, token=secrets.token_bytes(32))).request()
-    dear.clear()
-    assert asked(desk, guessed) == b""
+        with pytest.raises(EnrolmentError):
+            desk.desk.join(Fields({**request, "mac": bytes(wrong)}), BINDING, NONCE, time.time())
+    with pytest.raises(EnrolmentError):
+        desk.desk.join(Fields(guessed), BINDING, NONCE, time.time())
     assert dear == []
-    assert asked(desk, request) != b""
+    assert machine.ask(desk.desk)
 
 
-def test_a52_who_has_a_token_draws_a_bounded_number_of_decapsulations(desk: Desk, dear: list[str]) -> None:
-    machine = Machine(desk.ticket())
-    requests = [replace(machine, secret=secrets.token_bytes(32)).request() for _ in range(OPENED_MAX + 20)]
+def test_a52_who_has_a_token_draws_a_bounded_number_of_verifications(desk: Desk, dear: list[str]) -> None:
+    machine = Machine(desk.token())
+    for _ in range(OPENED_MAX):
+        machine.ask(desk.desk)
     dear.clear()
-    for request in requests:
-        asked(desk, request)
-    assert dear.count("open") == OPENED_MAX
-    dear.clear()
-    assert asked(desk, requests[OPENED_MAX - 1]) not in (b"", REFUSED)  # the last token again: nothing is opened
+    for _ in range(20):
+        assert refused(desk, machine) is Refusal.UNAVAILABLE
     assert dear == []
-
-
-@pytest.mark.parametrize("size", [0, 1, HEAD_BYTES - 1, HEAD_BYTES, HEAD_BYTES + 40, 2_000, 20_000])
-def test_a52_garbage_of_any_length_is_nothing(desk: Desk, size: int) -> None:
-    assert asked(desk, os.urandom(size)) == b""
-    assert asked(desk, b"GDPE\x01" + os.urandom(size)) == b""
-
-
-def connected(listener: Listener) -> socket.socket:
-    return socket.create_connection(listener.address, 5.0)  # type: ignore[arg-type]
-
-
-def ends(peer: socket.socket) -> bool:
-    peer.settimeout(CONNECTION_S + 5.0)
-    try:
-        return peer.recv(1) == b""
-    except ConnectionResetError:
-        return True
+    assert misused(desk) == []
 
 
 @pytest.mark.parametrize(
-    "first",
-    [b"GET / HTTP/1.1\r\n", b"GDPE\x02", b"GDPE\x01\xff\xff\xff" + bytes(16), b"GDPE\x01\x00\x20\x00" + bytes(16)],
-    ids=["other", "version", "too long", "no ticket"],
+    ("payload", "ends_tls"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", False),
+        (b"GDPE\x01" + os.urandom(2_000), False),
+        (b"", True),
+        (b"\xff\xff\xff\xff" + bytes(16), True),
+        (encode_message({"op": "join"}) + bytes(64), True),
+        ((STRANGER_MAX_BYTES + 1).to_bytes(4, "big") + bytes(8 * STRANGER_MAX_BYTES), True),
+        (b"\0\0\0\x40" + os.urandom(64), True),
+    ],
+    ids=["other", "an earlier protocol", "nothing", "too long", "no token", "a flood", "garbage"],
 )
-def test_a52_a_connection_ends_at_its_first_wrong_byte(desk: Desk, first: bytes) -> None:
-    with desk.listening(bind_tcp("127.0.0.1", 0)) as listener, closing(connected(listener)) as peer:
-        begun_s = time.monotonic()
-        peer.sendall(first)
-        assert ends(peer)
-        assert time.monotonic() - begun_s < CONNECTION_S
-
-
-def test_a52_a_flood_of_a_ticket_holder_takes_no_more_than_a_request(desk: Desk) -> None:
-    request = Machine(desk.ticket()).request()
-    with desk.listening(bind_tcp("127.0.0.1", 0)) as listener, closing(connected(listener)) as peer:
-        with suppress(BrokenPipeError, ConnectionResetError):
-            peer.sendall(request + bytes(64 * REQUEST_MAX_BYTES))
-        assert ends(peer)
+def test_a52_a_connection_ends_at_what_is_wrong(desk: Desk, payload: bytes, ends_tls: bool) -> None:
+    """A silent or slow one ends in time, which ``test_a_slow_stranger_is_closed`` plays."""
+    token = desk.token()
+    with desk.listening():
+        with closing(plain(token.servers[0])) as peer:
+            stream = client_context().wrap_socket(peer) if ends_tls else peer
+            begun_s = time.monotonic()
+            with suppress(OSError):
+                stream.sendall(payload)
+            if not payload:
+                stream.shutdown(socket.SHUT_WR)
+            with suppress(OSError):
+                while stream.recv(1 << 16):
+                    pass
+            assert time.monotonic() - begun_s < 5.0
+            stream.close()
+        with connect(token.servers[0], token.root) as channel:
+            assert channel.request(Machine(token).request(None, channel.binding, channel.nonce)).flag("ok")
 
 
 def test_a52_silent_connections_keep_no_machine_out(desk: Desk, tmp_path: Path) -> None:
-    bound = bind_tcp("127.0.0.1", 0)
-    install(tmp_path / "home", desk.boot(ticket=desk.ticket(address=f"tcp://127.0.0.1:{bound.getsockname()[1]}")))
-    with desk.listening(bound) as listener:
-        silent = [connected(listener) for _ in range(2 * CONNECTIONS_MAX)]
-        assert enrol(tmp_path / "home")
+    token = desk.token()
+    install(tmp_path / "home", desk.boot(token=token))
+    with desk.listening():
+        silent = [plain(token.servers[0]) for _ in range(100)]
+        assert join(tmp_path / "home")
         for each in silent:
             each.close()
 
 
-def test_a52_a_slow_request_ends_within_seconds(desk: Desk) -> None:
-    request = Machine(desk.ticket()).request()
-    with desk.listening(bind_tcp("127.0.0.1", 0)) as listener, closing(connected(listener)) as peer:
-        begun_s = time.monotonic()
-        peer.sendall(request[:40])
-        assert ends(peer)
-        assert time.monotonic() - begun_s < CONNECTION_S + 4.0
+def test_a52_a_machine_joins_in_a_flood_of_wrong_tokens(desk: Desk, tmp_path: Path) -> None:
+    token = desk.token()
+    install(tmp_path / "home", desk.boot(token=token))
+    wrong = Machine(replace(token, secret=secrets.token_bytes(JOIN_SECRET_BYTES)))
+    is_over = threading.Event()
 
+    def flood() -> None:
+        while not is_over.is_set():
+            with suppress(EnrolmentError), connect(token.servers[0], token.root) as channel:
+                channel.request(wrong.request(None, channel.binding, channel.nonce))
 
-def test_a52_a_machine_enrols_in_a_flood_of_wrong_tokens(desk: Desk, tmp_path: Path) -> None:
-    bound = bind_tcp("127.0.0.1", 0)
-    ticket = desk.ticket(address=f"tcp://127.0.0.1:{bound.getsockname()[1]}")
-    install(tmp_path / "home", desk.boot(ticket=ticket))
-    wrong = Machine(replace(ticket, token=secrets.token_bytes(32))).request()
-    is_over = False
-
-    def flood(listener: Listener) -> None:
-        while not is_over:
-            try:
-                with closing(connected(listener)) as peer:
-                    peer.sendall(wrong)
-                    ends(peer)
-            except OSError:
-                continue
-
-    with desk.listening(bound) as listener, ThreadPoolExecutor(4) as pool:
-        floods = [pool.submit(flood, listener) for _ in range(4)]
+    with desk.listening(), ThreadPoolExecutor(4) as pool:
+        floods = [pool.submit(flood) for _ in range(4)]
         try:
-            assert enrol(tmp_path / "home")
+            assert join(tmp_path / "home")
         finally:
-            is_over = True
+            is_over.set()
     assert [each.result() for each in floods] == [None] * 4
 
 
@@ -525,69 +562,97 @@ class Recorded(Memory):
         self.boots[spec.name] = boot
         return super().create(spec, boot)
 
-    def ticket(self, name: str) -> Ticket:
-        return Ticket.from_json(self.boots[name].files[TICKET_FILE])
+    def machine(self, name: str) -> Machine:
+        """Return a machine with keys of its own that has read the user data of this one."""
+        document = json.loads(self.boots[name].files[JOIN_FILE])
+        return Machine(JoinToken.from_text(document["token"]), document["label"])
 
 
 @pytest.fixture
-def tickets(site: Site) -> Iterator[Tickets]:
-    with closing(Tickets(site.enrolment_folder)) as made:
+def local(site: Site) -> Iterator[Desk]:
+    with desk_of(site) as made:
         yield made
 
 
+@contextmanager
+def requested(site: Site, journal: Journal, provider: Recorded) -> Iterator[Supervisor]:
+    """Yield a supervisor whose machine m1 boots."""
+    with closing(supervisor(site, journal, provider)) as ours:
+        journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
+        work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
+        yield ours
+
+
+def joins(desk: Desk, machine: Machine, home: Path) -> list[str]:
+    """Let a machine join as its first start does; return the fingerprints of its memberships."""
+    home.mkdir()
+    document = {"token": machine.token.to_text(), "label": machine.label}
+    (home / JOIN_FILE).write_text(json.dumps(document))
+    (home / JOIN_FILE).chmod(0o600)
+    with desk.listening():
+        assert join(home)
+    row = desk.registry.machine_with(machine.label)
+    assert row is not None
+    return [each.hex() for each in desk.registry.fingerprints(row.id)]
+
+
+def revoked(site: Site) -> set[str]:
+    assert site.revocations is not None
+    return {path.stem for path in site.revocations[0].glob("*.revoke")}
+
+
 def test_a52_a_machine_whose_token_is_used_again_is_named_revoked_and_replaced(
-    site: Site, journal: Journal, tickets: Tickets
+    site: Site, journal: Journal, local: Desk, tmp_path: Path
 ) -> None:
-    provider, responder = Recorded(), Responder(tickets, site.authority)
-    ours = supervisor(site, journal, provider)
-    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
-    work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
-    assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
-    work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)
-    issued_credentials = journal.machines("c")[0].issued_credentials
-    assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) == REFUSED
-    work(ours, lambda: list(provider.machines) == ["m2"])
-    ours.close()
+    provider = Recorded()
+    with requested(site, journal, provider) as ours:
+        fingerprints = joins(local, provider.machine("m1"), tmp_path / "home")
+        work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)
+        proxy = journal.machines("c")[0].issued_credentials.proxy
+        assert refused(local, provider.machine("m1")) is Refusal.USED
+        work(ours, lambda: list(provider.machines) == ["m2"])
     (alarm,) = (each for each in journal.events("c") if each.what == "alarm")
     assert alarm.machine == "m1"
-    assert issued_credentials.proxy[:16] in alarm.detail
-    assert site.revocations is not None
-    revoked = {path.stem for path in site.revocations[0].glob("*.revoke")}
-    assert revoked == {each[:32] for each in issued_credentials.fingerprints}
+    assert proxy[:16] in alarm.detail
+    assert revoked(site) == {each[:32] for each in fingerprints}
 
 
-def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
-    site: Site, journal: Journal, tickets: Tickets
+def test_a52_a_misuse_is_an_alarm_alone_where_the_site_says_so(
+    site: Site, journal: Journal, local: Desk, tmp_path: Path
 ) -> None:
-    provider, responder = Recorded(), Responder(tickets, site.authority)
-    ours = supervisor(site, journal, provider)
-    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
-    work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
-    assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
-    record = journal.machines("c")[0]
-    journal.put(replace(record, released_unix_s=time.time()), time.time())
-    ours.reconcile()
-    ours.close()
-    assert site.revocations is not None
-    assert len(list(site.revocations[0].glob("*.revoke"))) == 2
+    provider = Recorded()
+    lenient = replace(site, enrolment=site.enrolment.model_copy(update={"revoke_misused": False}))
+    with requested(lenient, journal, provider) as ours:
+        joins(local, provider.machine("m1"), tmp_path / "home")
+        work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)
+        refused(local, provider.machine("m1"))
+        work(ours, lambda: [each for each in journal.events("c") if each.what == "alarm"])
+        ours.reconcile()
+    assert [each.what for each in journal.events("c")].count("alarm") == 1
+    assert list(provider.machines) == ["m1"]
+    assert revoked(site) == set()
+
+
+def test_a52_a_machine_that_joins_when_it_is_no_longer_wanted_is_revoked(
+    site: Site, journal: Journal, local: Desk, tmp_path: Path
+) -> None:
+    provider = Recorded()
+    with requested(site, journal, provider) as ours:
+        joins(local, provider.machine("m1"), tmp_path / "home")
+        journal.put(replace(journal.machines("c")[0], released_unix_s=time.time()), time.time())
+        ours.reconcile()
+    assert len(revoked(site)) == 2
 
 
 def test_a52_what_happened_while_no_supervisor_lived_is_acted_on_by_the_next(
-    site: Site, journal: Journal, tickets: Tickets
+    site: Site, journal: Journal, local: Desk, tmp_path: Path
 ) -> None:
     provider = Recorded()
-    first = supervisor(site, journal, provider)
-    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
-    work(first, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
-    first.close()
-    Responder(tickets, site.authority).answer(Machine(provider.ticket("m1")).request(), time.time())
-    second = supervisor(site, journal, provider)
-    work(second, lambda: journal.machines("c")[0].issued_credentials.fingerprints)
-    second.close()
-    assert tickets.pending_reports() == []
-
-
-def test_a52_an_answer_of_a_wrong_form_is_refused() -> None:
-    for head in (b"\x00abc", b"\x02\x00\x00\x01", b"\x01\xff\xff\xff", b"\x01"):
-        with pytest.raises(StatementError):
-            answer_bytes(head)
+    with requested(site, journal, provider):
+        pass
+    joins(local, provider.machine("m1"), tmp_path / "home")
+    refused(local, provider.machine("m1"))
+    with closing(supervisor(site, journal, provider)) as second:
+        work(second, lambda: list(provider.machines) == ["m2"])
+    assert len(revoked(site)) == 2
+    assert local.members.misuses() == []

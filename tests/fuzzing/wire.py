@@ -34,16 +34,8 @@ from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.parity import Parity
 from gdp.names import Name
 from gdp.trust.audit import BEGIN, AuditLine
-from gdp.trust.bootstrap_ticket import (
-    Application,
-    EnrolmentResponse,
-    Granted,
-    Request,
-    Seat,
-    Ticket,
-    request_head,
-    seal_request,
-)
+from gdp.trust.enrolment_wire import Application, read_message
+from gdp.trust.join_token import JoinRole, JoinToken
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 from tests.fuzzing.bodies import decoders
@@ -148,9 +140,10 @@ def _introduction() -> bytes:
 
 _REPORT: Final = AckNack(AckNackFlag.NONE, 5, 1, (MissingRange(5, 1, 2),))
 _STATUS: Final = Heartbeat(1, 5, 0, {bytes(32): StreamStart(1, 1, 1)}, b"description")
-_TICKET: Final = Ticket(("tcp://a:1",), _NODE.kem.public, _KEY, (Seat("switch", _NODE.role, "a"),))
+_TOKEN: Final = JoinToken(
+    root=_KEY, secret=bytes(16), role=JoinRole.MACHINE, expires_unix_s=NOW, servers=("a:1", "unix:/run/a")
+)
 _APPLICATION: Final = Application(b"csr", _NODE.kem.public, bytes(64))
-_GRANTED: Final = Granted(b"certificate", (b"delegation",))
 
 DECODERS: Final = (
     Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
@@ -189,19 +182,16 @@ DECODERS: Final = (
         (seal_keepalive(_KEY, _HEADER, 0, 3, bytes(8)),),
         (FrameError,),
     ),
-    Decoder("ticket", Ticket.from_json, (_TICKET.to_json(),), (LocalError,)),
-    Decoder("enrol-head", request_head, (seal_request(_TICKET, [_APPLICATION], _KEY),), (StatementError,)),
     Decoder(
-        "enrol-request",
-        Request.from_wire,
-        (Request(_KEY, (_APPLICATION,)).to_wire(),),
-        (StatementError,),
-        is_cbor=True,
+        "join-token",
+        lambda data: JoinToken.from_text(data.decode("latin-1")),
+        (_TOKEN.to_text().encode(),),
+        (LocalError,),
     ),
     Decoder(
-        "enrol-answer",
-        EnrolmentResponse.from_wire,
-        (EnrolmentResponse(b"root", (_GRANTED,)).to_wire(),),
+        "join-request",
+        lambda data: [Application.from_fields(each) for each in read_message(data).maps("nodes", 4)],
+        (cbor.encode({"op": "join", "nodes": [_APPLICATION.to_fields()]}),),
         (StatementError,),
         is_cbor=True,
     ),

@@ -71,6 +71,7 @@ def test_every_result_is_as_the_page_says() -> None:
         ("grant", "get friends(=n) in", ""),
         ("feed", "(=me, =l, start: number)", "(=me, any: number, start: number)"),
         ("join", "event Reads(name_of(pk(sk)), t);", ""),
+        ("enrol", "if mac = hmac(key, (MAC, cert, n, id, csr, kem, evidence)) then", ""),
     ],
 )
 def test_a_check_that_is_left_out_of_a_model_changes_a_result(

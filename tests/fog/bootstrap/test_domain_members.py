@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -11,14 +10,13 @@ from pathlib import Path
 import pytest
 
 from fog.bootstrap.domain_members import DomainMembers
-from gdp.enrolment.agent import Agent
+from gdp.enrolment.channel import connect
 from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.enrolment_wire import EnrolmentError
-from gdp.trust.join_token import JoinToken
+from gdp.trust.join_token import JoinToken, fingerprint_of
 from gdp.trust.right import Right
-from lab.process import until
 from tests.fog.bootstrap.desk import MAP, PLAN
 from tests.gdp.enrolment.lab import Lab, running_lab
 
@@ -34,12 +32,13 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
 @pytest.fixture
 def members(lab: Lab) -> Iterator[DomainMembers]:
-    with closing(DomainMembers(lab.files.directory)) as made:
+    with closing(DomainMembers(lab.files)) as made:
         yield made
 
 
 def token(members: DomainMembers) -> JoinToken:
-    return members.issue_token(LABEL, valid_s=TOKEN_S, unix_s=time.time())
+    now_s = time.time()
+    return members.issue_token(LABEL, [PLAN, MAP], valid_s=TOKEN_S, until_unix_s=now_s + 3_600.0, unix_s=now_s)
 
 
 def joined(lab: Lab, members: DomainMembers) -> Joined:
@@ -60,22 +59,21 @@ def test_a_token_of_a_machine_is_refused_under_another_label(lab: Lab, members: 
         join_domain(request)
 
 
-def test_a_joined_machine_gets_its_delegations_by_mail(lab: Lab, members: DomainMembers) -> None:
-    machine, proxy = joined(lab, members), members.find(LABEL)
-    assert proxy is not None
-    now_s = time.time()
-    members.delegate(proxy, [PLAN, MAP], until_unix_s=now_s + 3_600.0, unix_s=now_s)
-    folder = machine.directory / "proxy" / DELEGATIONS
-    agent = Agent(machine.directory, poll_s=1.0)
-    thread = threading.Thread(target=agent.run)
-    thread.start()
-    try:
-        until(lambda: len(list(folder.glob("*.delegation"))) == 2, "both delegations")
-    finally:
-        agent.stop()
-        thread.join()
-    held = {right for topic in DelegationStore(folder, machine.identities[-1]) for right in topic.delegation.rights}
-    assert held == {Right.SERVE, Right.PUBLISH}
+def test_a_machine_gets_its_delegations_with_its_memberships(lab: Lab, members: DomainMembers) -> None:
+    machine = joined(lab, members)
+    held = DelegationStore(machine.directory / "proxy" / DELEGATIONS, machine.identities[-1])
+    assert {right for topic in held for right in topic.delegation.rights} == {Right.SERVE, Right.PUBLISH}
+
+
+def test_nothing_of_a_machine_lasts_longer_than_planned(lab: Lab, members: DomainMembers) -> None:
+    machine = joined(lab, members)
+    ends = {each.member.not_after_unix_s for each in machine.identities}
+    assert all(each <= time.time() + 3_601 for each in ends)
+    certificates = [each.membership for each in machine.identities]
+    with connect(f"127.0.0.1:{lab.port}", fingerprint_of(machine.root)) as channel:
+        channel.identify(machine.identities[-1], bytes(16))
+        answer = channel.request({"op": "renew", "certificates": certificates})
+    assert answer.byte_strings("members", 4) == certificates
 
 
 def test_a_removed_machine_is_revoked_and_its_endpoint_record_is_gone(lab: Lab, members: DomainMembers) -> None:

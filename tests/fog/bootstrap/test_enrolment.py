@@ -1,4 +1,4 @@
-"""Enrolment of a machine: its files and keys, the listener, and the robot's rules."""
+"""Joining of a machine of this host: its files and keys, its revocation, and the robot's rules."""
 
 from __future__ import annotations
 
@@ -10,24 +10,27 @@ from pathlib import Path
 import pytest
 
 from fog.bootstrap.bundles import gateway_boot
-from fog.bootstrap.listener import bind_tcp
-from fog.bootstrap.members import Authority, metadata_of, revoke_credentials
+from fog.bootstrap.members import Authority, metadata_of
 from fog.bootstrap.robot_config import add_rules, reload_proxy, remove_rules
 from fog.cluster import ExportedInterface
 from fog.host.bundle import install
-from fog.host.enrolment import enrol
+from fog.host.joining import join
 from fog.site import open_site
 from gdp.config.config import RibConfig, SwitchConfig
 from gdp.config.drop_in import drop_in_directory
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
+from gdp.enrolment import domain_join, removal
+from gdp.enrolment.removal import remove_machine
 from gdp.errors import ConfigError, LocalError
 from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
+from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.process import until
 from proxy.config.config import ProxyConfig
 from tests.fog.bootstrap.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
@@ -44,7 +47,7 @@ def authority(desk: Desk) -> Authority:
 
 
 def test_a_machine_boots_with_files_that_the_nodes_take(desk: Desk, tmp_path: Path) -> None:
-    desk.enrol(tmp_path / "home")
+    desk.join(tmp_path / "home")
     config = ProxyConfig.load(tmp_path / "home" / "proxy.yaml")
     switch = SwitchConfig.load(tmp_path / "home" / "switch.yaml")
     assert (switch.attach, [port.iface for port in switch.ports]) == (("proxy0",), ["eth0"])
@@ -53,13 +56,13 @@ def test_a_machine_boots_with_files_that_the_nodes_take(desk: Desk, tmp_path: Pa
 
 def test_a_machine_is_a_leaf_unless_it_may_become_the_gateway(desk: Desk, tmp_path: Path) -> None:
     for name, is_gateway, role in (("m1", False, Role.LEAF), ("m2", True, Role.SWITCH)):
-        desk.enrol(tmp_path / name, name, is_gateway=is_gateway)
+        desk.join(tmp_path / name, name, is_gateway=is_gateway)
         config = SwitchConfig.load(tmp_path / name / "switch.yaml")
         assert load_member(config.identity, config.domain, Role.SWITCH)[0].role is role
 
 
 def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_path: Path) -> None:
-    desk.enrol(tmp_path / "home")
+    desk.join(tmp_path / "home")
     config = ProxyConfig.load(tmp_path / "home" / "proxy.yaml")
     held = DelegationStore(config.delegations, load_identity(config.identity, time.time()))
     key = load_owner(desk.authority.owner).key.public.compressed
@@ -71,8 +74,8 @@ def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_pat
 
 def test_machine_and_robot_derive_one_name_which_the_owners_key_alone_does_not_give(tmp_path: Path) -> None:
     with made_desk(tmp_path, CLUSTER.salted("unguessable")) as desk:
-        desk.enrol(tmp_path / "home")
-        path = open_site(None, tmp_path / "state").robots[0]
+        desk.join(tmp_path / "home")
+        path = desk.site.robots[0]
         add_rules(path, desk.authority, "c", desk.cluster.carried, days=1.0)
     served, used = ProxyConfig.load(tmp_path / "home" / "proxy.yaml").expose, ProxyConfig.load(path).imports
     names = {rule.overlay_name_of(rule.name, rule.type_name) for rule in served}
@@ -85,51 +88,64 @@ def test_machine_and_robot_derive_one_name_which_the_owners_key_alone_does_not_g
 
 def test_no_two_machines_share_a_key(desk: Desk, tmp_path: Path) -> None:
     for name in ("m1", "m2"):
-        desk.enrol(tmp_path / name, name)
-    issued_credentials = [each.issued_credentials for each in desk.tickets.pending_reports()]
-    assert issued_credentials[0] is not None
-    assert issued_credentials[1] is not None
-    assert issued_credentials[0].proxy != issued_credentials[1].proxy
-    assert not {*issued_credentials[0].fingerprints} & {*issued_credentials[1].fingerprints}
-    assert issued_credentials[0].until_unix_s == pytest.approx(time.time() + 86_400, abs=120)
+        desk.join(tmp_path / name, name)
+    first, second = desk.members.find("c-m1"), desk.members.find("c-m2")
+    assert first is not None
+    assert second is not None
+    assert first.name != second.name
+    rows = [desk.registry.machine_with(f"c-{name}") for name in ("m1", "m2")]
+    names = [{node.name for node in row.nodes} for row in rows if row is not None]
+    assert [len(each) for each in names] == [2, 2]
+    assert not names[0] & names[1]
+    assert rows[0] is not None
+    assert rows[0].until_unix_s == pytest.approx(time.time() + 86_400, abs=120)
 
 
-def test_a_machine_that_has_enrolled_does_not_ask_again(desk: Desk, tmp_path: Path) -> None:
-    desk.enrol(tmp_path / "home")
-    assert not enrol(tmp_path / "home")
-    assert load_identity(tmp_path / "home" / "switch", time.time()).label == "c-m7"
+def test_a_machine_that_has_joined_does_not_ask_again(desk: Desk, tmp_path: Path) -> None:
+    desk.join(tmp_path / "home")
+    assert not join(tmp_path / "home")
+    assert load_identity(tmp_path / "home" / "member" / "switch", time.time()).label == "c-m7"
 
 
 def test_a_machine_asks_until_its_launcher_is_there(desk: Desk, tmp_path: Path) -> None:
     install(tmp_path / "home", desk.boot())
     with ThreadPoolExecutor() as pool:
-        asking = pool.submit(enrol, tmp_path / "home", patience_s=30.0)
-        key = tmp_path / "home" / "proxy" / "node.csr"
-        while not key.exists() and not asking.done():
-            time.sleep(0.01)
+        asking = pool.submit(join, tmp_path / "home", deadline_s=30.0)
+        key = tmp_path / "home" / "keys" / "proxy" / "node.csr"
+        until(lambda: key.exists() or asking.done(), "keys")
         with desk.listening():
             assert asking.result()
 
 
 def test_a_machine_gives_up_without_an_answer(desk: Desk, tmp_path: Path) -> None:
     install(tmp_path / "home", desk.boot())
-    with pytest.raises(LocalError, match=r"this machine was not enrolled.*socket"):
-        enrol(tmp_path / "home", patience_s=0.1)
+    with pytest.raises(UnreachableError, match=r"the enrolment server is not reachable.*socket"):
+        join(tmp_path / "home", deadline_s=0.1)
 
 
-def test_a_machine_enrols_over_tcp(desk: Desk, tmp_path: Path) -> None:
-    bound = bind_tcp("127.0.0.1", 0)
-    ticket = desk.ticket(address=f"tcp://127.0.0.1:{bound.getsockname()[1]}")
-    install(tmp_path / "home", desk.boot(ticket=ticket))
-    with desk.listening(bound):
-        assert enrol(tmp_path / "home")
+def test_a_machine_that_is_killed_while_it_joins_asks_with_the_same_keys(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path / "home", desk.boot())
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with desk.listening():
+        with monkeypatch.context() as patch:
+            patch.setattr(domain_join, "_install", die)  # after the response
+            with pytest.raises(KeyboardInterrupt):
+                join(tmp_path / "home")
+        assert join(tmp_path / "home")
+    assert desk.members.misuses() == []
+    assert not (tmp_path / "home" / "keys").exists()
 
 
 def test_a_socket_below_a_long_path_is_reached(tmp_path: Path) -> None:
-    folder = tmp_path / ("long" * 40)
+    folder = tmp_path / ("long" * 30)
     folder.mkdir()
     with made_desk(folder) as desk:
-        desk.enrol(tmp_path / "home")
+        desk.join(tmp_path / "home")
 
 
 def test_nodes_start_first_and_know_their_machine(desk: Desk) -> None:
@@ -207,18 +223,29 @@ def test_a_rule_that_conflicts_with_the_robots_is_refused_and_leaves_no_file(tmp
     assert not list(drop_in_directory(path).iterdir())
 
 
-def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(
-    authority: Authority, tmp_path: Path
+def test_what_is_gone_is_revoked_once_and_forgotten_when_it_would_have_run_out(desk: Desk, tmp_path: Path) -> None:
+    folder, now_s = desk.files.config.revocations, time.time()
+    for name in ("m1", "m2"):
+        desk.join(tmp_path / name, name)
+    gone = [load_identity(tmp_path / "m1" / "member" / each, now_s).member for each in ("switch", "proxy")]
+    assert remove_machine(desk.files, "c-m1", unix_s=now_s).revoked == 2
+    revoked = {Revocation.from_statement(parse(path.read_bytes())).fingerprint for path in folder.iterdir()}
+    assert revoked == {each.fingerprint for each in gone}
+    assert remove_machine(desk.files, "c-m1", unix_s=now_s).revoked == 0
+    remove_machine(desk.files, "c-m2", unix_s=now_s + 2 * 86_400)  # all have run out
+    assert not list(folder.iterdir())
+
+
+def test_a_removal_that_was_interrupted_is_completed_by_the_next(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, now_s = tmp_path / "revocations", time.time()
-    folder.mkdir()
-    first, second = "ab" * 32, "cd" * 32
-    assert revoke_credentials(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
-    assert not revoke_credentials(authority.domain, folder, [first], until_unix_s=now_s + 60, unix_s=now_s)
-    (path,) = folder.iterdir()
-    assert Revocation.from_statement(parse(path.read_bytes())).fingerprint == bytes.fromhex(first)
-    assert revoke_credentials(authority.domain, folder, [second], until_unix_s=now_s + 90_000, unix_s=now_s + 80_000)
-    assert [path.name for path in folder.iterdir()] == [f"{second[:32]}.revoke"]
+    desk.join(tmp_path / "m1", "m1")
+    with monkeypatch.context() as patch:
+        patch.setattr(removal, "write_all", lambda *_, **__: (_ for _ in ()).throw(LocalError("the disk is full")))
+        with pytest.raises(LocalError):
+            desk.members.remove("c-m1", unix_s=time.time())
+    assert desk.members.remove("c-m1", unix_s=time.time())
+    assert len(list(desk.files.config.revocations.iterdir())) == 2
 
 
 class Proxy:

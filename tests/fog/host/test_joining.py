@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.bootstrap.bundles import joining_boot
+from fog.bootstrap.bundles import machine_boot
 from fog.host.bundle import JOIN_FILE, install
 from fog.host.joining import join
 from gdp.config.config import SwitchConfig
@@ -30,7 +30,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
 
 def installed(home: Path, token: JoinToken) -> Path:
-    install(home, joining_boot(CLUSTER, "m7", lambda node: ("run", node.package), token, has_relay=True))
+    install(home, machine_boot(CLUSTER, "m7", lambda node: ("run", node.package), token, has_relay=True))
     return home
 
 

@@ -17,7 +17,7 @@ import sky
 from sky import check, core, execution
 from sky.utils import rich_utils
 
-from fog.bootstrap.bundles import joining_boot
+from fog.bootstrap.bundles import machine_boot
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
 from fog.hardware import Hardware
 from fog.machine import MachineSpec
@@ -30,7 +30,7 @@ from gdp.trust.join_token import JoinRole, JoinToken
 ECHO = ExportedInterface("service", "/echo", "std_srvs/srv/SetBool")
 PLAN = ClusterPlan("a-demo", (CloudNode("p", "e"),), (MachineRequest(Hardware(cpus=1)),), (ECHO,))
 TOKEN = JoinToken(
-    root=bytes(32), secret=bytes(16), role=JoinRole.ROBOT, expires_unix_s=2_000_000_000, servers=("192.0.2.1:51820",)
+    root=bytes(32), secret=bytes(16), role=JoinRole.MACHINE, expires_unix_s=2_000_000_000, servers=("192.0.2.1:51820",)
 )
 
 
@@ -80,7 +80,7 @@ def main() -> None:
     provider = SkyPilotProvider(SkyPilotConfig(), unserved)  # type: ignore[arg-type]
     offers = provider.offers(Hardware.from_text("cpu:16"), spot=True)
     spec = MachineSpec("a-demo", "m1", offers[0])
-    boot = joining_boot(PLAN, "m1", lambda node: ("run", node.package), TOKEN)
+    boot = machine_boot(PLAN, "m1", lambda node: ("run", node.package), TOKEN)
 
     def dry_run(offer: Offer) -> str:
         return outcome(lambda: provider.dry_run(replace(spec, offer=offer), boot))

@@ -17,6 +17,7 @@ from fog.machine import MachineBundle, MachineSpec
 from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
+from gdp.enrolment.domain_join import JoinRequest, join_domain
 from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, work
@@ -63,11 +64,11 @@ def journal(site: Site) -> Iterator[Journal]:
 @pytest.fixture
 def ours(lab: Lab, site: Site, journal: Journal) -> Iterator[tuple[Supervisor, Cloud]]:
     provider = Cloud()
-    with closing(DomainMembers(lab.files.directory)) as members:
+    with closing(DomainMembers(lab.files)) as members:
         made = Supervisor(
             site=site,
             journal=journal,
-            enrolment=members,
+            members=members,
             provider=provider,
             command=lambda _: ("run",),
             heard=lambda: None,
@@ -95,7 +96,7 @@ def test_a_machine_that_joined_is_recorded_and_gets_its_delegations(
         assert machine is not None
         (proxy,) = (each for each in machine.nodes if each.role == "proxy")
         assert journal.machines("c")[0].issued_credentials.proxy == proxy.name.to_text()
-        assert registry.has_mail(proxy.name) == bool(PLAN.carried)
+        assert not registry.has_mail(proxy.name)
     assert [each.what for each in journal.events("c") if each.machine == "m1"].count("enrolled") == 1
 
 
@@ -122,20 +123,17 @@ def test_a_cluster_that_is_down_leaves_no_member_and_no_token(
         joined_label(lab, provider)
 
 
-def test_delegations_that_could_not_be_sent_are_sent_later(
-    lab: Lab, journal: Journal, ours: tuple[Supervisor, Cloud], monkeypatch: pytest.MonkeyPatch
+def test_a_rented_machine_whose_token_is_used_again_is_an_alarm_and_replaced(
+    lab: Lab, journal: Journal, ours: tuple[Supervisor, Cloud]
 ) -> None:
     supervisor, provider = ours
-
-    def fail(*_: object, **__: object) -> None:
-        raise UnreachableError("not now")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(DomainMembers, "delegate", fail)
-        joined_label(lab, provider)
-        work(supervisor, lambda: any("no delegations: not now" in each.detail for each in journal.events("c")))
-        assert not journal.machines("c")[0].issued_credentials.proxy
+    joined_label(lab, provider)
     work(supervisor, lambda: journal.machines("c")[0].issued_credentials.proxy)
+    thief = JoinRequest(token=provider.token("m1"), label="c-m1", directory=lab.folder / "thief")
+    with pytest.raises(EnrolmentError, match="used already"):
+        join_domain(thief)
+    work(supervisor, lambda: list(provider.machines) == ["m2"])
+    assert [each.machine for each in journal.events("c") if each.what == "alarm"] == ["m1"]
 
 
 def test_a_removal_that_failed_is_tried_again(

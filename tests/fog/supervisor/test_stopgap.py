@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.bootstrap.tickets import Tickets
+from fog.bootstrap.domain_members import DomainMembers
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec
 from fog.offer import Offer
@@ -61,7 +61,7 @@ def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
     return Supervisor(
         site=site,
         journal=journal,
-        enrolment=Tickets(site.enrolment_folder),
+        members=DomainMembers(site.domain_files),
         provider=provider,
         command=lambda _: ("run",),
         heard=lambda: None,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fog.bootstrap.tickets import Tickets
+from fog.bootstrap.domain_members import DomainMembers
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
@@ -121,7 +121,7 @@ def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
     return Supervisor(
         site=site,
         journal=journal,
-        enrolment=Tickets(site.enrolment_folder),
+        members=DomainMembers(site.domain_files),
         provider=provider,
         command=lambda _: ("run",),
         heard=lambda: None,

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +12,7 @@ from gdp.enrolment.create import DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
 from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.enrolment.registry import Registry
-from gdp.enrolment.server import bind_server, serve_domain
+from gdp.enrolment.server import bind_server, serve_domain_in_thread
 from gdp.trust.join_token import JoinRole, JoinToken
 
 
@@ -69,25 +66,5 @@ def running_lab(
         with (files.directory / DOMAIN_FILE).open("a", encoding="utf-8") as config:
             config.write(f"member_days: {member_days}\n")
         files = DomainFiles.load(files.directory)
-    loop = asyncio.new_event_loop()
-    task = loop.create_task(serve_domain(files, listening))
-
-    def serve() -> None:
-        asyncio.set_event_loop(loop)
-        try:
-            loop.run_until_complete(task)
-        except asyncio.CancelledError:
-            pass
-        finally:
-            loop.run_until_complete(loop.shutdown_asyncgens())
-            loop.close()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
+    with serve_domain_in_thread(files, listening):
         yield Lab(files, folder, port)
-    finally:
-        with contextlib.suppress(RuntimeError):  # the server has ended, and its loop is closed
-            loop.call_soon_threadsafe(task.cancel)
-        thread.join(10.0)
-        assert not thread.is_alive()

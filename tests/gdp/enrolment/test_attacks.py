@@ -22,8 +22,7 @@ from gdp.enrolment.channel import client_context, connect
 from gdp.enrolment.desk import EnrolmentDesk
 from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.errors import LocalError
-from gdp.trust.bootstrap_ticket import apply
-from gdp.trust.enrolment_wire import EnrolmentError, Refusal, UnreachableError, encode_message
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal, UnreachableError, apply, encode_message
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from tests.gdp.enrolment.lab import Lab, running_lab
 
@@ -38,8 +37,7 @@ def _request(token: JoinToken, label: str, role: JoinRole = JoinRole.LEAF) -> di
     nodes = []
     for _, node_role in role.nodes:
         keys = NodeKeys.generate(node_role, label)
-        made = apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public)
-        nodes.append({"request": made.request, "kem": made.kem.wire, "proof": made.proof})
+        nodes.append(apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public).to_fields())
     return {"op": "join", "id": join_id(token.secret), "nodes": nodes}
 
 
@@ -172,8 +170,7 @@ def test_a_second_machine_with_the_same_keys_is_refused(lab: Lab) -> None:
     keys = NodeKeys.generate(Role.LEAF, "clone")
     requests = list[dict[str, object]]()
     for token in (first, second):
-        made = apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public)
-        node = {"request": made.request, "kem": made.kem.wire, "proof": made.proof}
+        node = apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public).to_fields()
         requests.append({"op": "join", "id": join_id(token.secret), "nodes": [node]})
     with connect(f"127.0.0.1:{lab.port}", first.root) as channel:
         channel.request(_signed(first, requests[0], channel.binding, channel.nonce))

@@ -36,7 +36,7 @@ def test_a_member_of_a_domain_with_a_relay_dials_it_where_udp_is_blocked(tmp_pat
     with running_lab(tmp_path, relay_port=8_443) as lab:
         lab.join("robot")
         relay = RelayConfig.load(tmp_path / "robot/relay.yaml")
-        border = load_identity(lab.files.config.switch, time.time())
+        border = load_identity(lab.files.directory / "switch", time.time())
     assert SwitchConfig.load(tmp_path / "robot/switch.yaml").relay
     assert [(each.peer, each.endpoints) for each in relay.borders] == [(border.name, ("127.0.0.1:8443",))]
 

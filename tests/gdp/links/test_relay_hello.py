@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.enrolment.channel import client_context
-from gdp.enrolment.server import bind_handover
+from gdp.enrolment.server import bind_unix
 from gdp.links.relay_hello import HelloWait, hand_over
 from gdp.links.relay_loop import RelayLoop
 
@@ -93,7 +93,7 @@ def test_a_peer_that_leaves_early_is_noticed(port: Port) -> None:
 
 
 def test_a_connection_is_handed_over_with_its_bytes(tmp_path: Path) -> None:
-    with closing(bind_handover(tmp_path / "handover.sock")) as receiver:
+    with closing(bind_unix(tmp_path / "handover.sock", socket.SOCK_DGRAM)) as receiver:
         client, accepted = socket.socketpair()
         with client:
             client.send(b"hello")
