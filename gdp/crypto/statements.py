@@ -49,10 +49,7 @@ class StatementType(str, Enum):
     LACKING = "lacking"  # ... and which of them the sender has, so that it receives the rest
     ADVERTISE_ACK = "advertise-ack"
     PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
-    DIGEST = "digest"  # between RIBs of one domain
-    FETCH = "fetch"
-    INVENTORY = "inventory"
-    REPLICAS = "replicas"
+    SYNC = "sync"  # between neighbours, or RIBs of one domain: what each has of a set, and what the other lacks
     OPEN = "open"  # switch or RIB to a RIB: a channel
     ACCEPT = "accept"
     ENDPOINTS = "endpoints"  # of a switch: where it can be reached across IP networks

@@ -22,13 +22,14 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
-from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Key
+from gdp.control.rib_replication import Entry, Key
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.diagnosis.facts import RibFacts, RouteFact
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
 from gdp.limits import (
     ANSWER_BYTES_BURST,
@@ -40,11 +41,10 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
 )
 from gdp.names import Name
-from gdp.rib.anti_entropy import AntiEntropy, Message
-from gdp.rib.digest_tree import DigestTree
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
 from gdp.rib.lower_ribs import LowerRibs
+from gdp.rib.replication import Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
@@ -71,12 +71,6 @@ _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answere
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
 _STALE_MARGIN_S: Final = 1.0  # for the notice of a longer lease to arrive before the former one ends
 _DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query
-_PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
-    StatementType.DIGEST: Digest,
-    StatementType.FETCH: Fetch,
-    StatementType.INVENTORY: Inventory,
-    StatementType.REPLICAS: EntryBatch,
-}
 
 
 class OutgoingStatement(NamedTuple):
@@ -124,7 +118,9 @@ class RibCore:
         self._upstream_queries = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._lower = LowerRibs()
-        self._replication = self._replication_over(store.digests)
+        self._replication = (
+            None if store.digests is None else Replication(identity, store.digests, settings.peers, self.entry_of)
+        )
         self._endpoints = RibEndpoints(identity, policy, self._other_ribs, settings.watches)
         self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
@@ -178,7 +174,7 @@ class RibCore:
                 self._take_ack_from_above(statement, now)
             elif statement.type is StatementType.PRESENCE:
                 self._take_presence(statement, now)
-            elif statement.type in _PEER_MESSAGES:
+            elif statement.type is StatementType.SYNC:
                 self._take_peer_message(statement, now)
             elif statement.type is StatementType.ENDPOINTS:
                 self._endpoints.receive_record(statement, now)
@@ -301,7 +297,7 @@ class RibCore:
         """Return the monotonic second of the next timer, or None."""
         times = [self._store.next_expiry(), self._upstream_queries.next_due(), self._upstream.next_due()]
         if self._replication is not None:
-            times.append(self._replication.next_due())
+            times.append(self._replication.get_timer())
         times.append(self._endpoints.get_timer())
         return min((time for time in times if time is not None), default=None)
 
@@ -880,18 +876,9 @@ class RibCore:
 
     # -- other RIBs of the domain
 
-    def _replication_over(self, digests: DigestTree | None) -> AntiEntropy | None:
-        if digests is None:
-            return None
-        return AntiEntropy(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
-
     def _replicate(self, name: Name, advertiser: Name) -> None:
         if self._replication is not None:
             self._replication.push_entry((name, advertiser))
-
-    def _rank_of(self, key: Key) -> int | None:
-        known = self._store.get(*key)
-        return None if known is None else _rank(known)
 
     def entry_of(self, key: Key, now_s: float) -> Entry | None:
         """Return the stored entry of an advertiser of a name, for a peer or a snapshot, or None."""
@@ -927,12 +914,12 @@ class RibCore:
         if member.role is not Role.RIB or member.domain != self._policy.own or self._replication is None:
             raise StatementError(DropReason.WRONG_DOMAIN, "replicates with RIBs of this domain only")
         statement.verify(member.key)
-        if not self._replication.add_peer(member.name):
+        if not self._replication.add_peer(member.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "peers")
-        message = _PEER_MESSAGES[statement.type].from_fields(statement.fields)
-        for entry in self._replication.receive(message, member.name, now.mono_s):
+        message = SyncMessage.from_fields(statement.fields)
+        for item in self._replication.receive(message, member.name, now.mono_s):
             try:
-                self._handle_entry(entry, now)
+                self._handle_entry(Entry.from_bytes(item), now)
             except StatementError as error:
                 self.refusals[error.reason] += 1
 
@@ -980,7 +967,7 @@ class RibCore:
         withdrawal = Withdrawal.from_statement(statement, now.unix_s)
         name, sequence = withdrawal.name, withdrawal.sequence
         known = self._store.get(name, statement.signer)
-        if known is not None and _rank(known) >= 2 * sequence + 1:
+        if known is not None and known.rank >= 2 * sequence + 1:
             return
         member = self._sender(entry.membership, statement, now)
         statement.verify(member.key)
@@ -1026,11 +1013,6 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
         found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
         issuer_key = link.delegate_key
     return found
-
-
-def _rank(known: Route | Withdrawn) -> int:
-    """Return ``Item.rank`` of a stored entry; a lease that ended ranks like the advertisement."""
-    return 2 * known.sequence + (isinstance(known, Withdrawn) and bool(known.proof))
 
 
 def _asker(member: Membership) -> Asker:

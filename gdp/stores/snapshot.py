@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.control.rib_replication import Entry, Key
-from gdp.crypto import cbor
-from gdp.crypto.fields import Fields
 from gdp.errors import RemoteError
 from gdp.stores.background_database import BackgroundDatabase
 
@@ -72,8 +70,7 @@ class Snapshot(BackgroundDatabase[_Slice]):
 
     def _read(self, wire: bytes, left_s: float) -> Entry | None:
         try:
-            decoded = cbor.decode(wire)
-            entry = Entry.from_fields(Fields(decoded if isinstance(decoded, dict) else {}))
+            entry = Entry.from_bytes(wire)
         except RemoteError:
             self.unreadable += 1
             return None
@@ -94,7 +91,7 @@ class Snapshot(BackgroundDatabase[_Slice]):
         kept = [
             (
                 _key(key),
-                cbor.encode(entry.to_fields()),
+                entry.to_bytes(),
                 entry.until_unix_s or slice_.unix_s + entry.lease_s,
             )
             for key, entry in slice_.changes

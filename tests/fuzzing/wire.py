@@ -10,7 +10,7 @@ from typing import Final
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
-from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Item
+from gdp.control.rib_replication import Entry
 from gdp.crypto import cbor
 from gdp.crypto.certificates import Root, Unverified
 from gdp.crypto.control_seal import ControlOpener, ControlSealer
@@ -70,18 +70,11 @@ _ENTRY: Final = Entry(
     is_from_upstream=False,
 )
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
-    **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
+    **{name.replace(",", "").replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
     "presence": (
         Presence(node=_A, incarnation=1, other=_A, question=7).to_wire(_NODE.name, _NODE.key, b"cert"),
         Presence.from_fields,
     ),
-    "digest": (Digest(b"", bytes(8), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Digest.from_fields),
-    "fetch": (Fetch((b"a",), ((_A, _A),)).to_wire(_NODE.name, _NODE.key, b"cert"), Fetch.from_fields),
-    "inventory": (
-        Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"),
-        Inventory.from_fields,
-    ),
-    "replicas": (EntryBatch((_ENTRY,), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), EntryBatch.from_fields),
 }
 _STATEMENTS: Final[dict[str, tuple[bytes, Callable[[Statement], object]]]] = {
     "adcert": (adcert(), AdCert.from_statement),
@@ -161,6 +154,7 @@ _APPLICATION: Final = Application(b"csr", _NODE.kem.public, bytes(64))
 _GRANTED: Final = Granted(b"certificate", (b"delegation",))
 
 DECODERS: Final = (
+    Decoder("entry", Entry.from_bytes, (_ENTRY.to_bytes(),), (StatementError,), is_cbor=True),
     Decoder("frame", codec.decode, tuple(_FRAMES[:2]), (FrameError,)),
     Decoder("control", _control, (_control_seed(),), (FrameError,)),
     Decoder("cbor", cbor.decode, (cbor.encode({"a": [1, b"x", None, 1.5]}),), (StatementError,), is_cbor=True),

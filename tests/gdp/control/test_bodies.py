@@ -23,6 +23,7 @@ from gdp.control.relayed_statement import RelayedStatement
 from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.codec import HEADER_BYTES
 from gdp.names import Name
 from tests.gdp.control.members import node
@@ -53,6 +54,9 @@ BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256
 REFRESH = JoinRefresh(numbers=(1, 1 << 63), session=b"s" * 16, sender_session=b"o" * 8, sequence=9)
 UNKNOWN = replace(REFRESH, is_reply=True)
 LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
+TOTALS = SyncMessage(totals=((A, b"d" * 8), (B, bytes(8))), session=b"s" * 16, sequence=7)
+WANTED = SyncMessage(of=A, asked=(b"", b"\1"), lacking=((b"\2", bytes(34)), (A, b"")))
+REPLY = SyncMessage(of=A, hashes=((b"\1", bytes(2_048)),), items=(b"item", b"other"), is_last=True, rest=3)
 ASKED = DiagnosticRequest(ask="trace", name=A, target=B, sequence=7, body={"p": bytes(C)}, membership=b"cert")
 REPLIED = DiagnosticReply(
     ask="trace", sequence=7, asker=A, result={"branches": [{"port": "eth0"}]}, is_cut=True, hops_left=3
@@ -97,6 +101,9 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "revoked": (REVOKED.to_wire(NODE.name, NODE.key), REVOKED, Revoked.from_fields),
     "revoked in buckets": (BUCKETS.to_wire(NODE.name, NODE.key), BUCKETS, Revoked.from_fields),
     "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
+    "sync": (TOTALS.to_wire(NODE.name, NODE.key), TOTALS, SyncMessage.from_fields),
+    "sync, request": (WANTED.to_wire(NODE.name, NODE.key, b"cert"), WANTED, SyncMessage.from_fields),
+    "sync, reply": (REPLY.to_wire(NODE.name, NODE.key, b"cert"), REPLY, SyncMessage.from_fields),
     "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Response.from_fields),
     "relay": (
         RelayedStatement(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),
