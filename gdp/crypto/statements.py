@@ -45,8 +45,6 @@ class StatementType(str, Enum):
     GRANT = "grant"  # owner to node: a topic secret, sealed
     RELAY = "relay"  # an advertisement that a switch or a RIB relays
     REVOKE = "revoke"
-    REVOKED = "revoked"  # between neighbours: digests of the revocations of each trusted domain
-    LACKING = "lacking"  # ... and which of them the sender has, so that it receives the rest
     ADVERTISE_ACK = "advertise-ack"
     PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
     SYNC = "sync"  # between neighbours, or RIBs of one domain: what each has of a set, and what the other lacks

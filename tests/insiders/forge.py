@@ -586,22 +586,6 @@ class Forge:
             "until": until,
         }
 
-    def _revoked(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        domains = rng.sample(self._domains, rng.randrange(len(self._domains) + 1))
-        hashes = rng.choice((b"", rng.randbytes(2_048)))
-        return {
-            "i": self._echo(place), "s": next(self._numbers),
-            "p": [[each, rng.choice((0, 1, 100, _U64)), rng.choice((bytes(8), rng.randbytes(8)))] for each in domains],
-            "d": rng.choice(self._domains) if hashes else b"", "h": hashes,
-        }  # fmt: skip
-
-    def _lacking(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        buckets = rng.sample(range(256), rng.choice((0, 1, 256)))
-        return {
-            "i": self._echo(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
-            "k": rng.randbytes(8 * rng.choice((0, 1, 1_500))),
-        }  # fmt: skip
-
     def _open(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         to = rng.choice([host.name for host in self._stage.world.ribs.values()])
         return {"k": rng.randbytes(32), "w": to, "c": identity.membership, "p": bytes(rng.choice((0, 700, 8_000)))}
@@ -814,7 +798,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.JOIN_REFRESH: Forge._join_refresh, _T.JOIN_UNKNOWN: Forge._join_refresh, _T.ADVERTISE: Forge._advertisement,
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
     _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.SYNC: Forge._sync, _T.REVOKE: Forge._revoke,
-    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
+    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
     _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
     _T.ENDPOINTS_ANSWER: Forge._endpoints_answer, _T.MAIL: Forge._mail,
@@ -831,7 +815,7 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK), _T.SYNC: (_K.RIB_REQUEST, _K.REVOKED),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
-    _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,), _T.ENDPOINTS: (_K.RIB_REQUEST,),
+    _T.ENDPOINTS: (_K.RIB_REQUEST,),
     _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
     _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER), _T.DIAGNOSTIC_REQUEST: (_K.DIAGNOSTIC_REQUEST,),
     _T.DIAGNOSTIC_REPLY: (_K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REQUEST),

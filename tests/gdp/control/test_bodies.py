@@ -20,7 +20,6 @@ from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
-from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
@@ -49,11 +48,8 @@ STATE = LinkState(
     origin=NODE.name, domain=A, scope=Scope.BORDER, sequence=5, links=LINKS, inside=INSIDE, ribs=RIBS, members=(A, B)
 )
 ANSWER = Response(name=A, advertiser=B, advertisement=b"claim", domain=C, transit=(A, B), lease_s=30.0)
-REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
-BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
 REFRESH = JoinRefresh(numbers=(1, 1 << 63), session=b"s" * 16, sender_session=b"o" * 8, sequence=9)
 UNKNOWN = replace(REFRESH, is_reply=True)
-LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
 TOTALS = SyncMessage(totals=((A, b"d" * 8), (B, bytes(8))), session=b"s" * 16, sequence=7)
 WANTED = SyncMessage(of=A, asked=(b"", b"\1"), lacking=((b"\2", bytes(34)), (A, b"")))
 REPLY = SyncMessage(of=A, hashes=((b"\1", bytes(2_048)),), items=(b"item", b"other"), is_last=True, rest=3)
@@ -98,9 +94,6 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
         Query(A, 20.0, b"revoked!"),
         Query.from_fields,
     ),
-    "revoked": (REVOKED.to_wire(NODE.name, NODE.key), REVOKED, Revoked.from_fields),
-    "revoked in buckets": (BUCKETS.to_wire(NODE.name, NODE.key), BUCKETS, Revoked.from_fields),
-    "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
     "sync": (TOTALS.to_wire(NODE.name, NODE.key), TOTALS, SyncMessage.from_fields),
     "sync, request": (WANTED.to_wire(NODE.name, NODE.key, b"cert"), WANTED, SyncMessage.from_fields),
     "sync, reply": (REPLY.to_wire(NODE.name, NODE.key, b"cert"), REPLY, SyncMessage.from_fields),
