@@ -88,7 +88,7 @@ class RevocationSync:
         if len(self._received) > _SESSIONS_MAX:
             del self._received[next(iter(self._received))]
         self._revoked.expire(now.unix_s)
-        self._exchange.receive(key, message, now.mono_s)
+        self._exchange.receive_message(key, message, now.mono_s)
         self._send(now.mono_s)
 
     def took(self, neighbour: Neighbour, now_s: float) -> None:

@@ -51,8 +51,6 @@ class StatementType(str, Enum):
     OPEN = "open"  # switch or RIB to a RIB: a channel
     ACCEPT = "accept"
     ENDPOINTS = "endpoints"  # of a switch: where it can be reached across IP networks
-    ENDPOINTS_QUERY = "endpoints-query"  # to a RIB: which endpoint records of these switches are kept?
-    ENDPOINTS_ANSWER = "endpoints-answer"
     DIAGNOSTIC_REQUEST = "diagnostic-request"  # between members: measure a path, or tell about a name
     DIAGNOSTIC_REPLY = "diagnostic-reply"
     MAIL = "mail"  # between members, kept by the enrolment server

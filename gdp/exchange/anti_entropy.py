@@ -24,11 +24,11 @@ and decides what it accepts; items prove themselves.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
-from gdp.exchange.sync_message import ASKED_MAX, CAPACITY_BYTES, ITEMS_MAX, LACKING_MAX, SyncMessage
+from gdp.exchange.sync_message import ASKED_MAX, CAPACITY_BYTES, LACKING_MAX, SyncMessage, pages
 from gdp.exchange.sync_set import FANOUT, HASH_BYTES, LINE_BYTES, PREFIX_MAX_BYTES, SyncSet
 
 __all__ = ["AntiEntropy", "SyncPace"]
@@ -41,7 +41,8 @@ _EXAMINED_BYTES: Final = 32  # of a reply that an item compared with lines count
 _HASHES_DRAWN: Final = 4  # items that 256 hashes count for
 _WINDOW_S: Final = 600.0
 _SPARE: Final = 4_096  # items that a name may draw in a window, in addition to a multiple of all there are
-_BARREN: Final = 4  # times ``fetch_s`` after which a fetch that brought nothing new ends
+_BARREN: Final = 5  # times ``fetch_s`` after which a fetch that brought nothing new ends
+_REPEATS: Final = 3  # of one request
 _NAMES_MAX: Final = 1_024
 
 P = TypeVar("P", bound=Hashable)
@@ -76,6 +77,7 @@ class _Fetch:
     end_s: float  # while the total does not change
     until_s: float  # without progress
     prefixes: deque[bytes]
+    repeats_left: int = _REPEATS
     requested: dict[bytes, None] = field(default_factory=dict)  # now; less those whose hashes came
 
 
@@ -162,11 +164,12 @@ class AntiEntropy(Generic[P]):
             elif state.fetch is not None:
                 state.fetch.until_s = now_s + self._pace.fetch_s
 
-    def receive(self, peer: P, message: SyncMessage, now_s: float) -> tuple[bytes, ...]:
+    def receive_message(self, peer: P, message: SyncMessage, now_s: float) -> tuple[bytes, ...]:
         """Handle a peer's message; return the items in it, for the caller to verify and to store."""
         state = self._peers[peer]
         fetch = state.fetch
-        self._compare(state, message.totals, now_s)
+        if not message.is_last or (fetch is not None and not self._is_barren(fetch)):
+            self._compare(state, message.totals, now_s)  # what a fetch in vain left different stays so
         if fetch is not None and fetch.of == message.of:
             if message.items:
                 fetch.until_s = now_s + self._pace.fetch_s
@@ -187,8 +190,7 @@ class AntiEntropy(Generic[P]):
         for peer, state in self._peers.items():
             fetch = state.fetch
             if fetch is not None and self._end_of(fetch) <= now_s:
-                self._end_fetch(state, fetch, now_s)
-                state.total_at_s = min(state.total_at_s, now_s)  # a peer that differs answers with its own
+                self._repeat(peer, state, fetch, now_s)
             if state.request is not None and state.reply_at_s <= now_s:
                 self._reply(peer, state, state.request, now_s)
             if state.total_at_s <= now_s:
@@ -212,7 +214,7 @@ class AntiEntropy(Generic[P]):
         """Return, once, the messages to send, each with its peer."""
         for of in dict.fromkeys(of for of, _ in self._news):
             items = (self._item_of(of, key, now_s) for its, key in self._news if its == of)
-            for page in _pages(item for item in items if item is not None):
+            for page in pages(item for item in items if item is not None):
                 message = SyncMessage(of=of, items=page)
                 self._out += [(peer, message) for peer in self._peers]
         self._news.clear()
@@ -281,7 +283,18 @@ class AntiEntropy(Generic[P]):
         fetch.until_s = now_s + self._pace.fetch_s
         self._out.append((peer, SyncMessage(of=fetch.of, asked=tuple(asked), lacking=tuple(lacking))))
 
+    def _repeat(self, peer: P, state: _Peer, fetch: _Fetch, now_s: float) -> None:
+        """Repeat a request without a reply, a few times."""
+        if fetch.repeats_left and not (self._is_barren(fetch) and fetch.end_s <= now_s):
+            fetch.repeats_left -= 1
+            fetch.prefixes.extendleft(reversed(fetch.requested))
+            self._request(peer, fetch, now_s)
+            return
+        self._end_fetch(state, fetch, now_s)
+        state.total_at_s = min(state.total_at_s, now_s)  # a peer that differs answers with its own
+
     def _reply_ended(self, peer: P, state: _Peer, fetch: _Fetch, rest: int, now_s: float) -> None:
+        fetch.repeats_left = _REPEATS
         left = list(fetch.requested)[-rest:] if rest else []
         fetch.prefixes.extendleft(reversed(left))
         if fetch.prefixes:
@@ -292,13 +305,16 @@ class AntiEntropy(Generic[P]):
 
     def _end_fetch(self, state: _Peer, fetch: _Fetch, now_s: float) -> None:
         state.fetch = None
-        if self._sets[fetch.of].total == fetch.total:  # it has nothing for us, whatever its totals say
+        if self._is_barren(fetch):
             state.totals.pop(fetch.of, None)
             state.barren_until_s = now_s + self._pace.fetch_s
 
     def _end_of(self, fetch: _Fetch) -> float:
-        is_barren = self._sets[fetch.of].total == fetch.total
-        return min(fetch.until_s, fetch.end_s) if is_barren else fetch.until_s
+        return min(fetch.until_s, fetch.end_s) if self._is_barren(fetch) else fetch.until_s
+
+    def _is_barren(self, fetch: _Fetch) -> bool:
+        """Return whether the peer had nothing for us so far, whatever its totals say."""
+        return self._sets[fetch.of].total == fetch.total
 
     # -- what is here
 
@@ -330,7 +346,7 @@ class AntiEntropy(Generic[P]):
         for at in range(0, len(hashes), at_once):
             page = tuple((prefix, own.hashes(prefix)) for prefix in hashes[at : at + at_once])
             self._out.append((peer, SyncMessage(of=request.of, hashes=page)))
-        self._out += [(peer, SyncMessage(of=request.of, items=page)) for page in _pages(items)]
+        self._out += [(peer, SyncMessage(of=request.of, items=page)) for page in pages(items)]
         totals = ((request.of, own.total),)
         self._out.append((peer, SyncMessage(of=request.of, totals=totals, is_last=True, rest=rest)))
 
@@ -357,19 +373,3 @@ def _remember(table: dict[bytes, Any], name: bytes, value: object) -> None:
     table[name] = value
     if len(table) > _NAMES_MAX:
         del table[next(iter(table))]
-
-
-def _pages(items: Iterable[bytes]) -> Iterator[tuple[bytes, ...]]:
-    """Yield items in groups that fit one message each; an item that fits none is left out."""
-    group: list[bytes] = []
-    size = 0
-    for item in items:
-        if len(item) > CAPACITY_BYTES:
-            continue
-        if group and (size + len(item) > CAPACITY_BYTES or len(group) >= ITEMS_MAX):
-            yield tuple(group)
-            group, size = [], 0
-        group.append(item)
-        size += len(item)
-    if group:
-        yield tuple(group)

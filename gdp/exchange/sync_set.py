@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Final, Generic, TypeVar
 
-__all__ = ["FANOUT", "HASH_BYTES", "LINE_BYTES", "PREFIX_MAX_BYTES", "SyncSet"]
+__all__ = ["FANOUT", "HASH_BYTES", "LINE_BYTES", "PREFIX_MAX_BYTES", "SyncSet", "line_of", "rank_in"]
 
 FANOUT: Final = 256
 HASH_BYTES: Final = 8
@@ -122,17 +122,15 @@ class SyncSet(Generic[V]):
         for key, value in self._items(prefix):
             if len(lines) >= most:
                 break
-            lines.append(_short(key) + self._rank_of(value).to_bytes(_RANK_BYTES, "big"))
+            lines.append(line_of(key, self._rank_of(value)))
         return b"".join(lines)
 
     def newer(self, prefix: bytes, lines: bytes) -> list[bytes]:
         """Return the keys below a prefix whose items are not in these lines, or only with a lower rank."""
         if not lines:
             return [key for key, _ in self._items(prefix)]
-        known = {
-            lines[at : at + HASH_BYTES]: int.from_bytes(lines[at + HASH_BYTES : at + LINE_BYTES], "big")
-            for at in range(0, len(lines), LINE_BYTES)
-        }
+        found = [lines[at : at + LINE_BYTES] for at in range(0, len(lines), LINE_BYTES)]
+        known = {line[:HASH_BYTES]: rank_in(line) for line in found}
         return [key for key, value in self._items(prefix) if known.get(_short(key), -1) < self._rank_of(value)]
 
     def _items(self, prefix: bytes) -> Iterator[tuple[bytes, V]]:
@@ -153,6 +151,16 @@ class SyncSet(Generic[V]):
         bucket.count += count
         self._total ^= hashed
         self._count += count
+
+
+def line_of(key: bytes, rank: int) -> bytes:
+    """Return the line of an item, ``LINE_BYTES``."""
+    return _short(key) + rank.to_bytes(_RANK_BYTES, "big")
+
+
+def rank_in(line: bytes) -> int:
+    """Return the rank in a line; 0 in none."""
+    return int.from_bytes(line[HASH_BYTES:LINE_BYTES], "big")
 
 
 def _short(key: bytes) -> bytes:

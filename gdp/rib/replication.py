@@ -1,4 +1,4 @@
-"""Replication between the RIBs of one domain: each stores what any of them accepts.
+"""Replication between the RIBs of one domain: each stores what any of them accepts, routes and endpoint records.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Changes are pushed at once; ``exchange/anti_entropy.py`` finds
 what was lost. The RIB's core decides whether an entry is accepted: entries prove themselves.
@@ -6,21 +6,20 @@ what was lost. The RIB's core decides whether an entry is accepted: entries prov
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final
 
-from gdp.control.rib_replication import Entry, Key
 from gdp.crypto.identity import Identity
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import SyncSet
-from gdp.names import NAME_BYTES, Name
+from gdp.names import Name
 
-__all__ = ["Replication"]
+__all__ = ["ROUTES", "Replication"]
 
 COLD_S: Final = 3.0  # a RIB that just started denies no name before it compared with a peer, for so long at most
 PEERS_MAX: Final = 16
-_ROUTES: Final = b"routes"
+ROUTES: Final = b"routes"  # without it, several RIBs share the store itself
 _PACE: Final = SyncPace(total_s=1.0, soon_s=0.2, fetch_s=0.5, reply_s=0.005, reply_bytes=128 << 10, draws=64)
 
 
@@ -28,24 +27,24 @@ class Replication:
     """One RIB's exchange with its peers.
 
     Args:
+        sets: what is replicated, by identifier.
+        item_of: as of ``AntiEntropy``.
         peers: the RIBs to begin with; others of the domain are added when their first message comes.
-        entry_of: returns the stored entry of a key at a monotonic second, or None.
     """
 
     def __init__(
         self,
         identity: Identity,
-        digests: SyncSet[int],
+        sets: Mapping[bytes, SyncSet[Any]],
+        item_of: Callable[[bytes, bytes, float], bytes | None],
         peers: Iterable[Name],
-        entry_of: Callable[[Key, float], Entry | None],
     ) -> None:
         self._identity = identity
-        self._entry_of = entry_of
-        self._exchange = AntiEntropy[Name]({_ROUTES: digests}, self._item_of, _PACE)
+        self._exchange = AntiEntropy[Name](sets, item_of, _PACE)
         for peer in peers:
             self.add_peer(peer, float("-inf"))
         self._started_s: float | None = None
-        self._is_warm = not self.peers
+        self._is_warm = not self.peers or ROUTES not in sets
 
     @property
     def peers(self) -> tuple[Name, ...]:
@@ -55,7 +54,7 @@ class Replication:
     def is_cold(self, now_s: float) -> bool:
         """Return whether this RIB may still lack what its peers hold."""
         is_late = self._started_s is not None and now_s - self._started_s >= COLD_S
-        self._is_warm = self._is_warm or is_late or _ROUTES in self._exchange.compared
+        self._is_warm = self._is_warm or is_late or ROUTES in self._exchange.compared
         return not self._is_warm
 
     def add_peer(self, name: Name, now_s: float) -> bool:
@@ -66,13 +65,13 @@ class Replication:
             self._exchange.add_peer(name, name, now_s)
         return True
 
-    def push_entry(self, key: Key) -> None:
-        """Push the stored entry of a key to all peers."""
-        self._exchange.push(_ROUTES, key[0] + key[1])
+    def push(self, of: bytes, key: bytes) -> None:
+        """Push the item of a key to all peers."""
+        self._exchange.push(of, key)
 
     def receive(self, message: SyncMessage, sender: Name, now_s: float) -> tuple[bytes, ...]:
-        """Handle a peer's message; return the entries in it, for the caller to read, to verify and to store."""
-        return self._exchange.receive(sender, message, now_s)
+        """Handle a peer's message; return the items in it, for the caller to read, to verify and to store."""
+        return self._exchange.receive_message(sender, message, now_s)
 
     def connected(self, now_s: float) -> None:
         """Begin: messages reach the peers from now on."""
@@ -96,7 +95,3 @@ class Replication:
             if id(message) not in wires:
                 wires[id(message)] = message.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         return [(peer, wires[id(message)]) for peer, message in messages]
-
-    def _item_of(self, _of: bytes, key: bytes, now_s: float) -> bytes | None:
-        entry = self._entry_of((Name(key[:NAME_BYTES]), Name(key[NAME_BYTES:])), now_s)
-        return None if entry is None else entry.to_bytes()

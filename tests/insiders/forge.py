@@ -29,7 +29,7 @@ from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.exchange.sync_message import ASKED_MAX, ITEMS_MAX, LACKING_MAX, SETS_MAX
-from gdp.exchange.sync_set import LINE_BYTES
+from gdp.exchange.sync_set import LINE_BYTES, line_of
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT, SEQUENCE_AHEAD_S
@@ -521,21 +521,6 @@ class Forge:
             "s": self._number(rng), "u": self._number(rng), "c": identity.membership,
         }  # fmt: skip
 
-    def _endpoints_query(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        def item() -> bytes:
-            return rng.choice((*self._nodes, bytes(32))) + rng.choice((0, 1, _U64)).to_bytes(8, "big")
-
-        names = [item() for _ in range(rng.choice((0, 1, 64, 65)))]
-        return {"n": names, "w": rng.choice((0.0, 30.0, 3_600.0, 9e9)), "c": identity.membership}
-
-    def _endpoints_answer(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        body = self._endpoints(rng, identity, place)
-        record = identity.sign(StatementType.ENDPOINTS, body) if rng.random() < 0.7 else rng.randbytes(40)
-        return {
-            "e": [record] * rng.choice((0, 1, 2)), "s": self._number(rng), "r": rng.choice((255, 28, 31, 200)),
-            "c": identity.membership,
-        }  # fmt: skip
-
     def _mail(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {
             "to": rng.choice(self._nodes), "k": rng.choice(("delegation", "a-b", "")), "s": self._number(rng),
@@ -544,7 +529,11 @@ class Forge:
 
     def _sync(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         """Return totals, a request or a reply, with the session of a neighbour and the certificate of a RIB."""
-        sets = (b"routes", *(hash_of(each.key.public.compressed) for each in self._stage.world.authorities.values()))
+        sets = (
+            b"routes",
+            b"endpoints",
+            *(hash_of(each.key.public.compressed) for each in self._stage.world.authorities.values()),
+        )
         spoken = {
             "d": rng.choice(sets), "c": identity.membership, "i": self._echo(place), "s": next(self._numbers),
         }  # fmt: skip
@@ -553,13 +542,24 @@ class Forge:
             totals = [[each, rng.choice((bytes(8), rng.randbytes(8)))] for each in rng.sample(sets, len(sets))]
             return {**spoken, "d": b"", "w": totals}
         prefixes = [rng.randbytes(rng.choice((0, 1, 1, 2, 32))) for _ in range(rng.choice((1, 16, LACKING_MAX)))]
+        if chance < 0.4:  # as a switch asks for endpoints, or a RIB for its
+            numbers = [rng.choice((0, 1, _U64)) for _ in range(rng.choice((1, 64, 65)))]
+            lacking = [[name, line_of(name, each)] for each in numbers if (name := rng.choice(self._nodes))]
+            refused = {"x": rng.choice((255, 28, 31, 200))} if rng.random() < 0.3 else {}
+            return {**spoken, **refused, "d": b"endpoints", "l": lacking, "e": [self._endpoint_item(rng, identity)]}
         if chance < 0.6:
             lines = [rng.randbytes(LINE_BYTES * rng.choice((0, 0, 1, 30))) for _ in prefixes[:20]]
             lacking = [[each, line] for each, line in zip(prefixes, lines, strict=False)]
             return {**spoken, "l": lacking, "p": [rng.randbytes(1)[: rng.randrange(2)] for _ in prefixes[:16]]}
-        items = [self._entry(rng, identity) for _ in range(rng.choice((0, 1, 1, 3)))]
+        makes = self._entry, self._endpoint_item
+        items = [rng.choice(makes)(rng, identity) for _ in range(rng.choice((0, 1, 1, 3)))]
         hashes = [[rng.randbytes(1)[: rng.randrange(2)], rng.randbytes(2_048)] for _ in range(rng.choice((0, 1, 2)))]
         return {**spoken, "e": items, "h": hashes, "z": rng.random() < 0.5, "r": rng.choice((0, 1, LACKING_MAX))}
+
+    def _endpoint_item(self, rng: random.Random, identity: Identity) -> bytes:
+        body = self._endpoints(rng, identity, Place("", 0, b""))
+        record = identity.sign(StatementType.ENDPOINTS, body) if rng.random() < 0.7 else rng.randbytes(40)
+        return rng.choice((0, 1, 60_000, (1 << 32) - 1)).to_bytes(4, "big") + record
 
     def _entry(self, rng: random.Random, identity: Identity) -> bytes:
         unix_s = int(self._stage.world.network.now.unix_s)
@@ -800,8 +800,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.SYNC: Forge._sync, _T.REVOKE: Forge._revoke,
     _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
-    _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
-    _T.ENDPOINTS_ANSWER: Forge._endpoints_answer, _T.MAIL: Forge._mail,
+    _T.ENDPOINTS: Forge._endpoints, _T.MAIL: Forge._mail,
     _T.DIAGNOSTIC_REQUEST: Forge._diagnostic_request, _T.DIAGNOSTIC_REPLY: Forge._diagnostic_reply,
 }  # fmt: skip
 _K = Kind
@@ -812,11 +811,11 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.RELAY: (_K.RIB_REQUEST, _K.RIB_REQUEST, _K.RELOCATE, _K.REDIRECT), _T.QUERY: (_K.RIB_REQUEST, _K.WHERE),
     _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.ADVERTISE_ACK, _K.REDIRECT),
     _T.ADVERTISE_ACK: (_K.ADVERTISE_ACK, _K.RIB_ANSWER),
-    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK), _T.SYNC: (_K.RIB_REQUEST, _K.REVOKED),
+    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK),
+    _T.SYNC: (_K.RIB_REQUEST, _K.RIB_ANSWER, _K.REVOKED),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
     _T.ENDPOINTS: (_K.RIB_REQUEST,),
-    _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
     _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER), _T.DIAGNOSTIC_REQUEST: (_K.DIAGNOSTIC_REQUEST,),
     _T.DIAGNOSTIC_REPLY: (_K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REQUEST),
 }  # fmt: skip

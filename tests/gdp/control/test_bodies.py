@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
-from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
 from gdp.control.join import Join
@@ -53,6 +52,7 @@ UNKNOWN = replace(REFRESH, is_reply=True)
 TOTALS = SyncMessage(totals=((A, b"d" * 8), (B, bytes(8))), session=b"s" * 16, sequence=7)
 WANTED = SyncMessage(of=A, asked=(b"", b"\1"), lacking=((b"\2", bytes(34)), (A, b"")))
 REPLY = SyncMessage(of=A, hashes=((b"\1", bytes(2_048)),), items=(b"item", b"other"), is_last=True, rest=3)
+REFUSAL = SyncMessage(of=A, lacking=((A, b""),), refused=DropReason.STALE)
 ASKED = DiagnosticRequest(ask="trace", name=A, target=B, sequence=7, body={"p": bytes(C)}, membership=b"cert")
 REPLIED = DiagnosticReply(
     ask="trace", sequence=7, asker=A, result={"branches": [{"port": "eth0"}]}, is_cut=True, hops_left=3
@@ -62,18 +62,6 @@ Read = Callable[[Fields], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
     "hello": (HELLO.to_wire(NODE.name, NODE.key), HELLO, Hello.from_fields),
     "hello of a tunnel": (OBSERVING.to_wire(NODE.name, NODE.key), OBSERVING, Hello.from_fields),
-    "endpoints query": (
-        EndpointQuery(((A, 7), (B, 0)), 30.0).to_wire(NODE.name, NODE.key, b"cert"),
-        EndpointQuery(((A, 7), (B, 0)), 30.0),
-        EndpointQuery.from_fields,
-    ),
-    "endpoints answer": (
-        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE).to_wire(
-            NODE.name, NODE.key, b"cert"
-        ),
-        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE),
-        EndpointResponse.from_fields,
-    ),
     "diagnostic request": (
         ASKED.padded(NODE.name, NODE.key, 1_000),
         ASKED,
@@ -97,6 +85,7 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "sync": (TOTALS.to_wire(NODE.name, NODE.key), TOTALS, SyncMessage.from_fields),
     "sync, request": (WANTED.to_wire(NODE.name, NODE.key, b"cert"), WANTED, SyncMessage.from_fields),
     "sync, reply": (REPLY.to_wire(NODE.name, NODE.key, b"cert"), REPLY, SyncMessage.from_fields),
+    "sync, refusal": (REFUSAL.to_wire(NODE.name, NODE.key, b"cert"), REFUSAL, SyncMessage.from_fields),
     "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Response.from_fields),
     "relay": (
         RelayedStatement(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),

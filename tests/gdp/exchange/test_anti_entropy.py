@@ -48,7 +48,7 @@ class Node:
         return None if rank is None else item(key, rank)
 
     def take(self, peer: str, message: SyncMessage, now_s: float) -> None:
-        for each in self.engine.receive(peer, message, now_s):
+        for each in self.engine.receive_message(peer, message, now_s):
             key, rank = each[:32], int.from_bytes(each[32:40], "big")
             known = self.sets[message.of].get(key)
             if each != item(key, rank):
