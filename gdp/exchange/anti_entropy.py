@@ -35,8 +35,8 @@ __all__ = ["AntiEntropy", "SyncPace"]
 
 _HASHES_BYTES: Final = FANOUT * HASH_BYTES
 _FEW: Final = _HASHES_BYTES // LINE_BYTES  # items below a prefix that are listed, or sent; for more, hashes are shorter
-_LEAF_LINES_MAX: Final = CAPACITY_BYTES // LINE_BYTES - 1
-_PREFIX_COST_BYTES: Final = 12  # of a prefix in a request, with the heads of its fields
+_LINES_MAX: Final = 512  # of one prefix in a request
+_PREFIX_COST_BYTES: Final = 12  # of a prefix in a request, for the heads of its fields
 _EXAMINED_BYTES: Final = 32  # of a reply that an item compared with lines counts for
 _HASHES_DRAWN: Final = 4  # items that 256 hashes count for
 _WINDOW_S: Final = 600.0
@@ -105,7 +105,7 @@ class AntiEntropy(Generic[P]):
     """Anti-entropy of one node over several sets.
 
     Args:
-        sets: by identifier, up to 32 bytes; the owner may add sets at any time.
+        sets: by identifier, up to 32 bytes; the owner may add sets at any time. Keys have up to ``KEY_MAX_BYTES``.
         item_of: returns an item of a set as it is sent, given its key and the monotonic second, or None.
 
     Attributes:
@@ -199,15 +199,16 @@ class AntiEntropy(Generic[P]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [state.total_at_s for state in self._peers.values()]
-        times += [self._end_of(state.fetch) for state in self._peers.values() if state.fetch is not None]
-        times += [state.reply_at_s for state in self._peers.values() if state.request is not None]
+        times: list[float] = []
         fetched = self._fetched()
-        times += [
-            state.barren_until_s
-            for state in self._peers.values()
-            if state.fetch is None and not state.totals.keys() <= fetched
-        ]
+        for state in self._peers.values():
+            times.append(state.total_at_s)
+            if state.request is not None:
+                times.append(state.reply_at_s)
+            if state.fetch is not None:
+                times.append(self._end_of(state.fetch))
+            elif state.totals and not state.totals.keys() <= fetched:
+                times.append(state.barren_until_s)
         return min(times, default=None)
 
     def poll_messages(self, now_s: float) -> list[tuple[P, SyncMessage]]:
@@ -267,18 +268,19 @@ class AntiEntropy(Generic[P]):
         lacking: list[tuple[bytes, bytes]] = []
         left = CAPACITY_BYTES
         while fetch.prefixes and len(asked) < ASKED_MAX and len(lacking) < LACKING_MAX:
-            prefix = fetch.prefixes[0]
-            has_hashes = len(prefix) < PREFIX_MAX_BYTES
-            if has_hashes and own.count(prefix) > _FEW:
+            prefix = fetch.prefixes.popleft()
+            count = own.count(prefix)
+            if len(prefix) < PREFIX_MAX_BYTES and count > _FEW:
                 asked.append(prefix)
                 left -= _PREFIX_COST_BYTES
+            elif count > _LINES_MAX:  # keys that were made to lie together
+                fetch.prefixes.extendleft(prefix + bytes([each]) for each in reversed(range(FANOUT)))
+            elif count * LINE_BYTES + len(prefix) + _PREFIX_COST_BYTES <= left:
+                lacking.append((prefix, own.lines(prefix)))
+                left -= count * LINE_BYTES + len(prefix) + _PREFIX_COST_BYTES
             else:
-                lines = own.lines(prefix, _LEAF_LINES_MAX)
-                if len(lines) + _PREFIX_COST_BYTES > left:
-                    break
-                lacking.append((prefix, lines))
-                left -= len(lines) + _PREFIX_COST_BYTES
-            fetch.prefixes.popleft()
+                fetch.prefixes.appendleft(prefix)
+                break
         fetch.requested = dict.fromkeys((*asked, *(prefix for prefix, _ in lacking)))
         fetch.until_s = now_s + self._pace.fetch_s
         self._out.append((peer, SyncMessage(of=fetch.of, asked=tuple(asked), lacking=tuple(lacking))))
@@ -336,10 +338,15 @@ class AntiEntropy(Generic[P]):
                 hashes.append(prefix)
                 left -= _HASHES_BYTES
                 continue
-            found = [self._item_of(request.of, key, now_s) for key in own.newer(prefix, lines)]
-            items += [item for item in found if item is not None]
-            left -= sum(len(item) for item in found if item is not None)
             left -= own.count(prefix) * _EXAMINED_BYTES if lines else 0
+            for key in own.newer(prefix, lines):
+                if left <= 0:
+                    rest += 1  # the peer requests it again, with lines of what it got
+                    break
+                item = self._item_of(request.of, key, now_s)
+                if item is not None:
+                    items.append(item)
+                    left -= len(item)
         if not self._may_draw(state.name, len(items) + _HASHES_DRAWN * len(hashes), now_s):
             return
         at_once = CAPACITY_BYTES // _HASHES_BYTES

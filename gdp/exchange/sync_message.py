@@ -22,6 +22,7 @@ ASKED_MAX: Final = 16  # prefixes in one request, each of which brings 2 KiB
 LACKING_MAX: Final = 400
 ITEMS_MAX: Final = 64
 CAPACITY_BYTES: Final = 11_500  # of hashes, lines or items in one: a statement has at most 16 KiB, a certificate 4
+KEY_MAX_BYTES: Final = 2 * NAME_BYTES
 _SESSION_BYTES: Final = 16
 
 _SET: Final = octets(most=NAME_BYTES)
@@ -29,7 +30,7 @@ _TOTAL: Final[Form[tuple[bytes, bytes]]] = row(lambda *each: each, _SET, octets(
 _HASHES: Final[Form[tuple[bytes, bytes]]] = row(
     lambda *each: each, octets(most=PREFIX_MAX_BYTES - 1), octets(FANOUT * HASH_BYTES)
 )
-_LACKING: Final[Form[tuple[bytes, bytes]]] = row(lambda *each: each, octets(most=NAME_BYTES), OCTETS)
+_LACKING: Final[Form[tuple[bytes, bytes]]] = row(lambda *each: each, octets(most=KEY_MAX_BYTES), OCTETS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

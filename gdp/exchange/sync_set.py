@@ -116,14 +116,9 @@ class SyncSet(Generic[V]):
                 found.append(prefix + bytes([index]))
         return found
 
-    def lines(self, prefix: bytes, most: int) -> bytes:
-        """Return a line of each item below a prefix, up to ``most``: hash of the key (8 bytes), rank (9)."""
-        lines: list[bytes] = []
-        for key, value in self._items(prefix):
-            if len(lines) >= most:
-                break
-            lines.append(line_of(key, self._rank_of(value)))
-        return b"".join(lines)
+    def lines(self, prefix: bytes) -> bytes:
+        """Return a line of each item below a prefix: hash of the key (8 bytes), rank (9)."""
+        return b"".join(line_of(key, self._rank_of(value)) for key, value in self._items(prefix))
 
     def newer(self, prefix: bytes, lines: bytes) -> list[bytes]:
         """Return the keys below a prefix whose items are not in these lines, or only with a lower rank."""

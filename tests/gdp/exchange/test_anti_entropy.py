@@ -196,6 +196,22 @@ def test_a_node_that_has_all_and_one_that_has_few_cost_what_the_few_lack() -> No
     assert network.bytes_between("a", "b") < 20_010 * (ITEM_BYTES + 30) + 10_000
 
 
+def test_keys_that_were_made_to_lie_together_are_sent_in_bounded_replies() -> None:
+    network = Network(a=Node(), b=Node())
+    keys = [bytes(2) + key_of(number)[2:] for number in range(2_000)]
+    for number, key in enumerate(keys):
+        network.nodes["a"].sets[SETS[0]].put(key, 1)
+        if number % 4:
+            network.nodes["b"].sets[SETS[0]].put(key, 1)
+    largest = 0
+    while not network.agree():
+        network.sent.clear()
+        network.run(PACE.reply_s)
+        assert network.now_s < 5
+        largest = max(largest, network.sent.get(("a", "b"), 0))
+    assert largest < 2 * (PACE.reply_bytes + 5_000)
+
+
 class Liar(Node):
     """A node that claims another total each time, and has no items for it."""
 
