@@ -42,6 +42,7 @@ _HASHES_DRAWN: Final = 4  # items that 256 hashes count for
 _WINDOW_S: Final = 600.0
 _SPARE: Final = 4_096  # items that a name may draw in a window, in addition to a multiple of all there are
 _BARREN: Final = 5  # times ``fetch_s`` after which a fetch that brought nothing new ends
+_LONGEST: Final = 100  # times ``fetch_s`` after which any fetch ends, so that other peers have their turn
 _REPEATS: Final = 3  # of one request
 _NAMES_MAX: Final = 1_024
 
@@ -74,7 +75,7 @@ class _Fetch:
 
     of: bytes
     total: bytes  # of the set here, when the fetch began
-    end_s: float  # while the total does not change
+    begun_s: float
     until_s: float  # without progress
     prefixes: deque[bytes]
     repeats_left: int = _REPEATS
@@ -252,8 +253,7 @@ class AntiEntropy(Generic[P]):
                 del state.totals[of]
                 own = self._sets[of].total
                 if own != total:
-                    end_s, until_s = now_s + _BARREN * self._pace.fetch_s, now_s + self._pace.fetch_s
-                    state.fetch = _Fetch(of, own, end_s, until_s, deque([b""]))
+                    state.fetch = _Fetch(of, own, now_s, now_s + self._pace.fetch_s, deque([b""]))
                     self._request(peer, state.fetch, now_s)
                     fetched.add(of)
                     break
@@ -287,7 +287,7 @@ class AntiEntropy(Generic[P]):
 
     def _repeat(self, peer: P, state: _Peer, fetch: _Fetch, now_s: float) -> None:
         """Repeat a request without a reply, a few times."""
-        if fetch.repeats_left and not (self._is_barren(fetch) and fetch.end_s <= now_s):
+        if fetch.repeats_left and now_s < self._limit_of(fetch):
             fetch.repeats_left -= 1
             fetch.prefixes.extendleft(reversed(fetch.requested))
             self._request(peer, fetch, now_s)
@@ -312,7 +312,10 @@ class AntiEntropy(Generic[P]):
             state.barren_until_s = now_s + self._pace.fetch_s
 
     def _end_of(self, fetch: _Fetch) -> float:
-        return min(fetch.until_s, fetch.end_s) if self._is_barren(fetch) else fetch.until_s
+        return min(fetch.until_s, self._limit_of(fetch))
+
+    def _limit_of(self, fetch: _Fetch) -> float:
+        return fetch.begun_s + (_BARREN if self._is_barren(fetch) else _LONGEST) * self._pace.fetch_s
 
     def _is_barren(self, fetch: _Fetch) -> bool:
         """Return whether the peer had nothing for us so far, whatever its totals say."""
@@ -338,7 +341,6 @@ class AntiEntropy(Generic[P]):
                 hashes.append(prefix)
                 left -= _HASHES_BYTES
                 continue
-            left -= own.count(prefix) * _EXAMINED_BYTES if lines else 0
             for key in own.newer(prefix, lines):
                 if left <= 0:
                     rest += 1  # the peer requests it again, with lines of what it got
@@ -347,6 +349,7 @@ class AntiEntropy(Generic[P]):
                 if item is not None:
                     items.append(item)
                     left -= len(item)
+            left -= own.count(prefix) * _EXAMINED_BYTES if lines else 0
         if not self._may_draw(state.name, len(items) + _HASHES_DRAWN * len(hashes), now_s):
             return
         at_once = CAPACITY_BYTES // _HASHES_BYTES
