@@ -26,7 +26,7 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = (
-    "gdp/switch", "gdp/rib", "gdp/client", "gdp/message", "gdp/crypto", "gdp/trust", "proxy/bridge",
+    "gdp/switch", "gdp/rib", "gdp/client", "gdp/exchange", "gdp/message", "gdp/crypto", "gdp/trust", "proxy/bridge",
 )  # fmt: skip
 _COPIED: Final = ("gdp", "proxy", "fog", "tests", "scripts", "netns_tests", "examples", "docs")
 _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {

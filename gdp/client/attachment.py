@@ -40,7 +40,6 @@ from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.advertisement import MS, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
-from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.withdrawal import Withdrawal
@@ -271,7 +270,7 @@ class Attachment:
             return statement  # it proves itself
         if header.kind == Kind.REVOKED:
             if statement.type is StatementType.REVOKE:
-                self._sync.took(switch, hash_of(Revocation.read(statement).issuer.owner_key), now.mono_s)
+                self._sync.took(switch, now.mono_s)
                 return statement
             self._sync.receive(switch, statement, now)
             return None

@@ -19,10 +19,11 @@ from typing import Final, NamedTuple
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
+from gdp.control.endpoint_sync import ENDPOINTS
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
-from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Key
+from gdp.control.rib_replication import Entry, Key
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
@@ -30,6 +31,7 @@ from gdp.crypto.schema import NAME, Keyed
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.diagnosis.facts import RibFacts, RouteFact
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
 from gdp.limits import (
     ANSWER_BYTES_BURST,
@@ -40,12 +42,11 @@ from gdp.limits import (
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
 )
-from gdp.names import Name
-from gdp.rib.anti_entropy import AntiEntropy, Message
-from gdp.rib.digest_tree import DigestTree
+from gdp.names import NAME_BYTES, Name
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
 from gdp.rib.lower_ribs import LowerRibs
+from gdp.rib.replication import ROUTES, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
@@ -73,12 +74,6 @@ _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answere
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
 _STALE_MARGIN_S: Final = 1.0  # for the notice of a longer lease to arrive before the former one ends
 _DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query
-_PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
-    StatementType.DIGEST: Digest,
-    StatementType.FETCH: Fetch,
-    StatementType.INVENTORY: Inventory,
-    StatementType.REPLICAS: EntryBatch,
-}
 
 
 class OutgoingStatement(NamedTuple):
@@ -126,8 +121,11 @@ class RibCore:
         self._upstream_queries = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._lower = LowerRibs()
-        self._replication = self._replication_over(store.digests)
-        self._endpoints = RibEndpoints(identity, policy, self._other_ribs, settings.watches)
+        self._endpoints = RibEndpoints(
+            identity, policy, lambda name: self._replication.push(ENDPOINTS, name), settings.watches
+        )
+        self._sets = {ENDPOINTS: self._endpoints.records} | ({} if store.digests is None else {ROUTES: store.digests})
+        self._replication = Replication(identity, self._sets, self._item_of, settings.peers)
         self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
         self._outgoing_statements: list[OutgoingStatement] = []
@@ -180,12 +178,10 @@ class RibCore:
                 self._take_ack_from_above(statement, now)
             elif statement.type is StatementType.PRESENCE:
                 self._take_presence(statement, now)
-            elif statement.type in _PEER_MESSAGES:
-                self._take_peer_message(statement, now)
+            elif statement.type is StatementType.SYNC:
+                self._take_sync(statement, now)
             elif statement.type is StatementType.ENDPOINTS:
                 self._endpoints.receive_record(statement, now)
-            elif statement.type in (StatementType.ENDPOINTS_QUERY, StatementType.ENDPOINTS_ANSWER):
-                self._take_endpoint_message(statement, now)
             else:
                 raise StatementError(DropReason.MALFORMED, f"a RIB takes no {statement.type.value}")
         except RemoteError as error:
@@ -285,8 +281,7 @@ class RibCore:
         self._now_s = now.mono_s
         self._watches.expire(now.mono_s)
         self._holders.expire(now.mono_s)
-        if self._replication is not None:
-            self._replication.handle_timer(now.mono_s)
+        self._replication.handle_timer(now.mono_s)
         self._endpoints.handle_timer(now)
         self._ask_what_is_due(now)
         for passed in self._upstream.due(now.mono_s):
@@ -295,16 +290,12 @@ class RibCore:
     def connected(self, now: Timestamps) -> None:
         """Record that statements arrive from now on: there is a switch."""
         self._now_s = now.mono_s
-        if self._replication is not None:
-            self._replication.connected(now.mono_s)
-        self._endpoints.connected()
+        self._replication.connected(now.mono_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._store.next_expiry(), self._upstream_queries.next_due(), self._upstream.next_due()]
-        if self._replication is not None:
-            times.append(self._replication.next_due())
-        times.append(self._endpoints.get_timer())
+        times += [self._replication.get_timer(), self._endpoints.get_timer()]
         return min((time for time in times if time is not None), default=None)
 
     def statements_to_send(self) -> list[OutgoingStatement]:
@@ -314,11 +305,10 @@ class RibCore:
                 outgoing for outgoing in self._outgoing_statements if outgoing.about not in refused
             ]
         letters, self._outgoing_statements = self._outgoing_statements, []
-        if self._replication is not None:
-            letters += [
-                OutgoingStatement(to, Kind.RIB_REQUEST, wire)
-                for to, wire in self._replication.statements_to_send(self._now_s)
-            ]
+        letters += [
+            OutgoingStatement(to, Kind.RIB_REQUEST, wire)
+            for to, wire in self._replication.statements_to_send(self._now_s)
+        ]
         return letters + [OutgoingStatement(*each) for each in self._endpoints.poll_statements()]
 
     # -- advertisements
@@ -336,9 +326,6 @@ class RibCore:
             return
         if passed_on.type is StatementType.WITHDRAW:
             self._take_withdrawal(passed_on, member, now)
-            return
-        if passed_on.type is StatementType.ENDPOINTS:
-            self._endpoints.receive_relayed(passed_on, member, now)
             return
         try:
             advertisement = self._verifier.verify_statement(passed_on, now.unix_s)
@@ -580,7 +567,7 @@ class RibCore:
 
     def _answer_none(self, name: Name, to: Name, *, is_unknown: bool) -> None:
         """Answer that no node advertises a name, or, if the tier above could not be asked, that it is not known."""
-        if self._replication is not None and self._replication.is_cold(self._now_s):
+        if self._replication.is_cold(self._now_s):
             return  # a peer may know; the asker repeats its query, here or at that peer
         self._deny(name, to, lease_s=0.0 if is_unknown else NEGATIVE_LEASE_S)
 
@@ -868,32 +855,18 @@ class RibCore:
         """Return how many endpoint records are kept."""
         return len(self._endpoints)
 
-    def _other_ribs(self) -> tuple[Name, ...]:
-        peers = self._settings.peers if self._replication is None else self._replication.peers
-        return tuple(peer for peer in peers if peer != self._identity.name)
-
-    def _take_endpoint_message(self, statement: Statement, now: Timestamps) -> None:
-        member = self._policy.verify_sender(statement, now.unix_s)
-        statement.verify(member.key)
-        if statement.type is StatementType.ENDPOINTS_QUERY:
-            self._endpoints.handle_query(statement, member, now)
-        else:
-            self._endpoints.receive_response(statement, member, now)
-
     # -- other RIBs of the domain
 
-    def _replication_over(self, digests: DigestTree | None) -> AntiEntropy | None:
-        if digests is None:
-            return None
-        return AntiEntropy(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
-
     def _replicate(self, name: Name, advertiser: Name) -> None:
-        if self._replication is not None:
-            self._replication.push_entry((name, advertiser))
+        if ROUTES in self._sets:
+            self._replication.push(ROUTES, name + advertiser)
 
-    def _rank_of(self, key: Key) -> int | None:
-        known = self._store.get(*key)
-        return None if known is None else _rank(known)
+    def _item_of(self, of: bytes, key: bytes, now_s: float) -> bytes | None:
+        """Return an item as a peer gets it, or None."""
+        if of == ENDPOINTS:
+            return self._endpoints.item_of(Name(key), now_s)
+        entry = self.entry_of((Name(key[:NAME_BYTES]), Name(key[NAME_BYTES:])), now_s)
+        return None if entry is None else entry.to_cbor()
 
     def entry_of(self, key: Key, now_s: float) -> Entry | None:
         """Return the stored entry of an advertiser of a name, for a peer or a snapshot, or None."""
@@ -924,17 +897,25 @@ class RibCore:
             )
         return None
 
-    def _take_peer_message(self, statement: Statement, now: Timestamps) -> None:
+    def _take_sync(self, statement: Statement, now: Timestamps) -> None:
+        """Take part in equalising a set with a RIB of this domain, or answer a switch that asks for endpoints."""
         member = self._policy.verify_sender(statement, now.unix_s)
-        if member.role is not Role.RIB or member.domain != self._policy.own or self._replication is None:
+        is_peer = member.role is Role.RIB and member.domain == self._policy.own
+        if not is_peer and not member.role.is_switch:
             raise StatementError(DropReason.WRONG_DOMAIN, "replicates with RIBs of this domain only")
         statement.verify(member.key)
-        if not self._replication.add_peer(member.name):
+        message = SyncMessage.from_fields(statement.fields)
+        if not is_peer:
+            self._endpoints.handle_query(message, member, now)
+            return
+        if not self._replication.add_peer(member.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "peers")
-        message = _PEER_MESSAGES[statement.type].from_fields(statement.fields)
-        for entry in self._replication.receive(message, member.name, now.mono_s):
+        for item in self._replication.receive(message, member.name, now.mono_s):
             try:
-                self._handle_entry(entry, now)
+                if message.of == ENDPOINTS:
+                    self._endpoints.receive_item(item, now)
+                elif message.of in self._sets:
+                    self._handle_entry(Entry.from_cbor(item), now)
             except StatementError as error:
                 self.refusals[error.reason] += 1
 
@@ -982,7 +963,7 @@ class RibCore:
         withdrawal = Withdrawal.received(statement, now.unix_s)
         name, sequence = withdrawal.name, withdrawal.sequence
         known = self._store.get(name, statement.signer)
-        if known is not None and _rank(known) >= 2 * sequence + 1:
+        if known is not None and known.rank >= 2 * sequence + 1:
             return
         member = self._policy.verify_sender(statement, now.unix_s, entry.membership)
         statement.verify(member.key)
@@ -1022,11 +1003,6 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
         found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
         issuer_key = link.delegate_key
     return found
-
-
-def _rank(known: Route | Withdrawn) -> int:
-    """Return ``Item.rank`` of a stored entry; a lease that ended ranks like the advertisement."""
-    return 2 * known.sequence + (isinstance(known, Withdrawn) and bool(known.proof))
 
 
 def _asker(member: Membership) -> Asker:

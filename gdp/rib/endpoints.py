@@ -2,7 +2,7 @@
 
 Sans-I/O; time comes in as ``Timestamps``. A switch publishes its own record over its channel, and renews it. The RIB
 verifies membership, role, signature, sequence and quota, and keeps one record of each switch for ``ENDPOINT_LEASE_S``.
-It passes the record on to the other RIBs of the domain. A RIB that has just started requests what its peers keep.
+The RIBs of a domain equalise the records of its switches.
 
 Records are sent to switches of the record's own domain only, and kept in memory: after a restart of all RIBs the
 switches publish again. A change is sent to its watchers three times, because nothing acknowledges it.
@@ -10,18 +10,19 @@ switches publish again. A change is sent to its watchers three times, because no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_query import EndpointQuery, EndpointResponse, batches
 from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.relayed_statement import RelayedStatement
-from gdp.crypto.certificates import Membership, Role
+from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of, record_in
+from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, check_sequence, parse
 from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage, pages
+from gdp.exchange.sync_set import SyncSet, line_of, rank_in
 from gdp.frame.kinds import Kind
 from gdp.limits import (
     ENDPOINT_LEASE_S,
@@ -33,7 +34,7 @@ from gdp.limits import (
     ENDPOINT_RECORDS_PER_S,
     RIB_WATCHES_MAX,
 )
-from gdp.names import Name
+from gdp.names import NAME_BYTES, Name
 from gdp.rib.watches import Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
@@ -42,6 +43,8 @@ from gdp.trust.domain import Policy
 __all__ = ["RibEndpoints"]
 
 _REPEAT_S: Final = (0.3, 0.8)  # after a change was sent to its watchers
+_WATCH_S: Final = 30.0  # a switch that requests a record also gets changes for so long
+_LEASE_LEFT_S: Final = 1.0  # a lease that is about to end is not passed on
 
 
 class _Outgoing(NamedTuple):
@@ -61,22 +64,27 @@ class RibEndpoints:
     """Endpoint records of one RIB.
 
     Args:
-        peers: returns the other RIBs of the domain.
+        push: sends the record of a switch of this domain to the other RIBs.
+
+    Attributes:
+        records: those of this domain's switches, which its RIBs equalise.
     """
 
     def __init__(
         self,
         identity: Identity,
         policy: Policy,
-        peers: Callable[[], Iterable[Name]],
+        push: Callable[[Name], None],
         watches: int = RIB_WATCHES_MAX,
         maximum: int = ENDPOINT_RECORDS_MAX,
     ) -> None:
         self._identity = identity
         self._policy = policy
-        self._peers = peers
+        self._push = push
         self._maximum = maximum
-        self._kept: dict[Name, _Kept] = {}  # the first one to expire first
+        self._kept: dict[Name, _Kept] = {}
+        self._ends = DueQueue[Name]()
+        self.records = SyncSet[int](lambda sequence: sequence)
         self._of_others = 0  # records of other domains
         self._watches = Watches(watches)
         self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
@@ -92,10 +100,11 @@ class RibEndpoints:
         kept = self._kept.get(name)
         return None if kept is None else kept.record
 
-    def connected(self) -> None:
-        """Request all records of the domain from the other RIBs: this RIB has just started, or was cut off."""
-        query = EndpointQuery((), 0.0).to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._out += [_Outgoing(peer, Kind.RIB_REQUEST, query) for peer in self._peers()]
+    def item_of(self, name: Name, now_s: float) -> bytes | None:
+        """Return the item of a kept record, or None."""
+        kept = self._kept.get(name)
+        left_s = 0.0 if kept is None else kept.expires_s - now_s
+        return None if kept is None or left_s < _LEASE_LEFT_S else item_of(kept.record.wire, left_s)
 
     def receive_record(self, statement: Statement, now: Timestamps) -> None:
         """Keep a record that its switch sent over its channel; the switch receives the result.
@@ -112,44 +121,27 @@ class RibEndpoints:
             raise
         self._respond(statement.signer)
         if kept.member.domain == self._policy.own:
-            relayed = RelayedStatement(statement.wire, (), self._identity.membership)
-            for peer in self._peers():
-                wire = relayed.to_wire(self._identity.name, self._identity.key)
-                self._out.append(_Outgoing(peer, Kind.RIB_REQUEST, wire))
+            self._push(kept.record.name)
 
-    def receive_relayed(self, statement: Statement, member: Membership, now: Timestamps) -> None:
-        """Keep a record that a proven RIB of this domain passed on; it goes no further.
+    def receive_item(self, item: bytes, now: Timestamps) -> None:
+        """Keep a record that a proven RIB of this domain sent; it goes no further.
 
         Raises:
-            StatementError: it is refused.
+            StatementError: it is refused; an older one raises nothing.
         """
-        if member.role is not Role.RIB or member.domain != self._policy.own:
-            raise StatementError(DropReason.WRONG_DOMAIN, "an endpoint record from another than its switch")
-        self._keep(statement, now)
+        wire, left_s = record_in(item)
+        try:
+            self._keep(parse(wire), now, min(left_s, ENDPOINT_LEASE_S))
+        except StatementError as error:
+            if error.reason is not DropReason.STALE:
+                raise
 
-    def receive_response(self, statement: Statement, member: Membership, now: Timestamps) -> None:
-        """Keep the records that a proven RIB of this domain sent when requested.
-
-        Raises:
-            StatementError: the response is not valid; a record in it that is refused raises nothing.
-        """
-        if member.role is not Role.RIB or member.domain != self._policy.own:
-            raise StatementError(DropReason.WRONG_DOMAIN, "endpoint records of another than a RIB of this domain")
-        refused: StatementError | None = None
-        for wire in EndpointResponse.from_fields(statement.fields).records:
-            try:
-                self._keep(parse(wire), now)
-            except StatementError as error:
-                refused = refused if error.reason is DropReason.STALE else error
-        if refused is not None:
-            raise refused
-
-    def _keep(self, statement: Statement, now: Timestamps) -> _Kept:
+    def _keep(self, statement: Statement, now: Timestamps, lease_s: float = ENDPOINT_LEASE_S) -> _Kept:
         known = self._kept.get(statement.signer)
         if known is not None and known.record.wire == statement.wire:  # renewed
             self._check(known, now)
-            known.expires_s = now.mono_s + ENDPOINT_LEASE_S
-            self._kept[known.record.name] = self._kept.pop(known.record.name)
+            known.expires_s = max(known.expires_s, now.mono_s + lease_s)
+            self._ends.put(known.record.name, known.expires_s)
             return known
         record, member = EndpointRecord.verified(statement.wire, self._policy, now.unix_s)
         if not member.role.is_switch:
@@ -165,8 +157,12 @@ class RibEndpoints:
         if is_of_other and not was_of_other and self._of_others >= others_max:
             raise StatementError(DropReason.QUOTA, "endpoint records of other domains")
         self._of_others += is_of_other - was_of_other
-        self._kept.pop(record.name, None)
-        kept = self._kept[record.name] = _Kept(record, member, now.mono_s + ENDPOINT_LEASE_S)
+        kept = self._kept[record.name] = _Kept(record, member, now.mono_s + lease_s)
+        self._ends.put(record.name, kept.expires_s)
+        if is_of_other:
+            self.records.remove(record.name)
+        else:
+            self.records.put(record.name, record.sequence)
         self._tell(kept, now.mono_s)
         for after_s in _REPEAT_S:
             self._repeats.put((record.name, record.sequence, after_s), now.mono_s + after_s)
@@ -177,35 +173,32 @@ class RibEndpoints:
         if kept.record.until_unix_s < now.unix_s:
             raise StatementError(DropReason.EXPIRED, "endpoint record")
 
-    def handle_query(self, statement: Statement, member: Membership, now: Timestamps) -> None:
-        """Respond to a proven switch or RIB with the records that it lacks, and watch them for it.
+    def handle_query(self, query: SyncMessage, member: Membership, now: Timestamps) -> None:
+        """Respond to a proven switch with the records that it lacks, and watch them for it.
 
         Raises:
             StatementError: it may not ask, or asks too often; QUOTA after the response, there are too many watches.
         """
-        query = EndpointQuery.from_fields(statement.fields)
-        is_peer = member.role is Role.RIB and member.domain == self._policy.own
-        if not member.role.is_switch and not is_peer:
-            raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs of this domain ask for endpoints")
+        if not member.role.is_switch:
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches ask for endpoints")
+        if query.of != ENDPOINTS or len(query.lacking) > ENDPOINT_NAMES_MAX:
+            raise StatementError(DropReason.MALFORMED, "a switch's query for endpoints")
         if not self._query_paces.spend(member.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "queries for endpoints")
-        if is_peer:
-            wanted = [kept for kept in self._kept.values() if kept.member.domain == self._policy.own]
-            self._send(member.name, [kept.record.wire for kept in wanted if self._is_valid(kept, now)])
-            return
         asker = Asker(member.name, member.domain, False)
         lacked: list[bytes] = []
         refused: StatementError | None = None
-        for name, sequence in query.known:
+        for prefix, line in query.lacking:
+            name = Name(prefix.ljust(NAME_BYTES, b"\0"))  # a shorter one is of no switch
             kept = self._kept.get(name)
-            if kept is not None and kept.record.sequence > sequence and self._may_tell(kept, asker):
-                lacked += [kept.record.wire] if self._is_valid(kept, now) else []
+            if kept is not None and kept.record.sequence > rank_in(line) and self._may_tell(kept, asker):
+                lacked += [item_of(kept.record.wire, kept.expires_s - now.mono_s)] if self._is_valid(kept, now) else []
             try:
-                if query.watch_s > 0:
-                    self._watches.add(name, asker, now.mono_s + query.watch_s)
+                self._watches.add(name, asker, now.mono_s + _WATCH_S)
             except StatementError as error:
                 refused = error  # without a watch it learns changes by its next query
-        self._send(member.name, lacked)
+        for page in list(pages(lacked)) or [()]:
+            self._respond(member.name, page)
         if refused is not None:
             raise refused
 
@@ -217,8 +210,8 @@ class RibEndpoints:
 
     def handle_timer(self, now: Timestamps) -> None:
         """Drop records that were not renewed, and send changes once more to their watchers."""
-        while self._kept and next(iter(self._kept.values())).expires_s <= now.mono_s:
-            self._drop(next(iter(self._kept)))
+        for name in self._ends.poll_due(now.mono_s):
+            self._drop(name)
         self._watches.expire(now.mono_s)
         for name, sequence, _ in self._repeats.poll_due(now.mono_s):
             known = self._kept.get(name)
@@ -227,7 +220,7 @@ class RibEndpoints:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._repeats.next_due(), next(iter(self._kept.values())).expires_s if self._kept else None]
+        times = [self._repeats.next_due(), self._ends.next_due()]
         return min((each for each in times if each is not None), default=None)
 
     def poll_statements(self) -> list[_Outgoing]:
@@ -244,6 +237,8 @@ class RibEndpoints:
 
     def _drop(self, name: Name) -> None:
         self._of_others -= self._kept.pop(name).member.domain != self._policy.own
+        self._ends.discard(name)
+        self.records.remove(name)
 
     @staticmethod
     def _may_tell(kept: _Kept, asker: Asker) -> bool:
@@ -251,18 +246,15 @@ class RibEndpoints:
         return kept.member.domain == asker.domain and kept.member.name != asker.name
 
     def _tell(self, kept: _Kept, now_s: float) -> None:
+        item = item_of(kept.record.wire, kept.expires_s - now_s)
         for asker in self._watches.watchers(kept.record.name, now_s):
             if self._may_tell(kept, asker):
-                self._respond(asker.name, (kept.record.wire,))
+                self._respond(asker.name, (item,))
 
-    def _send(self, to: Name, records: list[bytes]) -> None:
-        for batch in batches(records, self._identity.membership) or [()]:
-            self._respond(to, batch)
-
-    def _respond(self, to: Name, records: tuple[bytes, ...] = (), refused: DropReason | None = None) -> None:
+    def _respond(self, to: Name, items: tuple[bytes, ...] = (), refused: DropReason | None = None) -> None:
+        """Send items, and request what is newer than the receiver's own record here."""
         own = self._kept.get(to)
-        response = EndpointResponse(
-            records=records, kept_sequence=0 if own is None else own.record.sequence, refused=refused
-        )
+        line = b"" if own is None else line_of(to, own.record.sequence)
+        response = SyncMessage(of=ENDPOINTS, items=items, lacking=((to, line),), refused=refused)
         wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._out.append(_Outgoing(to, Kind.RIB_ANSWER, wire))

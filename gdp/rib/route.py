@@ -85,6 +85,11 @@ class Route:
         """Return what a move changes: switch and domain."""
         return self.switch, self.domain
 
+    @property
+    def rank(self) -> int:
+        """Return a rank that is higher for the newer of two entries: by sequence number, then the withdrawal."""
+        return 2 * self.sequence
+
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
@@ -102,3 +107,8 @@ class Withdrawn:
     valid_until_unix_s: int
     proof: bytes = b""
     membership: bytes = b""
+
+    @property
+    def rank(self) -> int:
+        """Return its rank, as of a route; a lease that ended ranks like the advertisement."""
+        return 2 * self.sequence + bool(self.proof)

@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterator
 from typing import Protocol
 
 from gdp.control.rib_replication import Key
+from gdp.exchange.sync_set import SyncSet
 from gdp.names import Name
-from gdp.rib.digest_tree import DigestTree
 from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
 from gdp.trust.evidence_index import EvidenceIndex
@@ -26,7 +26,7 @@ class Store(Protocol):
     """
 
     @property
-    def digests(self) -> DigestTree | None:
+    def digests(self) -> SyncSet[int] | None:
         """Return hashes over the contents, for replication; None where several RIBs share the store itself."""
 
     def __len__(self) -> int:
@@ -82,7 +82,7 @@ class MemoryStore:
         self._evidence = EvidenceIndex[Key]()
         self.changes: set[Key] | None = None  # what changed since the last snapshot; None: there are no snapshots
         # over the replicated entries: all but those from the tier above, and leases that ended
-        self.digests = DigestTree()
+        self.digests = SyncSet[int](lambda rank: rank)
 
     def __len__(self) -> int:
         return self._size
@@ -115,7 +115,7 @@ class MemoryStore:
         if self.changes is not None:
             self.changes.add((route.name, route.advertiser))
         if not route.is_from_upstream:
-            self.digests.put(route.name, route.advertiser, route.sequence, is_withdrawn=False)
+            self.digests.put(route.name + route.advertiser, route.rank)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._evidence.put((route.name, route.advertiser), route.fingerprints | route.issuers)
         self._count(route.sender, route.advertiser)
@@ -136,7 +136,7 @@ class MemoryStore:
         self._count(withdrawn.sender, advertiser)
         heapq.heappush(self._forget, (withdrawn.valid_until_unix_s, name, advertiser))
         if withdrawn.proof:
-            self.digests.put(name, advertiser, withdrawn.sequence, is_withdrawn=True)
+            self.digests.put(name + advertiser, withdrawn.rank)
         return route
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
@@ -183,14 +183,14 @@ class MemoryStore:
         self._evidence.remove((name, advertiser), route.fingerprints | route.issuers)
         self._size -= 1
         self._uncount(route.sender, advertiser)
-        self.digests.remove(name, advertiser)
+        self.digests.remove(name + advertiser)
         return route
 
     def _forget_withdrawn(self, name: Name, advertiser: Name) -> None:
         withdrawn = self._withdrawn.pop((name, advertiser), None)
         if withdrawn is not None:
             self._uncount(withdrawn.sender, advertiser)
-            self.digests.remove(name, advertiser)
+            self.digests.remove(name + advertiser)
 
     def _count(self, *owners: Name) -> None:
         for owner in owners:

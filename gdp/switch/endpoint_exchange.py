@@ -2,7 +2,7 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds) or ``Timestamps``. A record is sent again until a response
 states that the RIB keeps it, then each third of its lease. A RIB that is new here receives record and query at once.
-Queries watch the wanted switches, so that the RIB sends a new record when it comes; they are repeated for losses.
+The RIB also sends new records of the wanted switches when they come; queries are repeated for losses.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_query import ENDPOINT_NAMES_MAX, EndpointQuery, EndpointResponse
 from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, record_in
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
+from gdp.exchange.sync_set import line_of, rank_in
 from gdp.limits import ENDPOINT_LEASE_S
 from gdp.names import Name
 from gdp.sansio import Timestamps
@@ -26,7 +28,6 @@ __all__ = ["EndpointExchange", "Refusal"]
 _RENEW_S: Final = ENDPOINT_LEASE_S / 3
 _AGAIN_S: Final = (0.3, 0.6, 1.2, 2.4, 4.8)  # until a response comes; the last one from then on
 _QUERY_S: Final = 5.0
-_WATCH_S: Final = 30.0
 
 
 class Refusal(NamedTuple):
@@ -109,8 +110,8 @@ class EndpointExchange:
             wires.append(self.own.wire)
         if self._query.due_s <= now_s:
             self._query.sent(now_s)
-            known = tuple((name, self._sequence_of(name)) for name in self._wanted)
-            query = EndpointQuery(known, _WATCH_S)
+            lines = {name: line_of(name, record.sequence) for name, (record, _) in self._known.items()}
+            query = SyncMessage(of=ENDPOINTS, lacking=tuple((name, lines.get(name, b"")) for name in self._wanted))
             wires.append(query.to_wire(self._identity.name, self._identity.key, self._identity.membership))
         return wires
 
@@ -119,7 +120,7 @@ class EndpointExchange:
         due_s = min(self._publication.due_s, self._query.due_s)
         return None if due_s == float("inf") else due_s
 
-    def receive(self, response: EndpointResponse, now: Timestamps) -> None:
+    def receive(self, response: SyncMessage, now: Timestamps) -> None:
         """Process a response of the RIB in use.
 
         Raises:
@@ -127,10 +128,11 @@ class EndpointExchange:
         """
         own = self.own
         if own is not None:
+            kept_sequence = next((rank_in(line) for name, line in response.lacking if name == own.name), 0)
             if response.refused is not None:
-                self.refusal = Refusal(response.refused, response.kept_sequence)
+                self.refusal = Refusal(response.refused, kept_sequence)
                 self._publication.answered(now.mono_s + _QUERY_S)
-            elif response.kept_sequence == own.sequence:
+            elif kept_sequence == own.sequence:
                 self.refusal = None
                 if self._publication.tries:
                     self._publication.answered(now.mono_s + _RENEW_S)
@@ -139,9 +141,9 @@ class EndpointExchange:
         if self._wanted and self._query.tries:
             self._query.answered(now.mono_s + _QUERY_S)
         refused: StatementError | None = None
-        for wire in response.records:
+        for item in response.items:
             try:
-                self._learn(wire, now)
+                self._learn(record_in(item)[0], now)
             except StatementError as error:
                 refused = error
         if refused is not None:

@@ -1,10 +1,10 @@
 """Flooding of link states: one switch's part in keeping all link-state databases equal.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: after RFC 2328, section 13, with these differences.
-Neighbours compare digests in every hello and send each other all link states where the digests differ. So a lost flood
-heals without acknowledgements. A switch that has restarted asks not to carry transit until it has learnt the network
-again (RFC 6987, stub router on start-up). A leaf passes link states on like any other switch: that keeps databases
-equal and attracts no traffic. Its own links stay within its domain.
+Neighbours compare digests in every hello and keepalive, and send each other all link states where these differ. So a
+lost flood heals without acknowledgements. A switch that has restarted asks not to carry transit until it has learnt the
+network again (RFC 6987, stub router on start-up). A leaf passes link states on like any other switch: that keeps
+databases equal and attracts no traffic. Its own links stay within its domain.
 """
 
 from __future__ import annotations

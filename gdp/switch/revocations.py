@@ -35,7 +35,7 @@ from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
-from gdp.trust.revocations import OPERATOR, hash_of
+from gdp.trust.revocations import OPERATOR
 from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["RevocationHandler"]
@@ -91,7 +91,7 @@ class RevocationHandler:
         revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
         if revocation is None:
             return []
-        self._sync.took(neighbour, hash_of(revocation.issuer.owner_key), now.mono_s)
+        self._sync.took(neighbour, now.mono_s)
         return self._apply(revocation, now)
 
     def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> list[Name]:

@@ -21,7 +21,6 @@ from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
-from gdp.control.endpoint_query import EndpointResponse
 from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
@@ -31,6 +30,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
@@ -240,8 +240,8 @@ class RibClient:
         if statement.type is StatementType.ADVERTISE_ACK:
             self._handle_ack(statement)
             return
-        if statement.type is StatementType.ENDPOINTS_ANSWER:
-            self._endpoints.receive(EndpointResponse.from_fields(fields), now)
+        if statement.type is StatementType.SYNC:
+            self._endpoints.receive(SyncMessage.from_fields(fields), now)
             return
         statement.expect(StatementType.ANSWER)
         response = Response.from_fields(fields)

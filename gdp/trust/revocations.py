@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 from gdp.crypto.statements import Statement, assemble
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_set import SyncSet
 from gdp.limits import (
     CERTIFICATE_LIFE_MAX_S,
     CLOCK_SKEW_S,
@@ -34,9 +35,8 @@ from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocation import Revocation
 
-__all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
+__all__ = ["ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
 
-BUCKETS: Final = 256  # of a root's revocations, by the first byte of the fingerprint
 ID_BYTES: Final = 8
 OPERATOR: Final = b""  # the origin of this node's own operator: without a rate, never displaced
 _ROOTS_PER_S, _ROOTS_BURST = 1_500.0, 4_096.0  # of one origin; a verification costs about 80 us
@@ -60,17 +60,13 @@ class Kept(NamedTuple):
 
 @dataclass(slots=True)
 class _Root:
-    """The revocations of one root. A value: until when (8 bytes), and the signature, or the whole statement.
+    """The revocations of one root, by fingerprint.
 
-    Args:
-        root: the hash of its key.
+    A value: until when (8 bytes), and the signature, or the whole statement.
     """
 
-    root: Name
+    items: SyncSet[bytes] = field(default_factory=lambda: SyncSet(_end_of))
     subject: Subject | None = None
-    buckets: list[dict[bytes, bytes]] = field(default_factory=lambda: [{} for _ in range(BUCKETS)])
-    hashes: list[int] = field(default_factory=lambda: [0] * BUCKETS)
-    count: int = 0
 
 
 @dataclass(slots=True)
@@ -91,6 +87,7 @@ class Revocations:
         per_root, of_owners, per_issuer, per_origin: bounds, see ``limits``.
 
     Attributes:
+        sets: the revocations of each root, by the hash of its key, for neighbours to compare.
         changes: keys that were added or dropped since they were last written down; None: there is no writer.
     """
 
@@ -104,7 +101,8 @@ class Revocations:
         per_origin: int = REVOCATIONS_PER_ORIGIN,
     ) -> None:
         self._roots: dict[bytes, _Root] = {}
-        self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours identify it
+        self._key_of: dict[bytes, bytes] = {}  # by the hash by which neighbours identify it
+        self.sets: dict[bytes, SyncSet[bytes]] = {}
         self.trust(root_keys)
         self._owners: dict[bytes, dict[bytes, _Owned]] = {}  # by the issuer's key and the fingerprint
         self._about: dict[Name, dict[KeptKey, None]] = {}  # of owners, by the name that signed
@@ -121,14 +119,15 @@ class Revocations:
         self.changes: set[KeptKey] | None = None
 
     def __len__(self) -> int:
-        return self._owned + sum(root.count for root in self._roots.values())
+        return self._owned + sum(map(len, self.sets.values()))
 
     def trust(self, root_keys: Iterable[bytes]) -> None:
         """Add trusted domains' keys; known revocations stay."""
         for key in root_keys:
             if key not in self._roots:
-                self._roots[key] = _Root(hash_of(key))
+                root = self._roots[key] = _Root()
                 self._key_of[hash_of(key)] = key
+                self.sets[hash_of(key)] = root.items
 
     def is_root(self, issuer_key: bytes) -> bool:
         """Return whether this is the key of a trusted domain."""
@@ -138,7 +137,7 @@ class Revocations:
         """Return whether the holder of ``issuer_key`` revoked this certificate."""
         root = self._roots.get(issuer_key)
         if root is not None:
-            return fingerprint in root.buckets[fingerprint[0]]
+            return root.items.get(fingerprint) is not None
         of_owner = self._owners.get(issuer_key)
         return of_owner is not None and fingerprint in of_owner
 
@@ -208,7 +207,7 @@ class Revocations:
     def keys(self) -> Iterable[KeptKey]:
         """Yield the key of every stored revocation, those of roots first."""
         for key, root in self._roots.items():
-            yield from ((key, fingerprint) for bucket in root.buckets for fingerprint in bucket)
+            yield from ((key, fingerprint) for fingerprint in root.items)
         for key, of_owner in self._owners.items():
             yield from ((key, fingerprint) for fingerprint in of_owner)
 
@@ -229,7 +228,7 @@ class Revocations:
         if root is None:
             owned = self._owners.get(issuer_key, {}).get(fingerprint)
             return None if owned is None else owned.wire
-        value = root.buckets[fingerprint[0]].get(fingerprint)
+        value = root.items.get(fingerprint)
         return None if value is None else _unpacked(root, fingerprint, value)
 
     # -- revocations by owners, by name
@@ -244,40 +243,9 @@ class Revocations:
         ids = (_id(fingerprint, self._owners[key][fingerprint].until_unix_s) for key, fingerprint in entries)
         return reduce(xor, ids, 0).to_bytes(ID_BYTES, "big")
 
-    # -- revocations by roots, for neighbours
-
-    def summary(self) -> list[tuple[Name, int, bytes]]:
-        """Return for each root, by the hash of its key, its number of revocations, and a digest."""
-        return [
-            (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big")) for root in self._roots.values()
-        ]
-
-    def hashes(self, of: Name) -> list[bytes] | None:
-        """Return the digests of a root's buckets; None: it is not trusted."""
-        root = self._root(of)
-        return None if root is None else [each.to_bytes(ID_BYTES, "big") for each in root.hashes]
-
-    def ids(self, of: Name, bucket: int) -> list[bytes]:
-        """Return short ids of a root's revocations in one bucket."""
-        root = self._root(of)
-        entries = {} if root is None else root.buckets[bucket]
-        return [_id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") for print_, value in entries.items()]
-
-    def lacking(self, of: Name, bucket: int, ids: frozenset[bytes]) -> list[KeptKey]:
-        """Return the keys of a root's bucket that are not among these ids."""
-        root = self._root(of)
-        if root is None:
-            return []
-        key = self._key_of[of]
-        return [
-            (key, print_)
-            for print_, value in root.buckets[bucket].items()
-            if _id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") not in ids
-        ]
-
-    def _root(self, of: Name) -> _Root | None:
-        key = self._key_of.get(of)
-        return None if key is None else self._roots[key]
+    def item_of(self, of: bytes, fingerprint: bytes, _now_s: float) -> bytes | None:
+        """Return the signed statement of a root's revocation, for a neighbour that lacks it, or None."""
+        return self.wire(self._key_of[of], fingerprint)
 
     # -- quotas
 
@@ -292,7 +260,7 @@ class Revocations:
         """Return until when a revocation counts, or -1."""
         root = self._roots.get(issuer_key)
         if root is not None:
-            value = root.buckets[fingerprint[0]].get(fingerprint)
+            value = root.items.get(fingerprint)
             return -1 if value is None else _end_of(value)
         owned = self._owners.get(issuer_key, {}).get(fingerprint)
         return -1 if owned is None else owned.until_unix_s
@@ -311,16 +279,10 @@ class Revocations:
 
     def _add_of_root(self, root: _Root, revocation: Revocation, statement: Statement) -> None:
         fingerprint = revocation.fingerprint
-        before = root.buckets[fingerprint[0]].get(fingerprint)
-        if before is None:
-            if root.count >= self._per_root:
-                raise StatementError(DropReason.QUOTA, "revocations of one domain")
-            root.count += 1
-        else:
-            root.hashes[fingerprint[0]] ^= _id(fingerprint, _end_of(before))
+        if root.items.get(fingerprint) is None and len(root.items) >= self._per_root:
+            raise StatementError(DropReason.QUOTA, "revocations of one domain")
         root.subject = root.subject or revocation.issuer
-        root.buckets[fingerprint[0]][fingerprint] = _packed(root, revocation, statement)
-        root.hashes[fingerprint[0]] ^= _id(fingerprint, revocation.until_unix_s)
+        root.items.put(fingerprint, _packed(root, revocation, statement))
 
     def _add_of_owner(self, revocation: Revocation, statement: Statement, origin: bytes) -> None:
         issuer_key, fingerprint = revocation.issuer.owner_key, revocation.fingerprint
@@ -382,9 +344,7 @@ class Revocations:
             self.changes.add((issuer_key, fingerprint))
         root = self._roots.get(issuer_key)
         if root is not None:
-            value = root.buckets[fingerprint[0]].pop(fingerprint)
-            root.hashes[fingerprint[0]] ^= _id(fingerprint, _end_of(value))
-            root.count -= 1
+            root.items.remove(fingerprint)
             return
         owned = self._owners[issuer_key].pop(fingerprint)
         if not self._owners[issuer_key]:

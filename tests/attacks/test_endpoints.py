@@ -54,7 +54,7 @@ def test_a85_a_member_that_got_new_keys_is_tried_with_these() -> None:
 def test_a93_a_switch_of_two_domains_that_changes_between_them_uses_up_no_quota() -> None:
     keys, hour = NodeKeys.generate(Role.SWITCH, "both"), Validity(UNIX_S - 60, UNIX_S + 3_600)
     own, foreign = keys.join(SCHOOL, hour), keys.join(CLOUD, hour)
-    endpoints = RibEndpoints(node("rib", Role.RIB), Policy(SCHOOL.root, [CLOUD.root]), tuple, maximum=8)
+    endpoints = RibEndpoints(node("rib", Role.RIB), Policy(SCHOOL.root, [CLOUD.root]), lambda _: None, maximum=8)
     for turn in range(6):
         now_s = 100.0 * turn
         for number, identity in enumerate((foreign, own)):

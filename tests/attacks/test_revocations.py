@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from gdp.control import revocation_sync
 from gdp.control.hello import Hello
-from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import parse
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
+from gdp.exchange import anti_entropy
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.metadata import Metadata
@@ -264,7 +264,7 @@ def test_a06_fresh_hellos_draw_no_more_bytes_than_they_cost(echoes: bool) -> Non
 
 
 def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(revocation_sync, "_SPARE", 100)
+    monkeypatch.setattr(anti_entropy, "_SPARE", 100)
     world, flow = with_thief()
     for number in range(300):
         wire = by_root(world, "school", number.to_bytes(32, "big"))
@@ -275,7 +275,12 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
     answered = Bytes(world, "nuc1", THIEF)
     session = world.switches["nuc1"].hello_protocol.ports[port].echo
     for number in range(6):
-        said = Lacking(session, int(2e15) + number, school_of(world), (), ())
+        said = SyncMessage(
+            of=school_of(world),
+            lacking=tuple((bytes([at]), b"") for at in range(256)),
+            session=session,
+            sequence=int(2e15) + number,
+        )
         say(world, said.to_wire(identity.name, identity.key), THIEF, "nuc1", Kind.REVOKED)
         world.network.run(0.5)
     assert answered.sent < (2 * 300 + 100 + 12) * 500
@@ -287,11 +292,12 @@ def test_a_recorded_digest_draws_nothing() -> None:
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     school = school_of(world)
     session = world.switches["nuc1"].hello_protocol.ports[port].echo
-    said = Revoked(session, int(2e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
+    totals = ((school, b"another!"),)
+    said = SyncMessage(totals=totals, session=session, sequence=int(2e15)).to_wire(identity.name, identity.key)
     for _ in range(20):
         say(world, said, THIEF, "nuc1", Kind.REVOKED)
-    old = Revoked(b"an older session", int(3e15), ((school, 5, b"another!"),)).to_wire(identity.name, identity.key)
-    say(world, old, THIEF, "nuc1", Kind.REVOKED)
+    old = SyncMessage(totals=totals, session=b"an older session", sequence=int(3e15))
+    say(world, old.to_wire(identity.name, identity.key), THIEF, "nuc1", Kind.REVOKED)
     assert world.switches["nuc1"].drops()[DropReason.REPLAYED] >= 20
     flow.outlive()
 

@@ -11,7 +11,7 @@ from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
-from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Item
+from gdp.control.rib_replication import Entry
 from gdp.crypto import cbor
 from gdp.crypto.cbor import Value
 from gdp.crypto.certificates import Root, Unverified
@@ -64,13 +64,7 @@ _ENTRY: Final = Entry(
     lease_s=9.0,
     is_from_upstream=False,
 )
-_MADE: Final = (
-    Presence(node=_A, incarnation=1, other=_A, question=7),
-    Digest(b"", bytes(8), is_last=True),
-    Fetch((b"a",), ((_A, _A),)),
-    Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True),
-    EntryBatch((_ENTRY,), is_last=True),
-)
+_MADE: Final = (Presence(node=_A, incarnation=1, other=_A, question=7),)
 _STATEMENTS: Final = (
     *(wire for wire, _, _ in BODIES.values()),
     *(each.to_wire(_NODE.name, _NODE.key, b"cert") for each in _MADE),

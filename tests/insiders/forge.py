@@ -22,13 +22,15 @@ from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.control.rib_replication import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
+from gdp.crypto import cbor
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import NAMED_SUBJECT, SUBJECT
 from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, LocalError, StatementError
+from gdp.exchange.sync_message import ASKED_MAX, ITEMS_MAX, LACKING_MAX, SETS_MAX
+from gdp.exchange.sync_set import LINE_BYTES, line_of
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT, SEQUENCE_AHEAD_S
@@ -41,6 +43,7 @@ from gdp.names import ZERO, Name
 from gdp.switch.core import SwitchCore
 from gdp.trust.adcert import AdCert
 from gdp.trust.advertisement import Advertisement
+from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from tests.insiders.stage import PERSONAS, Persona, Place, Stage
@@ -56,7 +59,7 @@ _SIZES: Final = (900, 1_024, 1_025, 6_400, 6_500, 6_501, 12_000, 16_000, 16_300)
 _MAXIMA: Final = {
     "h": HEARD_MAX, "u": CONFLICTS_MAX, "y": COOKIES_MAX,
     "l": LINKS_MAX, "i": LINKS_MAX, "m": MEMBERS_MAX, "x": TRANSIT_MAX, "r": RIBS_MAX,
-    "chain": CHAIN_MAX, "p": FETCH_PREFIXES_MAX, "k": FETCH_KEYS_MAX, "e": ENTRIES_MAX, "rights": 4,
+    "chain": CHAIN_MAX, "p": ASKED_MAX, "e": ITEMS_MAX, "w": SETS_MAX, "rights": 4,
 }  # fmt: skip
 _RIGHTS: Final = tuple(Right)
 _REMEMBERED: Final = 96  # old statements that are sent again, or put into others
@@ -519,63 +522,60 @@ class Forge:
             "s": self._number(rng), "u": self._number(rng), "c": identity.membership,
         }  # fmt: skip
 
-    def _endpoints_query(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        def item() -> bytes:
-            return rng.choice((*self._nodes, bytes(32))) + rng.choice((0, 1, _U64)).to_bytes(8, "big")
-
-        names = [item() for _ in range(rng.choice((0, 1, 64, 65)))]
-        return {"n": names, "w": rng.choice((0.0, 30.0, 3_600.0, 9e9)), "c": identity.membership}
-
-    def _endpoints_answer(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        body = self._endpoints(rng, identity, place)
-        record = identity.sign(StatementType.ENDPOINTS, body) if rng.random() < 0.7 else rng.randbytes(40)
-        return {
-            "e": [record] * rng.choice((0, 1, 2)), "s": self._number(rng), "r": rng.choice((255, 28, 31, 200)),
-            "c": identity.membership,
-        }  # fmt: skip
-
     def _mail(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {
             "to": rng.choice(self._nodes), "k": rng.choice(("delegation", "a-b", "")), "s": self._number(rng),
             "b": rng.randbytes(rng.choice((0, 1, 2_000))), "c": identity.membership,
         }  # fmt: skip
 
-    def _digest(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        return {
-            "p": rng.choice((b"", b"\x00", bytes(2))), "h": rng.choice((rng.randbytes(8), rng.randbytes(2_048))),
-            "z": rng.random() < 0.5, "c": identity.membership,
+    def _sync(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        """Return totals, a request or a reply, with the session of a neighbour and the certificate of a RIB."""
+        sets = (
+            b"routes",
+            b"endpoints",
+            *(hash_of(each.key.public.compressed) for each in self._stage.world.authorities.values()),
+        )
+        spoken = {
+            "d": rng.choice(sets), "c": identity.membership, "i": self._echo(place), "s": next(self._numbers),
         }  # fmt: skip
+        chance = rng.random()
+        if chance < 0.3:
+            totals = [[each, rng.choice((bytes(8), rng.randbytes(8)))] for each in rng.sample(sets, len(sets))]
+            return {**spoken, "d": b"", "w": totals}
+        prefixes = [rng.randbytes(rng.choice((0, 1, 1, 2, 32))) for _ in range(rng.choice((1, 16, LACKING_MAX)))]
+        if chance < 0.4:  # as a switch asks for endpoints, or a RIB for its
+            numbers = [rng.choice((0, 1, _U64)) for _ in range(rng.choice((1, 64, 65)))]
+            lacking = [[name, line_of(name, each)] for each in numbers if (name := rng.choice(self._nodes))]
+            refused = {"x": rng.choice((255, 28, 31, 200))} if rng.random() < 0.3 else {}
+            return {**spoken, **refused, "d": b"endpoints", "l": lacking, "e": [self._endpoint_item(rng, identity)]}
+        if chance < 0.6:
+            lines = [rng.randbytes(LINE_BYTES * rng.choice((0, 0, 1, 30))) for _ in prefixes[:20]]
+            lacking = [[each, line] for each, line in zip(prefixes, lines, strict=False)]
+            return {**spoken, "l": lacking, "p": [rng.randbytes(1)[: rng.randrange(2)] for _ in prefixes[:16]]}
+        makes = self._entry, self._endpoint_item
+        items = [rng.choice(makes)(rng, identity) for _ in range(rng.choice((0, 1, 1, 3)))]
+        hashes = [[rng.randbytes(1)[: rng.randrange(2)], rng.randbytes(2_048)] for _ in range(rng.choice((0, 1, 2)))]
+        return {**spoken, "e": items, "h": hashes, "z": rng.random() < 0.5, "r": rng.choice((0, 1, LACKING_MAX))}
 
-    def _fetch(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        prefixes = [rng.choice((b"", rng.randbytes(1), rng.randbytes(2))) for _ in range(rng.choice((0, 1, 16)))]
-        keys = [rng.choice(self._names) + rng.choice(self._nodes) for _ in range(rng.choice((0, 1, 64)))]
-        return {"p": prefixes, "k": keys, "c": identity.membership}
+    def _endpoint_item(self, rng: random.Random, identity: Identity) -> bytes:
+        body = self._endpoints(rng, identity, Place("", 0, b""))
+        record = identity.sign(StatementType.ENDPOINTS, body) if rng.random() < 0.7 else rng.randbytes(40)
+        return rng.choice((0, 1, 60_000, (1 << 32) - 1)).to_bytes(4, "big") + record
 
-    def _inventory(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        def item() -> bytes:
-            number = rng.choice((0, 1, _U64, next(self._numbers)))
-            return self._name(rng) + rng.choice(self._nodes) + number.to_bytes(8, "big") + bytes([rng.randrange(2)])
-
-        items = [item() for _ in range(rng.choice((0, 1, 8, INVENTORY_MAX)))]
-        return {"i": items, "z": rng.random() < 0.5, "c": identity.membership}
-
-    def _replicas(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        def entry() -> _Body:
-            unix_s = int(self._stage.world.network.now.unix_s)
-            spoken = {
-                "q": self._inner(rng, identity), "m": rng.choice((b"", rng.choice(self._certs))),
-                "w": rng.choice(self._nodes), "d": rng.choice(self._domains), "v": rng.choice(self._domains),
-                "x": list(self._domains), "l": rng.choice((0.0, 6.0, 3_600.0)), "u": rng.random() < 0.3,
-                "t": rng.choice((0, unix_s + 100, _U64)),
-            }  # fmt: skip
-            if rng.random() < 0.3:
-                self._spoil(rng, spoken)
-            return spoken
-
-        return {
-            "e": [entry() for _ in range(rng.choice((0, 1, 1, 3)))], "z": rng.random() < 0.5,
-            "c": identity.membership,
+    def _entry(self, rng: random.Random, identity: Identity) -> bytes:
+        unix_s = int(self._stage.world.network.now.unix_s)
+        spoken: _Body = {
+            "q": self._inner(rng, identity), "m": rng.choice((b"", rng.choice(self._certs))),
+            "w": rng.choice(self._nodes), "d": rng.choice(self._domains), "v": rng.choice(self._domains),
+            "x": list(self._domains), "l": rng.choice((0.0, 6.0, 3_600.0)), "u": rng.random() < 0.3,
+            "t": rng.choice((0, unix_s + 100, _U64)),
         }  # fmt: skip
+        if rng.random() < 0.3:
+            self._spoil(rng, spoken)
+        try:
+            return cbor.encode(spoken)
+        except LocalError:
+            return b""
 
     def _revoke(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         unix_s = int(self._stage.world.network.now.unix_s)
@@ -586,22 +586,6 @@ class Forge:
             "cert": rng.choice((rng.randbytes(32), member.fingerprint)),
             "until": until,
         }
-
-    def _revoked(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        domains = rng.sample(self._domains, rng.randrange(len(self._domains) + 1))
-        hashes = rng.choice((b"", rng.randbytes(2_048)))
-        return {
-            "i": self._echo(place), "s": next(self._numbers),
-            "p": [[each, rng.choice((0, 1, 100, _U64)), rng.choice((bytes(8), rng.randbytes(8)))] for each in domains],
-            "d": rng.choice(self._domains) if hashes else b"", "h": hashes,
-        }  # fmt: skip
-
-    def _lacking(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
-        buckets = rng.sample(range(256), rng.choice((0, 1, 256)))
-        return {
-            "i": self._echo(place), "s": next(self._numbers), "d": rng.choice(self._domains), "b": bytes(buckets),
-            "k": rng.randbytes(8 * rng.choice((0, 1, 1_500))),
-        }  # fmt: skip
 
     def _open(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         to = rng.choice([host.name for host in self._stage.world.ribs.values()])
@@ -823,12 +807,10 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.HELLO: Forge._hello, _T.LINK_STATE: Forge._link_state, _T.JOIN: Forge._join,
     _T.JOIN_REFRESH: Forge._join_refresh, _T.JOIN_UNKNOWN: Forge._join_refresh, _T.ADVERTISE: Forge._advertisement,
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
-    _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.DIGEST: Forge._digest, _T.FETCH: Forge._fetch,
-    _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
-    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
+    _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.SYNC: Forge._sync, _T.REVOKE: Forge._revoke,
+    _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
-    _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
-    _T.ENDPOINTS_ANSWER: Forge._endpoints_answer, _T.MAIL: Forge._mail,
+    _T.ENDPOINTS: Forge._endpoints, _T.MAIL: Forge._mail,
     _T.DIAGNOSTIC_REQUEST: Forge._diagnostic_request, _T.DIAGNOSTIC_REPLY: Forge._diagnostic_reply,
 }  # fmt: skip
 _K = Kind
@@ -839,12 +821,11 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.RELAY: (_K.RIB_REQUEST, _K.RIB_REQUEST, _K.RELOCATE, _K.REDIRECT), _T.QUERY: (_K.RIB_REQUEST, _K.WHERE),
     _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.ADVERTISE_ACK, _K.REDIRECT),
     _T.ADVERTISE_ACK: (_K.ADVERTISE_ACK, _K.RIB_ANSWER),
-    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK), _T.DIGEST: (_K.RIB_REQUEST,),
-    _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
+    _T.PRESENCE: (_K.RIB_ANSWER, _K.RIB_REQUEST, _K.ADVERTISE_ACK),
+    _T.SYNC: (_K.RIB_REQUEST, _K.RIB_ANSWER, _K.REVOKED),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
-    _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,), _T.ENDPOINTS: (_K.RIB_REQUEST,),
-    _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
+    _T.ENDPOINTS: (_K.RIB_REQUEST,),
     _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER), _T.DIAGNOSTIC_REQUEST: (_K.DIAGNOSTIC_REQUEST,),
     _T.DIAGNOSTIC_REPLY: (_K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REQUEST),
 }  # fmt: skip

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from gdp.client.reader_proxies import READERS_MAX
 from gdp.client.unicast_streams import STREAMS_MAX
+from gdp.exchange.sync_set import FANOUT
 from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
-from gdp.rib.anti_entropy import QUEUE_MAX
 from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
@@ -20,8 +20,7 @@ LIMITS: Final[Mapping[str, int]] = {
     "Parked._by_name": PENDING_FRAMES_MAX,
     "Readers._by_name": READERS_MAX,
     "PrivateStreams._streams": STREAMS_MAX,
-    "_Peer.keys": QUEUE_MAX,
-    "_Peer.prefixes": QUEUE_MAX,
+    "_Fetch.prefixes": FANOUT * FANOUT,
     "JoinBuffer._unfinished": JOIN_MESSAGES_MAX,
     "ReplayWindow._finished": REPLAY_WINDOW_MESSAGES,
 }

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
-from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
 from gdp.control.join import Join
@@ -20,10 +19,10 @@ from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
-from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.cbor import Value
 from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.codec import HEADER_BYTES
 from gdp.names import Name
 from tests.gdp.control.members import node
@@ -49,11 +48,12 @@ STATE = LinkState(
     origin=NODE.name, domain=A, scope=Scope.BORDER, sequence=5, links=LINKS, inside=INSIDE, ribs=RIBS, members=(A, B)
 )
 ANSWER = Response(name=A, advertiser=B, advertisement=b"claim", domain=C, transit=(A, B), lease_s=30.0)
-REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
-BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
 REFRESH = JoinRefresh(numbers=(1, 1 << 63), session=b"s" * 16, sender_session=b"o" * 8, sequence=9)
 UNKNOWN = replace(REFRESH, is_reply=True)
-LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
+TOTALS = SyncMessage(totals=((A, b"d" * 8), (B, bytes(8))), session=b"s" * 16, sequence=7)
+WANTED = SyncMessage(of=A, asked=(b"", b"\1"), lacking=((b"\2", bytes(34)), (A, b"")))
+REPLY = SyncMessage(of=A, hashes=((b"\1", bytes(2_048)),), items=(b"item", b"other"), is_last=True, rest=3)
+REFUSAL = SyncMessage(of=A, lacking=((A, b""),), refused=DropReason.STALE)
 ASKED = DiagnosticRequest(ask="trace", name=A, target=B, sequence=7, body={"p": bytes(C)}, membership=b"cert")
 REPLIED = DiagnosticReply(
     ask="trace", sequence=7, asker=A, result={"branches": [{"port": "eth0"}]}, is_cut=True, hops_left=3
@@ -63,18 +63,6 @@ Read = Callable[[Mapping[str, Value]], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
     "hello": (HELLO.to_wire(NODE.name, NODE.key), HELLO, Hello.from_fields),
     "hello of a tunnel": (OBSERVING.to_wire(NODE.name, NODE.key), OBSERVING, Hello.from_fields),
-    "endpoints query": (
-        EndpointQuery(((A, 7), (B, 0)), 30.0).to_wire(NODE.name, NODE.key, b"cert"),
-        EndpointQuery(((A, 7), (B, 0)), 30.0),
-        EndpointQuery.from_fields,
-    ),
-    "endpoints answer": (
-        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE).to_wire(
-            NODE.name, NODE.key, b"cert"
-        ),
-        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE),
-        EndpointResponse.from_fields,
-    ),
     "diagnostic request": (
         ASKED.padded(NODE.name, NODE.key, 1_000),
         ASKED,
@@ -95,9 +83,10 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
         Query(A, 20.0, b"revoked!"),
         Query.from_fields,
     ),
-    "revoked": (REVOKED.to_wire(NODE.name, NODE.key), REVOKED, Revoked.from_fields),
-    "revoked in buckets": (BUCKETS.to_wire(NODE.name, NODE.key), BUCKETS, Revoked.from_fields),
-    "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
+    "sync": (TOTALS.to_wire(NODE.name, NODE.key), TOTALS, SyncMessage.from_fields),
+    "sync, request": (WANTED.to_wire(NODE.name, NODE.key, b"cert"), WANTED, SyncMessage.from_fields),
+    "sync, reply": (REPLY.to_wire(NODE.name, NODE.key, b"cert"), REPLY, SyncMessage.from_fields),
+    "sync, refusal": (REFUSAL.to_wire(NODE.name, NODE.key, b"cert"), REFUSAL, SyncMessage.from_fields),
     "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Response.from_fields),
     "relay": (
         RelayedStatement(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),

@@ -6,8 +6,8 @@ from itertools import count
 
 import pytest
 
-from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.endpoint_sync import ENDPOINTS, item_of, record_in
 from gdp.control.endpoints import Endpoint
 from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
@@ -15,6 +15,8 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
+from gdp.exchange.sync_set import line_of, rank_in
 from gdp.frame.kinds import Kind
 from gdp.limits import ENDPOINT_LEASE_S, ENDPOINT_RECORDS_BURST
 from gdp.names import Name
@@ -47,17 +49,35 @@ def give(to: RibCore, wire: bytes, by: Identity = ONE, now_s: float = 0.0) -> li
     return to.statements_to_send()
 
 
-def query(by: Identity = TWO, *known: tuple[Name, int], watch_s: float = 0.0) -> bytes:
-    return EndpointQuery(known or ((ONE.name, 0),), watch_s).to_wire(by.name, by.key, by.membership)
+def query(by: Identity = TWO, *known: tuple[Name, int]) -> bytes:
+    lacking = tuple((name, line_of(name, sequence)) for name, sequence in known or ((ONE.name, 0),))
+    return SyncMessage(of=ENDPOINTS, lacking=lacking).to_wire(by.name, by.key, by.membership)
 
 
-def responses(outgoing: list[OutgoingStatement], to: Identity) -> list[EndpointResponse]:
+def responses(outgoing: list[OutgoingStatement], to: Identity) -> list[SyncMessage]:
     found = [parse(each.statement) for each in outgoing if each.to == to.name and each.kind is Kind.RIB_ANSWER]
-    return [EndpointResponse.from_fields(each.expect(StatementType.ENDPOINTS_ANSWER)) for each in found]
+    return [SyncMessage.from_fields(each.expect(StatementType.SYNC)) for each in found]
+
+
+def kept_sequence(response: SyncMessage) -> int:
+    ((_, line),) = response.lacking
+    return rank_in(line)
 
 
 def records_for(outgoing: list[OutgoingStatement], to: Identity) -> list[bytes]:
-    return [wire for response in responses(outgoing, to) for wire in response.records]
+    return [record_in(item)[0] for response in responses(outgoing, to) for item in response.items]
+
+
+def equalise(*cores: RibCore, now_s: float = 0.0) -> list[OutgoingStatement]:
+    """Let RIBs send each other what they have; return all of it."""
+    sent: list[OutgoingStatement] = []
+    by_name = {core._identity.name: core for core in cores}
+    while outgoing := [(core, each) for core in cores for each in tick(core, now_s)]:
+        for core, each in outgoing:
+            by_name[each.to].receive(each.statement, core._identity.name, at(now_s, UNIX_S + now_s))
+        sent += [each for _, each in outgoing]
+        now_s += 0.01
+    return sent
 
 
 def tick(of: RibCore, now_s: float) -> list[OutgoingStatement]:
@@ -69,7 +89,7 @@ def tick(of: RibCore, now_s: float) -> list[OutgoingStatement]:
 def test_a_published_record_reaches_the_switch_that_asks(asker: Identity) -> None:
     core, wire = rib(), record().wire
     (kept,) = responses(give(core, wire), ONE)
-    assert (kept.kept_sequence, kept.refused) == (1, None)
+    assert (kept_sequence(kept), kept.refused) == (1, None)
     assert records_for(give(core, query(asker), asker), asker) == [wire]
 
 
@@ -77,12 +97,12 @@ def test_a_record_that_the_asker_has_is_not_sent_again() -> None:
     core = rib()
     give(core, record().wire)
     (answer,) = responses(give(core, query(TWO, (ONE.name, 1)), TWO), TWO)
-    assert answer.records == ()
+    assert answer.items == ()
 
 
 def test_a_newer_record_is_sent_to_its_watchers_at_once_and_twice_more() -> None:
     core = rib()
-    give(core, query(watch_s=30.0), TWO)
+    give(core, query(), TWO)
     wire = record().wire
     assert records_for(give(core, wire), TWO) == [wire]
     assert records_for(tick(core, 0.4), TWO) == [wire]
@@ -92,7 +112,7 @@ def test_a_newer_record_is_sent_to_its_watchers_at_once_and_twice_more() -> None
 
 def test_a_watch_ends() -> None:
     core = rib()
-    give(core, query(watch_s=30.0), TWO)
+    give(core, query(), TWO)
     tick(core, 31.0)
     assert records_for(give(core, record().wire, now_s=31.0), TWO) == []
 
@@ -135,7 +155,7 @@ def test_a_refusal_says_why(by: Identity, wire: bytes, reason: DropReason) -> No
     give(core, record(sequence=5).wire)
     (answer,) = responses(give(core, wire, by), by)
     assert answer.refused is reason
-    assert answer.kept_sequence == (5 if by is ONE else 0)
+    assert kept_sequence(answer) == (5 if by is ONE else 0)
     assert core.refusals[reason] == 1
 
 
@@ -145,7 +165,7 @@ def test_a_record_that_another_replays_is_refused() -> None:
     relayed = RelayedStatement(wire, (), TWO.membership).to_wire(TWO.name, TWO.key)
     assert give(core, relayed, TWO) == []
     assert core.endpoints == 0
-    assert core.refusals == {DropReason.UNKNOWN_SENDER: 1, DropReason.WRONG_DOMAIN: 1}
+    assert core.refusals == {DropReason.UNKNOWN_SENDER: 1, DropReason.MALFORMED: 1}
 
 
 def test_a_record_of_an_untrusted_domain_is_refused() -> None:
@@ -159,7 +179,7 @@ def test_endpoints_stay_within_the_domain_of_their_switch() -> None:
     core = rib()
     give(core, record().wire)
     give(core, record(FOREIGN).wire, FOREIGN)
-    assert records_for(give(core, query(FOREIGN, watch_s=30.0), FOREIGN), FOREIGN) == []
+    assert records_for(give(core, query(FOREIGN), FOREIGN), FOREIGN) == []
     assert records_for(give(core, query(TWO, (FOREIGN.name, 0)), TWO), TWO) == []
     assert records_for(give(core, record(sequence=2).wire), FOREIGN) == []
 
@@ -169,7 +189,7 @@ def test_only_switches_and_ribs_of_the_domain_ask(asker: Identity) -> None:
     core = rib()
     give(core, record().wire)
     assert give(core, query(asker), asker) == []
-    assert core.refusals[DropReason.NOT_DELEGATED] == 1
+    assert core.refusals[DropReason.WRONG_DOMAIN] == 1
 
 
 def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_and_no_memory() -> None:
@@ -183,7 +203,7 @@ def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_an
 
 
 def test_records_of_other_domains_do_not_displace_those_of_ones_own() -> None:
-    endpoints = RibEndpoints(RIB, Policy(SCHOOL.root, [CLOUD.root]), tuple, maximum=4)
+    endpoints = RibEndpoints(RIB, Policy(SCHOOL.root, [CLOUD.root]), lambda name: None, maximum=4)
     numbers = count()
     for domain, expected in ((CLOUD, 2), (SCHOOL, 4)):
         for _ in range(4):
@@ -207,11 +227,11 @@ def test_a_revoked_switch_is_forgotten_at_once() -> None:
 
 def test_a_record_goes_to_the_other_ribs_of_the_domain_and_no_further() -> None:
     one, two = rib(peers=(PEER.name,)), rib(PEER, peers=(RIB.name,))
-    give(one, record().wire)
-    sent = [each for each in give(one, record(sequence=2).wire) if each.to == PEER.name]
+    equalise(one, two)
+    sent = [each for each in give(one, record().wire) if each.to == PEER.name]
     assert [each.kind for each in sent] == [Kind.RIB_REQUEST]
     out = give(two, sent[0].statement, RIB)
-    assert [each for each in out if each.to == RIB.name and parse(each.statement).type is StatementType.RELAY] == []
+    assert [each for each in out if each.to == RIB.name] == []
     assert two.endpoints == 1
 
 
@@ -222,22 +242,27 @@ def test_a_rib_that_has_just_started_fetches_what_its_peers_keep() -> None:
         give(old, record(switch).wire, switch)
     give(old, record(FOREIGN).wire, FOREIGN)
     new.connected(at(0.0))
-    requests = [each.statement for each in new.statements_to_send()]
-    answers = [answer for wire in requests for answer in give(old, wire, PEER)]
-    assert len(answers) > 1
-    for answer in answers:
-        give(new, answer.statement, RIB)
+    assert len(equalise(old, new)) > 4
     assert new.endpoints == len(switches)
+
+
+def test_two_ribs_do_not_keep_a_record_alive_that_its_switch_does_not_renew() -> None:
+    one, two = rib(peers=(PEER.name,)), rib(PEER, peers=(RIB.name,))
+    give(one, record().wire)
+    for now_s in range(2 * int(ENDPOINT_LEASE_S)):
+        equalise(one, two, now_s=float(now_s))
+        assert (one.endpoints, two.endpoints) == (1, 1) or now_s >= ENDPOINT_LEASE_S - 2
+    assert (one.endpoints, two.endpoints) == (0, 0)
 
 
 def test_records_from_a_rib_of_another_domain_are_refused() -> None:
     core = rib()
     by = FOREIGN_RIB
-    wire = EndpointResponse(records=(record().wire,)).to_wire(by.name, by.key, by.membership)
-    give(core, wire, by)
+    items = (item_of(record().wire, 60.0),)
+    give(core, SyncMessage(of=ENDPOINTS, items=items).to_wire(by.name, by.key, by.membership), by)
     give(core, RelayedStatement(record().wire, (), by.membership).to_wire(by.name, by.key), by)
     assert core.endpoints == 0
-    assert core.refusals[DropReason.WRONG_DOMAIN] == 2
+    assert core.refusals == {DropReason.WRONG_DOMAIN: 1, DropReason.MALFORMED: 1}
 
 
 def test_a_query_is_answered_although_there_are_too_many_watches() -> None:
@@ -245,5 +270,5 @@ def test_a_query_is_answered_although_there_are_too_many_watches() -> None:
     wire = record().wire
     give(core, wire)
     known = tuple((Name(bytes([number]) * 32), 0) for number in range(1, 9))
-    assert records_for(give(core, query(TWO, *known, (ONE.name, 0), watch_s=30.0), TWO), TWO) == [wire]
+    assert records_for(give(core, query(TWO, *known, (ONE.name, 0)), TWO), TWO) == [wire]
     assert core.refusals[DropReason.QUOTA] == 1

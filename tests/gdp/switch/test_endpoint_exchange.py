@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from gdp.control.endpoint_query import ENDPOINT_NAMES_MAX, EndpointQuery, EndpointResponse
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import DropReason, StatementError
+from gdp.exchange.sync_message import SyncMessage
+from gdp.exchange.sync_set import line_of
 from gdp.limits import ENDPOINT_LEASE_S
 from gdp.names import Name
 from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
@@ -50,8 +54,14 @@ def sent(of: EndpointExchange, until_s: float) -> list[tuple[float, StatementTyp
     return found
 
 
+def kept(sequence: int, refused: DropReason | None = None) -> SyncMessage:
+    """Return a response of a RIB that keeps this record of ours; 0: none."""
+    line = line_of(ME.name, sequence) if sequence else b""
+    return SyncMessage(of=ENDPOINTS, lacking=((ME.name, line),), refused=refused)
+
+
 def learn(into: EndpointExchange, *wires: bytes) -> None:
-    into.receive(EndpointResponse(records=wires), at(0.0))
+    into.receive(replace(kept(0), items=tuple(item_of(wire, 60.0) for wire in wires)), at(0.0))
 
 
 def test_a_record_is_sent_at_once_and_again_until_the_rib_keeps_it() -> None:
@@ -59,7 +69,7 @@ def test_a_record_is_sent_at_once_and_again_until_the_rib_keeps_it() -> None:
     made.set_own(record())
     times = [now_s for now_s, _ in sent(made, 20.0)]
     assert times[:4] == pytest.approx([0.0, 0.3, 0.9, 2.1])
-    made.receive(EndpointResponse(kept_sequence=1), at(20.0))
+    made.receive(kept(1), at(20.0))
     assert made.get_timer() == pytest.approx(20.0 + ENDPOINT_LEASE_S / 3)
 
 
@@ -67,8 +77,8 @@ def test_a_record_that_the_rib_has_lost_is_sent_again_at_once() -> None:
     made = exchange()
     made.set_own(record())
     made.statements_to_send(0.0)
-    made.receive(EndpointResponse(kept_sequence=1), at(0.1))
-    made.receive(EndpointResponse(kept_sequence=0), at(1.0))
+    made.receive(kept(1), at(0.1))
+    made.receive(kept(0), at(1.0))
     assert made.get_timer() == 1.0
 
 
@@ -76,17 +86,17 @@ def test_another_rib_receives_record_and_query_at_once() -> None:
     made = exchange(PEER)
     made.set_own(record())
     made.statements_to_send(0.0)
-    made.receive(EndpointResponse(kept_sequence=1), at(0.1))
+    made.receive(kept(1), at(0.1))
     made.rib_changed(1.0)
     types = [parse(wire).type for wire in made.statements_to_send(1.0)]
-    assert types == [StatementType.ENDPOINTS, StatementType.ENDPOINTS_QUERY]
+    assert types == [StatementType.ENDPOINTS, StatementType.SYNC]
 
 
 def test_a_refusal_is_kept_for_the_operator_until_the_record_is_accepted() -> None:
     made = exchange()
     made.set_own(record(sequence=3))
     made.statements_to_send(0.0)
-    made.receive(EndpointResponse(kept_sequence=9, refused=DropReason.STALE), at(0.1))
+    made.receive(kept(9, DropReason.STALE), at(0.1))
     assert made.refusal == Refusal(DropReason.STALE, 9)
     made.set_own(record(sequence=10))
     assert made.refusal is None
@@ -108,7 +118,7 @@ def test_a_query_names_what_is_known_already() -> None:
     learn(made, record(PEER, 4).wire)
     made.rib_changed(1.0)
     (wire,) = made.statements_to_send(1.0)
-    assert EndpointQuery.from_fields(parse(wire).fields).known == ((PEER.name, 4),)
+    assert SyncMessage.from_fields(parse(wire).fields).lacking == ((PEER.name, line_of(PEER.name, 4)),)
 
 
 def test_a_query_is_repeated_often_until_answered_and_then_seldom() -> None:
@@ -130,7 +140,7 @@ def test_a_query_is_bounded() -> None:
     made = exchange()
     made.want([Name(bytes([1, number]) * 16) for number in range(200)], 0.0)
     (wire,) = made.statements_to_send(0.0)
-    assert len(EndpointQuery.from_fields(parse(wire).fields).known) == ENDPOINT_NAMES_MAX
+    assert len(SyncMessage.from_fields(parse(wire).fields).lacking) == ENDPOINT_NAMES_MAX
 
 
 def test_a_record_is_learnt_and_a_newer_one_replaces_it() -> None:
