@@ -277,7 +277,7 @@ class Diagnostics:
         """Return the monotonic second of the next timer, or None."""
         if not self._pending and not self._waiting:
             return None
-        return min(each.until_s for each in (*self._pending.values(), *self._waiting))
+        return min([each.until_s for each in self._pending.values()] + [each.until_s for each in self._waiting])
 
     # -- internals
 

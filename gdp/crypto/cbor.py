@@ -34,7 +34,6 @@ _FLOATS: Final = {0xF9: _HALF, 0xFA: _SINGLE, 0xFB: _DOUBLE}
 _NAN: Final = b"\xf9\x7e\x00"
 _SHORT_HEADS: Final = tuple(bytes((initial,)) for initial in range(256))  # by initial byte
 _KEYS_MAX: Final = 1_024  # map keys whose other form is kept
-_TEXT_HEAD: Final = 0x60
 _SHORT_KEY_BYTES: Final = 24  # with the head, which then has the length
 _first: Final = itemgetter(0)
 
@@ -113,25 +112,21 @@ class _Reader:
         previous, size = b"", len(wire)
         for _ in range(pairs):
             start = self.at
-            end = start + wire[start] - _TEXT_HEAD + 1 if start < size else 0
+            end = start + wire[start] - 0x60 + 1 if start < size else 0
             if start < end <= size and end - start <= _SHORT_KEY_BYTES:  # the usual key, without the general case
                 encoded = wire[start:end]
                 key = _short_key(encoded)
                 self.at = end
             else:
-                key = self._key(depth)
-                encoded = wire[start : self.at]
+                item = self.item(depth)
+                if not isinstance(item, str):
+                    _refuse("a map key that is not text")
+                key, encoded = item, wire[start : self.at]
             if encoded <= previous:
                 _refuse("map keys not in order, or one twice")
             previous = encoded
             result[key] = self.item(depth)
         return result
-
-    def _key(self, depth: int) -> str:
-        key = self.item(depth)
-        if not isinstance(key, str):
-            _refuse("a map key that is not text")
-        return key
 
     def _long_argument(self, info: int, at: int) -> tuple[int, int]:
         """Return the argument that follows its initial byte, and the cursor behind it."""

@@ -327,11 +327,8 @@ class SwitchCore:
         """Return the monotonic second of the next timer, or None."""
         if self._rest_due_s is None:
             self._rest_due_s = self._next_of_rest()
-        due_s = self._rest_due_s
-        for time in (self.hello_protocol.get_timer(), self.diagnostics.get_timer()):
-            if time is not None and time < due_s:
-                due_s = time
-        return due_s
+        times = (self._rest_due_s, self.hello_protocol.get_timer(), self.diagnostics.get_timer())
+        return min([time for time in times if time is not None])
 
     def _next_of_rest(self) -> float:
         """Return the monotonic second of the next timer outside neighbour discovery."""
