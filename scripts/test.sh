@@ -13,6 +13,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 scripts/setup.sh --quiet --dev
 out=.ci/out
+unset PYTHONDONTWRITEBYTECODE  # workers and the programs that they start share what one of them has compiled
 mkdir -p "$out"
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch" ${PYTEST_DEBUG_TEMPROOT:+"$PYTEST_DEBUG_TEMPROOT"}' EXIT

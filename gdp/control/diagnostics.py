@@ -273,8 +273,9 @@ class Diagnostics:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [each.until_s for each in self._pending.values()] + [each.until_s for each in self._waiting]
-        return min(times, default=None)
+        if not self._pending and not self._waiting:
+            return None
+        return min([each.until_s for each in self._pending.values()] + [each.until_s for each in self._waiting])
 
     # -- internals
 

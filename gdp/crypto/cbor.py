@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from functools import lru_cache
 from operator import itemgetter
 from typing import Final, NoReturn, TypeAlias
 
@@ -31,6 +32,9 @@ _SINGLE: Final = struct.Struct("!f")
 _DOUBLE: Final = struct.Struct("!d")
 _FLOATS: Final = {0xF9: _HALF, 0xFA: _SINGLE, 0xFB: _DOUBLE}
 _NAN: Final = b"\xf9\x7e\x00"
+_SHORT_HEADS: Final = tuple(bytes((initial,)) for initial in range(256))  # by initial byte
+_KEYS_MAX: Final = 1_024  # map keys whose other form is kept
+_SHORT_KEY_BYTES: Final = 24  # with the head, which then has the length
 _first: Final = itemgetter(0)
 
 
@@ -77,7 +81,9 @@ class _Reader:
         major = initial >> 5
         argument = initial & 0x1F
         at += 1
-        if argument >= 24:
+        if argument == 24 and at < len(wire) and wire[at] >= 24:  # the usual length of a name or a key
+            argument, at = wire[at], at + 1
+        elif argument >= 24:
             argument, at = self._long_argument(argument, at)
         if 2 <= major <= 3:
             end = at + argument
@@ -103,30 +109,24 @@ class _Reader:
     def _map(self, pairs: int, depth: int) -> dict[str, Value]:
         wire = self.wire
         result: dict[str, Value] = {}
-        previous = b""
+        previous, size = b"", len(wire)
         for _ in range(pairs):
             start = self.at
-            key = self._key(depth)
-            encoded = wire[start : self.at]
+            end = start + wire[start] - 0x60 + 1 if start < size else 0
+            if start < end <= size and end - start <= _SHORT_KEY_BYTES:  # the usual key, without the general case
+                encoded = wire[start:end]
+                key = _short_key(encoded)
+                self.at = end
+            else:
+                item = self.item(depth)
+                if not isinstance(item, str):
+                    _refuse("a map key that is not text")
+                key, encoded = item, wire[start : self.at]
             if encoded <= previous:
                 _refuse("map keys not in order, or one twice")
             previous = encoded
             result[key] = self.item(depth)
         return result
-
-    def _key(self, depth: int) -> str:
-        start = self.at
-        length = self.wire[start] - 0x60 if start < len(self.wire) else -1
-        if 0 <= length < 24:  # the usual short key, without the cost of the general case
-            self.at = start + 1 + length
-            raw = self.wire[start + 1 : self.at]
-            if len(raw) != length:
-                _refuse("ends within a map key")
-            return _text(raw)
-        key = self.item(depth)
-        if not isinstance(key, str):
-            _refuse("a map key that is not text")
-        return key
 
     def _long_argument(self, info: int, at: int) -> tuple[int, int]:
         """Return the argument that follows its initial byte, and the cursor behind it."""
@@ -157,6 +157,12 @@ class _Reader:
             _refuse("a float not in its shortest form")
         self.at = end
         return number
+
+
+@lru_cache(_KEYS_MAX)
+def _short_key(encoded: bytes) -> str:
+    """Return the text of a map key of up to 23 bytes, encoded with its head."""
+    return _text(encoded[1:])
 
 
 def _text(raw: bytes) -> str:
@@ -222,13 +228,14 @@ def _write(value: object, pieces: list[bytes], depth: int) -> None:
 
 def _head(major: int, argument: int) -> bytes:
     if argument < 24:
-        return bytes((major << 5 | argument,))
+        return _SHORT_HEADS[major << 5 | argument]
     if argument >= 1 << 64:
         raise LocalError("a whole number of more than 64 bits")
     width = 1 if argument < 1 << 8 else 2 if argument < 1 << 16 else 4 if argument < 1 << 32 else 8
     return bytes((major << 5 | 23 + width.bit_length(),)) + argument.to_bytes(width, "big")
 
 
+@lru_cache(_KEYS_MAX, typed=True)  # a field's key is that of every statement of its type
 def _key(key: object) -> bytes:
     if not isinstance(key, str):
         raise LocalError("a map key that is not text")

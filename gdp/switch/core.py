@@ -244,11 +244,12 @@ class SwitchCore:
                 if header.kind == Kind.KEEPALIVE:
                     self._take_keepalive(arrival, header, now)
                 else:
-                    has_others = True
-                    self._receive_frame(arrival, header, now)
+                    has_others |= self._receive_frame(arrival, header, now)
             except RemoteError as error:
+                has_others = True
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not stop the switch
+                has_others = True
                 self.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
         if recosted := self.hello_protocol.neighbours.poll_costs():
@@ -297,7 +298,7 @@ class SwitchCore:
         if self._rest_due_s is None:
             self._rest_due_s = self._next_of_rest()
         times = (self._rest_due_s, self.hello_protocol.get_timer(), self.diagnostics.get_timer())
-        return min(time for time in times if time is not None)
+        return min([time for time in times if time is not None])
 
     def _next_of_rest(self) -> float:
         """Return the monotonic second of the next timer outside neighbour discovery."""
@@ -448,13 +449,14 @@ class SwitchCore:
         if neighbour.role.is_switch:
             self._flooding.compare(neighbour, now.mono_s)
 
-    def _receive_frame(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
+    def _receive_frame(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> bool:
+        """Handle a frame other than a keepalive; return False if it is a fragment whose statement is not complete."""
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
             if header.kind == Kind.COOKIE:
                 self.hello_protocol.receive_cookie(arrival, header)
-                return
+                return True
             if header.kind == Kind.HELLO:
                 wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
             else:
@@ -464,14 +466,14 @@ class SwitchCore:
                 statement = parse(wire)
                 with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
                     self._take_control(arrival, header.kind, statement, now)
-            return
+            return wire is not None
         neighbour = self._sender(arrival)  # their frames cause no response and no query
         if header.kind == Kind.DIAGNOSTIC_REQUEST and header.hops_left & HOPS_MASK <= 1:
             if self.multicast.trees.of_topic(Name(header.destination)):
                 raise FrameError(DropReason.NOT_FOR_US, "a request that a tree has copied")
             self.diagnostics.receive(header, arrival, now, neighbour.name)
         elif header.destination == self.name:
-            self._take_own(header, arrival, now)
+            return self._take_own(header, arrival, now)
         elif header.hops_left & SECOND_PATH:
             raise FrameError(DropReason.NO_SECOND_PATH)  # nothing is asked for it: the first copy travels anyway
         else:
@@ -480,6 +482,7 @@ class SwitchCore:
             if sought is not None and self.resolver.cache.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
             self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
+        return True
 
     def _take_control(self, arrival: ReceivedFrame, kind: int, statement: Statement, now: Timestamps) -> None:
         if kind == Kind.HELLO:
@@ -526,16 +529,17 @@ class SwitchCore:
                 return neighbour
         raise FrameError(DropReason.UNKNOWN_SENDER)
 
-    def _take_own(self, header: Header, arrival: ReceivedFrame, now: Timestamps) -> None:
+    def _take_own(self, header: Header, arrival: ReceivedFrame, now: Timestamps) -> bool:
+        """Handle a frame that is for this switch; return False if it is a fragment whose statement is not complete."""
         if header.kind in (Kind.RIB_ANSWER, Kind.RELOCATE):
             wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is None:
-                return
+                return False
             opened: Opened | None = Opened(wire, is_fresh=False)
             if header.kind == Kind.RIB_ANSWER:
                 opened = self.rib_client.open(wire, Name(header.source), now)
             if opened is None:
-                return
+                return True
             statement = parse(opened.wire)
             if opened.is_fresh and statement.signer != header.source:
                 raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
@@ -559,6 +563,7 @@ class SwitchCore:
             self.diagnostics.receive(header, arrival, now, self._sender(arrival).name)
         else:
             raise FrameError(DropReason.NOT_FOR_US, str(header.kind))
+        return True
 
     # -- neighbours and links
 

@@ -85,6 +85,7 @@ class _Node:
     ports: dict[int, tuple[SimLink, _End, _End]] = field(default_factory=dict)  # link, own end, far end
     costs: dict[int, int] = field(default_factory=dict)  # by port
     timer_s: float | None = None
+    due_s: float | None = None  # of its own timer; one that moved later keeps the event at ``timer_s``
     fired_s: float = float("-inf")
     fired: int = 0  # number of timers in the instant ``fired_s``
     is_alive: bool = True
@@ -235,7 +236,7 @@ class SimNetwork:
     def _arm(self, name: str) -> None:
         """Schedule the call of a core for when its next timer is due."""
         node = self._nodes[name]
-        due_s = node.machine.get_timer()
+        due_s = node.due_s = node.machine.get_timer()
         if due_s is None or node.stalled is not None or (node.timer_s is not None and node.timer_s <= due_s):
             return
         node.timer_s = max(due_s, self._now_s)
@@ -253,8 +254,7 @@ class SimNetwork:
         node.fired_s = self._now_s
         if node.fired > _SAME_INSTANT_MAX:
             raise LocalError(f"{name} wants to be called again and again at {self._now_s}")
-        due_s = node.machine.get_timer()
-        if due_s is not None and due_s <= self._now_s + 1e-9:
+        if node.due_s is not None and node.due_s <= self._now_s + 1e-9:
             node.machine.handle_timer(Timestamps(self._now_s + 1e-6, EPOCH_UNIX_S + self._now_s))
         self._settle(name)
 

@@ -153,9 +153,7 @@ def test_a_restarted_server_answers_again() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_lost_part_of_an_answer_is_repaired(seed: int) -> None:
-    world = ring(
-        seed, lease_s=ADVERTISEMENT_LEASE_S, keepalive_ms=None
-    )  # shorter leases may end before a renewal has passed such links
+    world = ring(seed, lease_s=8.0, keepalive_ms=None)  # shorter ones may end before a renewal has passed such links
     server, client = pair(world)
     server.answers = False
     for sim_link in world.cables.values():
@@ -298,7 +296,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
 
 
 def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -> None:
-    world = ring()
+    world = ring(keepalive_ms=2_000)  # no link fails, and much time passes
     server, client = pair(world)
     server.answer(client.member.name, b"1")
     assert work(world, client, until_s=2, have=1)

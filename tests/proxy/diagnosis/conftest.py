@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
+from tests.insiders.oracle import signing_oracle
+
 _WAYS = {"directly": "every node asked directly", "by_frames": "far nodes asked by frames"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _signatures() -> Iterator[None]:
+    """Sign by the ideal scheme: no fault here is one of signatures."""
+    with signing_oracle():
+        yield
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import pytest
 
@@ -11,8 +10,10 @@ from gdp.diagnosis.answer import Answer, Cause, Verdict
 from gdp.diagnosis.diagnosis import RULES
 from tests.pages import ROOT, blocks_between
 from tests.proxy.diagnosis.faults import FAULTS, Fault
+from tests.proxy.diagnosis.stage import Stage
 
 BEYOND: Final = "EtherType filtered between switches"  # nothing comes from beyond the filter
+ORDERED: Final = sorted(FAULTS, key=lambda fault: fault.title == BEYOND)  # so that a stage serves its tests in a row
 
 
 def check(answer: Answer, cause: Cause) -> None:
@@ -21,19 +22,36 @@ def check(answer: Answer, cause: Cause) -> None:
     assert answer.command
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.title)
-def test_a_fault_is_named_when_every_node_is_asked_directly(fault: Fault, tmp_path: Path) -> None:
-    check(fault.inject(tmp_path).explain(fault.asked), fault.cause)
+class Injected(NamedTuple):
+    """A fault, and the stage that has it."""
+
+    fault: Fault
+    stage: Stage
 
 
-@pytest.mark.parametrize("fault", [each for each in FAULTS if each.title != BEYOND], ids=lambda fault: fault.title)
-def test_a_fault_is_named_when_far_nodes_are_asked_by_frames(fault: Fault, tmp_path: Path) -> None:
-    check(fault.inject(tmp_path).explain_over_network(fault.asked), fault.cause)
+@pytest.fixture(scope="module")
+def injected(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Injected:
+    """Return the stage of a fault, for all tests of that fault."""
+    return Injected(request.param, request.param.inject(tmp_path_factory.mktemp("stage")))
 
 
-def test_a_fault_that_frames_cannot_tell_is_one_of_two_reasons(tmp_path: Path) -> None:
-    fault = next(each for each in FAULTS if each.title == BEYOND)
-    answer = fault.inject(tmp_path).explain_over_network(fault.asked)
+def _title(fault: Fault) -> str:
+    return fault.title
+
+
+@pytest.mark.parametrize("injected", ORDERED, indirect=True, ids=_title)
+def test_a_fault_is_named_when_every_node_is_asked_directly(injected: Injected) -> None:
+    check(injected.stage.explain(injected.fault.asked), injected.fault.cause)
+
+
+@pytest.mark.parametrize("injected", ORDERED[:-1], indirect=True, ids=_title)
+def test_a_fault_is_named_when_far_nodes_are_asked_by_frames(injected: Injected) -> None:
+    check(injected.stage.explain_over_network(injected.fault.asked), injected.fault.cause)
+
+
+@pytest.mark.parametrize("injected", ORDERED[-1:], indirect=True, ids=_title)
+def test_a_fault_that_frames_cannot_tell_is_one_of_two_reasons(injected: Injected) -> None:
+    answer = injected.stage.explain_over_network(injected.fault.asked)
     check(answer, Cause.LINK_SILENT)
     assert "filters EtherType" in answer.sentence
 
