@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.congestion.delivery_rate import Flight
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.message.acknack import AckNack
 from gdp.message.receipts import ReceiptCheck, samples_of
@@ -25,13 +26,6 @@ __all__ = ["SentFrames"]
 _FLIGHT_FRAMES: Final = 16
 _MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
-
-
-class _Flight(NamedTuple):
-    end: int  # count of frames sent up to its last one
-    frames: int
-    number: int  # on the reader's path
-    is_repair: bool  # all its frames were sent before
 
 
 class _Run(NamedTuple):
@@ -50,7 +44,7 @@ class _Run(NamedTuple):
 class _Reader:
     """What one reader has not confirmed yet."""
 
-    flights: deque[_Flight] = field(default_factory=deque)
+    flights: deque[Flight] = field(default_factory=deque)
     resolved: int = 0  # count of frames whose fate is known
     received: int = -1  # count in its latest report; -1: none yet
     newest: tuple[int, int] = (0, 0)  # message and fragment in its latest report
@@ -115,8 +109,9 @@ class SentFrames:
                 path, reader = self._paths.path(name, now_s), self._readers.get(name)
                 if reader is None:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
-                number = path.sent(size, len(flight), now_s)
-                reader.flights.append(_Flight(count, len(flight), number, is_repair))
+                record = path.sent(size, len(flight), now_s)
+                record.place, record.is_repair = count, is_repair
+                reader.flights.append(record)
                 reader.receipts.sent(samples, is_repair=is_repair)
 
     def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
@@ -166,8 +161,8 @@ class SentFrames:
         return is_unproven
 
     def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> bool:
-        while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
-            reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
+        while reader.flights and not reader.flights[0].is_under_way:
+            reader.resolved, reader.partial = reader.flights.popleft().place, 0  # it was given up with a silence
         came = (acknack.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
         has_begun = reader.received < 0 or came > _COUNT_MASK // 2
         newest = acknack.newest, acknack.newest_part
@@ -179,17 +174,16 @@ class SentFrames:
             self._confirm_repairs(reader, path, 0 if has_begun else came, place, now_s)
         if not is_newer or place <= reader.resolved:  # what came now was given up before
             return False
-        before, numbers, reader.partial = reader.resolved, [], 0
-        while reader.flights and reader.flights[0].end <= place:
-            flight = reader.flights.popleft()
-            reader.resolved = flight.end
-            numbers.append(flight.number)
+        before, confirmed, reader.partial = reader.resolved, list[Flight](), 0
+        while reader.flights and reader.flights[0].place <= place:
+            confirmed.append(reader.flights.popleft())
+            reader.resolved = confirmed[-1].place
         if has_begun:
             reader.unseen, reader.lost = (place - acknack.received) & _COUNT_MASK, 0
         held_s = None if is_repair else acknack.held_us / 1e6 + waited_s
-        if not numbers:
-            if reader.flights and reader.flights[0].end - reader.flights[0].frames < place:  # a part of it came
-                path.handle_part(reader.flights[0].number, held_s, now_s)
+        if not confirmed:
+            if reader.flights and reader.flights[0].place - reader.flights[0].frames < place:  # a part of it came
+                path.handle_part(reader.flights[0], held_s, now_s)
             return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
@@ -200,7 +194,7 @@ class SentFrames:
         if is_unproven and held_s is not None:
             held_s = waited_s  # nor is it believed how long it held its report
         path.handle_held(acknack.held_us / 1e6)
-        path.acknowledged(numbers, max(min(judged, frames - 1), 0), held_s, now_s)
+        path.acknowledged(confirmed, max(min(judged, frames - 1), 0), held_s, now_s)
         return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:
@@ -214,12 +208,12 @@ class SentFrames:
         """
         is_over = not came and reader.partial > 0
         came += reader.partial
-        numbers, lost = list[int](), 0
+        confirmed, lost = list[Flight](), 0
         while reader.flights:
             flight = reader.flights[0]
-            size = flight.end - reader.resolved
+            size = flight.place - reader.resolved
             if not flight.is_repair and came and any(each.is_repair for each in reader.flights):
-                lost += flight.end - max(reader.resolved, place)
+                lost += flight.place - max(reader.resolved, place)
             elif not flight.is_repair and not reader.repairs:
                 came = 0
                 break
@@ -229,19 +223,19 @@ class SentFrames:
                 came, is_over = max(came - size, 0), False
                 reader.repairs -= 0 if flight.is_repair else min(size, reader.repairs)
             reader.flights.popleft()
-            reader.resolved = flight.end
-            numbers.append(flight.number)
+            reader.resolved = flight.place
+            confirmed.append(flight)
         reader.partial = came if reader.flights else 0
         reader.lost += lost
-        if numbers:
-            path.acknowledged(numbers, lost if self._counts_losses else 0, None, now_s)
+        if confirmed:
+            path.acknowledged(confirmed, lost if self._counts_losses else 0, None, now_s)
 
     def keep(self, readers: Iterable[bytes]) -> None:
         """Take off the account what is under way to other readers than these: it will not be confirmed."""
         for name in self._readers.keys() - set(readers):
             path, reader = self._paths.get(name), self._readers.pop(name)
             if path is not None:
-                path.controller.forget(flight.number for flight in reader.flights)
+                path.controller.forget(reader.flights)
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""

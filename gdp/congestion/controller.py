@@ -81,8 +81,8 @@ _TRIAL_S, _TRIAL_SHARE, _TRIAL_ROUNDS = 10.0, 0.8, 6
 class PathController:
     """Controller of one path.
 
-    Flights have numbers that ascend as they leave. A flight is one frame, or a few that leave at once. The caller
-    reports each flight that leaves, is confirmed, or is taken for lost, and asks ``next_send_s`` before it sends.
+    A flight is one frame, or a few that leave at once. The caller reports each flight that leaves, is confirmed, or is
+    taken for lost, and asks ``next_send_s`` before it sends.
 
     Args:
         mtu: bytes of a full frame.
@@ -101,7 +101,8 @@ class PathController:
         self.state = State.STARTUP
         self._mtu = mtu
         self._rate = DeliveryRate()
-        self._flights: dict[int, Flight] = {}
+        self._flights: dict[Flight, None] = {}  # in the order in which they left
+        self._leaving: list[Flight] = []  # counted, and perhaps not sealed yet
         self.inflight = 0
         self.due_s = self._changed_s = self._loss = 0.0
         self.confirmed_sent_s = float("-inf")
@@ -196,18 +197,21 @@ class PathController:
             return None
         return self.due_s
 
-    def sent(self, number: int, size: int, now_s: float, frames: int = 1) -> None:
-        """Count a flight of so many bytes and frames, which leaves now."""
-        self._flights[number] = self._rate.sent(size, now_s, self.inflight, frames)
+    def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
+        """Count and return a flight of so many bytes and frames, which leaves now."""
+        flight = self._rate.sent(size, now_s, self.inflight, frames)
+        self._flights[flight] = None
+        self._leaving.append(flight)
         self.inflight += size
         self._was_used = self._was_used or self.inflight + self._mtu > self.window
         self.charge(size, now_s)
+        return flight
 
-    def frames_sent(self, number: int, now_s: float) -> None:
-        """Note when a flight really leaves: its frames are sealed after ``sent``."""
-        flight = self._flights.get(number)
-        if flight is not None:
+    def frames_sent(self, now_s: float) -> None:
+        """Note when the flights counted since the last call really leave: their frames are sealed after ``sent``."""
+        for flight in self._leaving:
             flight.sent_s = now_s
+        self._leaving.clear()
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take.
@@ -227,24 +231,24 @@ class PathController:
         self._rate.app_limited(self.inflight)
         self._is_paced = False
 
-    def acknowledged(self, numbers: Iterable[int], now_s: float, *, held_s: float | None = 0.0, lost: int = 0) -> None:
-        """Take an acknowledgement of one flight or many, in any order; unknown numbers are ignored.
+    def acknowledged(
+        self, flights: Iterable[Flight], now_s: float, *, held_s: float | None = 0.0, lost: int = 0
+    ) -> None:
+        """Take an acknowledgement of one flight or many, in any order; those not under way any more are ignored.
 
         Args:
             held_s: how long the reader held it back; None: it gives no round trip.
             lost: how many of the frames did not arrive.
         """
         newest, first_s, size, frames = None, now_s, 0, 0
-        for number in numbers:
-            flight = self._flights.pop(number, None)
-            if flight is None:
+        for flight in flights:
+            if not self._remove(flight):
                 continue
             size, frames, first_s = size + flight.size, frames + flight.frames, min(first_s, flight.sent_s)
             if newest is None or flight.sent_s > newest.sent_s:
                 newest = flight
         if newest is None:
             return
-        self.inflight -= size
         self.confirmed_sent_s = max(self.confirmed_sent_s, newest.sent_s)
         if newest.sent_s < self._changed_s:  # it says nothing about this path
             self._rate.acknowledged(newest, size, now_s, 0.0)
@@ -279,49 +283,47 @@ class PathController:
             self._end_round(sample, now_s)
         self._set_limits()
 
-    def measure_first(self, number: int, now_s: float, held_s: float) -> None:
+    def measure_first(self, flight: Flight, now_s: float, held_s: float) -> None:
         """Measure the first round trip by a part of a flight: the rest may be lost, and then nothing else does.
 
         Args:
             held_s: how long the reader held the report back.
         """
-        flight = self._flights.get(number)
-        if self._srtt_s is None and flight is not None and flight.sent_s >= self._changed_s:
+        if self._srtt_s is None and flight.is_under_way and flight.sent_s >= self._changed_s:
             self._measure_rtt(max(now_s - flight.sent_s - held_s, _LEAST_RTT_S), now_s)
             self._set_limits()
 
-    def lost(self, numbers: Iterable[int], now_s: float) -> None:
-        """Take frames that are taken for lost; unknown numbers are ignored."""
-        flights = [flight for number in numbers if (flight := self._flights.pop(number, None)) is not None]
+    def lost(self, flights: Iterable[Flight], now_s: float) -> None:
+        """Take flights that are taken for lost; those not under way any more are ignored."""
+        flights = [flight for flight in flights if self._remove(flight)]
         if not flights:
             return
-        self.inflight -= sum(flight.size for flight in flights)
         frames = sum(flight.frames for flight in flights)
         self._round_frames += frames
         self._note_loss(frames, frames)
         self._record_lost(frames, max(flight.sent_s for flight in flights), now_s)
         self._set_limits()
 
-    def forget(self, numbers: Iterable[int]) -> None:
+    def forget(self, flights: Iterable[Flight]) -> None:
         """Take flights off the account whose fate will not be known."""
-        for number in numbers:
-            flight = self._flights.pop(number, None)
-            if flight is not None:
-                self.inflight -= flight.size
+        for flight in flights:
+            self._remove(flight)
 
     def forget_before(self, sent_s: float) -> None:
-        """Take flights off the account that left before ``sent_s``; numbers ascend, so the oldest are first."""
-        old = takewhile(lambda each: each[1].sent_s < sent_s, self._flights.items())
-        self.forget([number for number, _ in old])
-
-    def is_under_way(self, number: int) -> bool:
-        """Return whether a flight is on the account."""
-        return number in self._flights
+        """Take flights off the account that left before ``sent_s``."""
+        self.forget(list(takewhile(lambda flight: flight.sent_s < sent_s, self._flights)))
 
     def forget_all(self) -> None:
         """Take everything under way off the account."""
-        self._flights.clear()
-        self.inflight = 0
+        self.forget(list(self._flights))
+
+    def _remove(self, flight: Flight) -> bool:
+        """Take a flight off the account; return whether it was on it."""
+        was_under_way, flight.is_under_way = flight.is_under_way, False
+        if was_under_way:
+            del self._flights[flight]
+            self.inflight -= flight.size
+        return was_under_way
 
     def timed_out(self, now_s: float) -> None:
         """Start again with two frames: nothing that is under way was confirmed."""
