@@ -19,7 +19,7 @@ from gdp.client.control_keys import ControlKeys
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
-from gdp.client.reader_proxies import CALLS, TOPICS
+from gdp.client.reader_proxies import CALLS, TOPICS, ReaderProxies
 from gdp.client.request_streams import RequestStreams
 from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
@@ -231,13 +231,13 @@ class Participant:
 
     def connected_peers(self, service: Name) -> list[Name]:
         """Return all connected peers, those that do not keep up included; ``peers`` returns a subset."""
-        return self._peers(service, Publisher.is_read_by)
+        return self._peers(service, ReaderProxies.is_read_by)
 
     def silent_peers(self, service: Name) -> list[Name]:
         """Return the peers that have stopped reporting and may return, such as those behind a dead access point."""
-        return self._peers(service, Publisher.is_silent)
+        return self._peers(service, ReaderProxies.is_suspended)
 
-    def _peers(self, service: Name, fits: Callable[[Publisher, Name], bool]) -> list[Name]:
+    def _peers(self, service: Name, fits: Callable[[ReaderProxies, Name], bool]) -> list[Name]:
         """Return the peers with a live writer proxy whose state as readers of the service's publisher fits."""
         publisher = self._publications.get(service)
         if publisher is None:
@@ -245,7 +245,7 @@ class Participant:
         return [
             writer_proxy.publisher
             for writer_proxy in self.writer_proxies_of(service)
-            if writer_proxy.state is WriterProxyState.LIVE and fits(publisher, writer_proxy.publisher)
+            if writer_proxy.state is WriterProxyState.LIVE and fits(publisher.matched, writer_proxy.publisher)
         ]
 
     def withdraw(self, name: Name) -> None:

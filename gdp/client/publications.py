@@ -77,11 +77,11 @@ class Publications:
         what is kept for those that may come.
         """
         each_of = self._all_of(name)
-        return all((each.is_acknowledged() or not each.is_wanted) and not each.is_awaiting for each in each_of)
+        return all((each.is_acknowledged() or not each.is_wanted) and not each.queue.awaited for each in each_of)
 
     def unacknowledged(self, name: Name) -> int:
         """Return how many messages on a name some reader has not confirmed, or have not left if none does."""
-        return sum(each.messages - each.acknowledged for each in self._all_of(name) if each.is_wanted)
+        return sum(each.messages - each.acknowledgements.acknowledged for each in self._all_of(name) if each.is_wanted)
 
     def get(self, name: Name) -> Publisher | None:
         """Return the publisher of a name, or None."""
@@ -217,7 +217,7 @@ class Publications:
         """Note that a tree is installed, and its MTU."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.path > 1:
-            publisher.second_path_until_s = now_s + join.lease_s
+            publisher.governing_paths.second_until_s = now_s + join.lease_s
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
             mtu, is_split = path.receive_mtu(join.mtu, now_s), False
@@ -263,7 +263,7 @@ class Publications:
         streams, heard = self._private.get(service), self._heard(service, party)
         if streams is None or heard is None:
             raise LocalError(f"{party.short} is not heard on {service.short}")
-        return streams.stream(heard, self._publishers[service].mtu, now_s)
+        return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""
@@ -280,7 +280,7 @@ class Publications:
             if known is not None:
                 return known
             try:
-                return streams.stream(heard, self._publishers[service].mtu, now_s)
+                return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
             except LocalError as error:
                 raise StatementError(DropReason.QUOTA, "private streams") from error
         raise StatementError(DropReason.NOT_FOR_US)

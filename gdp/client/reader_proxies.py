@@ -109,7 +109,11 @@ class ReaderProxy:
 
 
 class ReaderProxies:
-    """Readers of one publisher, by name."""
+    """Readers of one publisher, by name.
+
+    Attributes:
+        is_reachable: a tree to them is installed.
+    """
 
     def __init__(self, topic: Name, source: WriterIdentity, patience: ReaderTimeouts = TOPICS) -> None:
         self._topic = topic
@@ -118,6 +122,7 @@ class ReaderProxies:
         self._readers: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
+        self.is_reachable = False
 
     def __len__(self) -> int:
         return len(self._readers)
@@ -130,6 +135,14 @@ class ReaderProxies:
 
     def __iter__(self) -> Iterator[bytes]:
         return iter(list(self._readers))
+
+    def is_read_by(self, name: bytes) -> bool:
+        """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
+        return self.is_reachable and name in self._readers
+
+    def reporting(self, now_s: float) -> list[bytes]:
+        """Return the readers to which a tree is installed; those that have missed reports come last."""
+        return sorted(self._readers, key=lambda name: self.is_quiet(name, now_s)) if self.is_reachable else []
 
     def names(self) -> list[bytes]:
         """Return the names of all, suspended ones included."""

@@ -34,6 +34,8 @@ __all__ = ["SendQueue"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
+_RELIABLE: Final = int(Flag.RELIABLE)
+_LATCHED: Final = int(Flag.LATCHED)
 
 
 class SendQueue:
@@ -42,6 +44,8 @@ class SendQueue:
     Args:
         keys: seals the frames.
         window: caches the frames of a topic whose readers acknowledge.
+        is_reliable: readers acknowledge what they get, whatever ``depth``.
+        is_urgent: its frames go before those of other topics.
         next_number: number of the first message.
         last_sequence: highest sequence number in use.
         options: how fresh its best-effort messages leave.
@@ -64,6 +68,9 @@ class SendQueue:
         *,
         keys: KeyEpochs,
         window: SendWindow,
+        is_reliable: bool,
+        is_urgent: bool,
+        depth: int,
         next_number: int,
         last_sequence: int,
         options: SendOptions = DEFAULT_OPTIONS,
@@ -72,10 +79,10 @@ class SendQueue:
         self._window = window
         self.next_number = next_number
         self.ledger = Ledger(last_sequence)
-        self.is_acknowledged = True
-        self.depth = 0
+        self._is_reliable = is_reliable
+        self._urgent = int(Flag.URGENT) if is_urgent else 0
         self.awaited = 0
-        self.flags = 0
+        self._note_depth(depth)
         self.mtu: int | None = None
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
@@ -209,9 +216,14 @@ class SendQueue:
     def set_depth(self, depth: int) -> None:
         """Change how many messages are latched; what is beyond that is dropped."""
         self.seal_gathered()
-        self.depth = depth
+        self._note_depth(depth)
         self._window.set_history_depth(self.kept, self.next_number)
         self.drops[DropReason.NO_READER] += self._drop_deferred(self.kept)
+
+    def _note_depth(self, depth: int) -> None:
+        self.depth = depth
+        self.is_acknowledged = self._is_reliable or depth > 0
+        self.flags = _RELIABLE * self._is_reliable | _LATCHED * (depth > 0) | self._urgent
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""

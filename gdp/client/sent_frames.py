@@ -1,4 +1,4 @@
-"""Frames that one publisher has sent, until its readers' reports show what became of them.
+"""Ledger of the frames that one publisher has sent, until its readers' reports show what became of them.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
@@ -6,6 +6,10 @@ A report states how many frames its reader has received, and the newest of them.
 everything that left up to that frame has arrived or is lost, and the count shows how many are lost. Frames that leave
 at once form flights of at most ``_FLIGHT_FRAMES``; a flight is confirmed as a whole. A frame that is sent again gives
 no round trip, because its confirmation may be that of the first time (Karn's rule).
+
+Each frame is entered once, when it leaves. What a report shows of it is handed to the path of its reader
+(``reader_path.py``), to the check of receipts (``gdp/message/receipts.py``) and to the estimate of loss
+(``gdp/message/frame_loss.py``).
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.congestion.delivery_rate import Flight
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.message.acknack import AckNack
+from gdp.message.frame_loss import FrameLoss
 from gdp.message.receipts import ReceiptCheck, samples_of
 
 __all__ = ["SentFrames"]
@@ -56,20 +61,37 @@ class _Reader:
 
 
 class SentFrames:
-    """Frames of one publisher under way to its readers.
+    """Ledger of the frames of one publisher.
 
     Args:
         paths: of the participant.
         counts_losses: frames keep their order; not so if they are striped over two paths.
+
+    Attributes:
+        loss: share of urgent frames lost, copies included.
+        last_s: when frames other than copies last left.
     """
 
     def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
         self._paths = paths
         self._counts_losses = counts_losses
+        self._leaving: tuple[Sequence[bytes], Sequence[bytes], float, int] | None = None
+        self.loss = FrameLoss()
+        self.last_s = float("-inf")
         self._readers: dict[bytes, _Reader] = {}
         self._count = 0
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
         self._uncounted: dict[int, set[int]] = {}  # fragments sent again to several readers: they give no round trip
+
+    def leave(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int) -> None:
+        """Note frames as in ``sent``; they are entered by ``count``, so that they need not wait for that."""
+        self._leaving = frames, names, now_s, again
+
+    def count(self) -> None:
+        """Enter the frames that left last."""
+        leaving, self._leaving = self._leaving, None
+        if leaving is not None:
+            self.sent(*leaving)
 
     def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
         """Count frames that leave now to the readers of these names; the first ``again`` of them were sent before.
@@ -140,20 +162,22 @@ class SentFrames:
                 return run.place + part - run.first, run.is_repair or part in self._uncounted.get(number, ())
         return 0, False
 
-    def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
-        """Note over how many hops a reader's report came."""
-        path = self._paths.get(name)
-        if path is not None:
-            path.handle_hops(hops, now_s)
-
-    def handle_report(self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0) -> bool:
+    def handle_report(
+        self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0, hops: int | None = None
+    ) -> bool:
         """Confirm on the reader's path what a report shows, which came ``waited_s`` before.
 
-        Return whether its receipts prove fewer frames than it counts.
+        Args:
+            hops: that it had left when it came by the first path; None: it came by the second one.
+
+        Returns:
+            whether its receipts prove fewer frames than it counts.
         """
         is_unproven = False
         reader, path = self._readers.get(name), self._paths.get(name)
         if path is not None:
+            if hops is not None:
+                path.handle_hops(hops, now_s)
             if reader is not None and acknack.received:
                 is_unproven = self._confirm(reader, path, acknack, now_s, waited_s)
                 self._forget_places()

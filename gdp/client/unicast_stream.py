@@ -145,12 +145,12 @@ class UnicastStream(Publisher):
 
     def note_second_path(self, came_s: float) -> None:
         """Note when a frame of the reader last came by a second path: copies to it go up the same tree."""
-        self.second_path_until_s = came_s + _SECOND_PATH_S
+        self.governing_paths.second_until_s = came_s + _SECOND_PATH_S
 
     def mark_in_use(self, now_s: float) -> None:
         """Note that the stream is in use; a silent reader becomes active."""
         self._touched_s = now_s
-        self.connect(*self.reader, self._exchange, now_s)
+        self.acknowledgements.connect(*self.reader, self._exchange, now_s)
 
     def renew(self, secrets: Secrets, now_s: float) -> None:
         """Replace the service's secrets."""

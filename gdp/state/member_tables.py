@@ -58,13 +58,13 @@ def participant_tables(
                 }
             )
         for publisher in member.publishers():
-            for reader in publisher.reader_names():
+            for reader in map(Name, publisher.matched.names()):
                 rows.append(
                     {
                         "local": local_name(publisher.topic),
                         "peer": reader,
                         "is": "reader",
-                        "state": "silent" if publisher.is_silent(reader) else "live",
+                        "state": "silent" if publisher.matched.is_suspended(reader) else "live",
                         "name": publisher.topic,
                     }
                 )

@@ -217,8 +217,8 @@ class ProxyNode:
             messages=self.traffic.messages,
             message_bytes=self.traffic.message_bytes,
             repairs=lambda: {
-                "sent": sum(publisher.repairs for publisher in member.publishers()),
-                "parity": sum(publisher.parity.sent for publisher in member.publishers()),
+                "sent": sum(publisher.protection.repairs for publisher in member.publishers()),
+                "parity": sum(publisher.protection.parity.sent for publisher in member.publishers()),
                 "recovered": sum(writer_proxy.recovered for writer_proxy in member.writer_proxies()),
             },
             lost=lambda: by_label(member.lost()),

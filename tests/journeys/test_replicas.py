@@ -306,7 +306,7 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
     servers = [Party(world, f"{name}/proxy", Right.SERVE, answers=False) for name in names]
     client = Party(world, "robot/proxy", Right.CALL)
     assert meet(world, client, *servers)
-    client.stream.bundle_bytes = 0
+    client.stream.queue.bundle_bytes = 0
     uplink, branches = Tap("robot", "gateway"), [Tap("gateway", name) for name in names]
     world.network.taps += [uplink, *branches]
     for number in range(200):

@@ -38,6 +38,7 @@ def publisher_of(
     incarnation: int = 1,
     secrets: Secrets = SECRETS,
     reliable: bool = True,
+    urgent: bool = False,
     depth: int = 0,
     options: SendOptions = DEFAULT_OPTIONS,
 ) -> Publisher:
@@ -48,6 +49,7 @@ def publisher_of(
         secrets=secrets,
         description=b"what it is",
         reliable=reliable,
+        urgent=urgent,
         depth=depth,
         options=options,
     )

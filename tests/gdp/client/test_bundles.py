@@ -52,7 +52,12 @@ def test_messages_that_wait_together_come_in_order_under_few_numbers(reliable: b
     assert len({header.number for header in data(pipe)}) < len(SMALL) / 10
     if reliable or not loss:
         assert end.messages == SMALL
-        assert pipe.publisher.acknowledged == pipe.publisher.messages == end.writer_proxy.delivered == len(SMALL)
+        assert (
+            pipe.publisher.acknowledgements.acknowledged
+            == pipe.publisher.messages
+            == end.writer_proxy.delivered
+            == len(SMALL)
+        )
 
 
 def test_a_message_alone_is_sealed_alone_and_at_once() -> None:
@@ -93,7 +98,7 @@ def test_a_latched_topic_has_no_bundles_so_that_late_joiners_get_so_many_message
 
 def test_without_space_for_bundles_each_message_has_its_own_seal() -> None:
     pipe, (end,) = live(publisher_of())
-    pipe.publisher.bundle_bytes = 0
+    pipe.publisher.queue.bundle_bytes = 0
     publish(pipe.publisher, SMALL[:100])
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert end.numbers == list(range(1, 101))
@@ -115,12 +120,12 @@ def test_what_publish_returns_is_confirmed_when_so_many_are() -> None:
     pipe, _ = live(publisher_of())
     numbers = [pipe.publisher.publish(message) for message in SMALL[:30]]
     pipe.run(0.001)
-    assert pipe.publisher.acknowledged == 0
+    assert pipe.publisher.acknowledgements.acknowledged == 0
     assert not pipe.publisher.is_acknowledged()
     numbers += [pipe.publisher.publish(message) for message in SMALL[:30]]
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert numbers == list(range(1, 61))
-    assert pipe.publisher.acknowledged == 60
+    assert pipe.publisher.acknowledgements.acknowledged == 60
 
 
 def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -> None:
@@ -131,7 +136,7 @@ def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -
     publish(pipe.publisher, SMALL[3:6])
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert end.messages == SMALL[:6]
-    assert pipe.publisher.acknowledged == pipe.publisher.messages == 6
+    assert pipe.publisher.acknowledgements.acknowledged == pipe.publisher.messages == 6
 
 
 @pytest.mark.parametrize("reliable", [True, False])
@@ -166,7 +171,7 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
     pipe.run(1.0)
     assert [each for each in end.messages if len(each) < 20_000] == SMALL
     assert end.messages == other.messages
-    assert publisher.acknowledged == publisher.messages == len(end.messages)
+    assert publisher.acknowledgements.acknowledged == publisher.messages == len(end.messages)
     assert end.writer_proxy.lost == 0 or not reliable  # numbers that were sealed but never sent look like a loss
 
 
@@ -214,7 +219,7 @@ def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_it
     assert pipe.run(1.0, publisher.is_acknowledged)
     assert end.messages == SMALL[:300]
     assert min(end.numbers) == 1_000
-    assert publisher.acknowledged == 300
+    assert publisher.acknowledgements.acknowledged == 300
 
 
 def test_a_topic_that_becomes_latched_bundles_no_more_and_one_that_is_no_longer_does_again() -> None:
@@ -226,4 +231,4 @@ def test_a_topic_that_becomes_latched_bundles_no_more_and_one_that_is_no_longer_
         assert pipe.run(1.0, pipe.publisher.is_acknowledged)
         assert any(header.flags & Flag.BUNDLE for header in data(pipe)) == (depth == 0)
     assert end.messages == SMALL[:300]
-    assert pipe.publisher.acknowledged == 300
+    assert pipe.publisher.acknowledgements.acknowledged == 300

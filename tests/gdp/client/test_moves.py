@@ -93,7 +93,7 @@ def test_confirmed_messages_are_counted_and_not_their_numbers() -> None:
         pipe.run(0.003)
         narrow(pipe, one)
         assert pipe.run(5, pipe.publisher.is_acknowledged)
-    assert pipe.publisher.acknowledged == pipe.publisher.messages == len(one.messages) == 30
+    assert pipe.publisher.acknowledgements.acknowledged == pipe.publisher.messages == len(one.messages) == 30
 
 
 def test_a_late_joiner_gets_latched_messages_in_the_new_size_and_no_reader_gets_them_again() -> None:

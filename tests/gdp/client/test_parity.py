@@ -27,7 +27,7 @@ def warmed(loss: float = 0.02) -> Pipe:
     for _ in range(60):
         pipe.publish([rng.randbytes(SIZE)])
         pipe.run(0.1)
-    assert pipe.publisher.parity.sent
+    assert pipe.publisher.protection.parity.sent
     assert end.writer_proxy.recovered
     return pipe
 

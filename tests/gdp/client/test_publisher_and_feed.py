@@ -65,7 +65,7 @@ def test_a_best_effort_topic_never_waits_for_what_is_lost() -> None:
         assert len(end.delivered) - before == (at % 10 != 3)
     assert end.numbers == sorted(end.numbers)
     assert end.writer_proxy.lost == 10
-    assert pipe.publisher.repairs == 0
+    assert pipe.publisher.protection.repairs == 0
 
 
 def test_without_a_reader_nothing_is_sealed_and_the_loss_is_counted() -> None:
