@@ -100,7 +100,7 @@ class AckNackHandler:
         reader.start = None
         if queue.is_acknowledged:
             self._acknowledge(name, acknack, is_new=is_new, now_s=now_s, trip_s=trip_s)
-        if not self._window.is_suspended(name):
+        if name not in self._window.readers.suspended:
             reader.behind_s = None
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
@@ -131,12 +131,12 @@ class AckNackHandler:
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""
         for name in self._readers.silent(now_s):
-            self._window.suspend(name)
+            self._window.readers.suspend(name)
             self._readers.suspend(name, now_s)
             self._heartbeats.starts.pop(name, None)
         for name in self._window.slow_readers(now_s):
             if self._readers.is_quiet(name, now_s):
-                self._window.suspend(name)
+                self._window.readers.suspend(name)
                 self._readers[name].behind_s = now_s
             else:
                 self.exclude(name, now_s)
@@ -151,7 +151,7 @@ class AckNackHandler:
 
     def exclude(self, name: bytes, now_s: float) -> None:
         """Let a slow reader block the others no longer, for a penalty time."""
-        if self._window.has_reader(name) or (name in self._readers and not self._queue.is_acknowledged):
+        if name in self._window.readers.active or (name in self._readers and not self._queue.is_acknowledged):
             self._readers.suspend_again(name, now_s)
             self._window.drop_reader(name)
             self._heartbeats.wanted = True
@@ -171,8 +171,8 @@ class AckNackHandler:
             self._readers.record_key(name, incarnation, 0, exchange)
             self._readers.admit(name, incarnation, now_s).sequence = self._queue.first_waiting
         self._readers[name].behind_s = None
-        if self._window.is_suspended(name):
-            self._window.resume(name, now_s)
+        if name in self._window.readers.suspended:
+            self._window.readers.resume(name, now_s)
         else:
             self._window.add_reader(name, self._queue.next_number, now_s)
 
@@ -247,8 +247,8 @@ class AckNackHandler:
                 reader.sequence = min(acknack.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
-                    if number < queue.next_number and acknack.next_number and self._window.readers > 1:
-                        self._window.suspend(name)  # the others must not wait for what it missed
+                    if number < queue.next_number and acknack.next_number and len(self._window.readers.active) > 1:
+                        self._window.readers.suspend(name)  # the others must not wait for what it missed
                         reader.behind_s = now_s
             self._heartbeats.starts[name] = reader.start
         self._heartbeats.wanted = True
@@ -269,15 +269,15 @@ class AckNackHandler:
         reader, window, queue = self._readers[name], self._window, self._queue
         self.lose_ended(window.poll_cancelled(acknack))
         oldest = queue.oldest
-        if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
+        if not (name in window.readers.active or name in window.readers.suspended) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before
             if not is_new and acknack.next_number < oldest:
                 end = queue.ledger.begin_of(oldest, queue.first_waiting)
                 queue.ledger.give_up(acknack.sequence, end - 1)
             window.add_reader(name, min(max(acknack.next_number, oldest), queue.next_number), now_s)
-        if window.has_reader(name) or window.is_suspended(name):
+        if name in window.readers.active or name in window.readers.suspended:
             window.handle_acknack(name, acknack, now_s, trip_s)
         lacks_from = acknack.missing[0].number if acknack.missing and not is_new else acknack.next_number
         is_gone = lacks_from < oldest
-        if is_gone or (window.is_suspended(name) and not acknack.missing):
+        if is_gone or (name in window.readers.suspended and not acknack.missing):
             self._heartbeats.is_reminder_wanted = True  # it requests what is gone, or does not know what it lacks

@@ -13,7 +13,7 @@ from typing import Final
 from gdp.client.blocking_readers import BlockingReaders, PathState
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import ReaderProxies
-from gdp.client.send_options import SendOptions
+from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.limits import SPREAD
@@ -35,12 +35,10 @@ class GoverningPaths:
 
     Args:
         paths: what may leave to each reader node; shared by all publishers of a participant.
-        count: 2: each frame is to leave by two paths. ``SPREAD``: large messages are striped over both.
-        lag_s: how long a reader may hold back the others.
-        is_urgent: its frames find space where those of other topics have filled the window.
-        fastest_governs: the first answer to a message counts, so readers on slower paths do not hold it back.
+        settings: of the publisher; urgent frames find space where those of other topics have filled the window.
 
     Attributes:
+        blocking: readers that hold back the others.
         share: of what the path carries, 0 to 1; the other topics that wait have the rest.
         seen_s: when ``allowance`` was last asked.
         second_until_s: monotonic second until which there is a second path, as far as known here.
@@ -53,25 +51,21 @@ class GoverningPaths:
         readers: ReaderProxies,
         queue: SendQueue,
         window: SendWindow,
-        count: int,
-        lag_s: float,
-        is_urgent: bool,
-        fastest_governs: bool,
+        settings: PublisherSettings,
     ) -> None:
         self._paths = paths
         self._readers = readers
         self._queue = queue
         self._window = window
-        self._count = count
-        self._is_urgent = is_urgent
-        self._fastest_governs = fastest_governs
-        self._blocking = BlockingReaders(lag_s)
+        self._count, self._is_urgent = settings.paths, settings.urgent
+        self._fastest_governs = settings.patience.fastest_governs
+        self.blocking = BlockingReaders(settings.patience.lag_s)
         self.seen_s = 0.0
         self.share = 1.0
         self.second_until_s = float("-inf")
         self._limit_bytes_s: float | None = None
         self._limit: TokenBucket | None = None
-        self.set_options(queue.options)
+        self.set_options(settings.options)
 
     def set_options(self, options: SendOptions) -> None:
         """Change how many bits may leave in a second."""
@@ -101,12 +95,12 @@ class GoverningPaths:
         if self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._governing()
-        if len(paths) == 1 and not self._blocking:
+        if len(paths) == 1 and not self.blocking:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
         if self._fastest_governs:
             return max(allowances, default=_ALL)
-        if self._blocking or (len(allowances) > 1 and min(allowances) <= 0):
+        if self.blocking or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
         return min(allowances, default=_ALL)
 
@@ -182,14 +176,6 @@ class GoverningPaths:
         """Return how long the answer of the slowest reader may take."""
         return max((path.patience_s(now_s) for path in self._governing()), default=0.0)
 
-    def slow_readers(self, now_s: float) -> list[bytes]:
-        """Return the readers that must no longer block the others, because their paths are far slower."""
-        return self._blocking.slow(now_s)
-
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which a reader may be too slow, or None."""
-        return self._blocking.get_timer()
-
     def governing_reader(self) -> tuple[Name, float, float] | None:
         """Return the slowest of several readers, its round trip in seconds, and its bytes a second, or None."""
         names = self.names()
@@ -218,7 +204,7 @@ class GoverningPaths:
             return names
         if self._queue.is_acknowledged:
             window, following = self._window, self._queue.sent[0]
-            keeping_up = [each for each in names if window.has_reader(each)]
+            keeping_up = [each for each in names if each in window.readers.active]
             return [each for each in keeping_up if not window.is_ahead(each, following)] or keeping_up or names
         readers, paths = self._readers, self._paths
         return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
@@ -253,4 +239,4 @@ class GoverningPaths:
         """Note which readers hold back the others."""
         paths = [(name, self._paths.path(name, now_s)) for name in self.names()]
         states = [PathState(name, path.allowance(now_s), path.sent_bytes) for name, path in paths if not path.is_silent]
-        self._blocking.record(states, now_s)
+        self.blocking.record(states, now_s)

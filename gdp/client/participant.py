@@ -21,7 +21,7 @@ from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
 from gdp.client.reader_proxies import CALLS, TOPICS, ReaderProxies
 from gdp.client.request_streams import RequestStreams
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.client.timer_queue import TimerQueue
 from gdp.client.unicast_stream import Party, PeerIncarnation
@@ -151,10 +151,8 @@ class Participant:
     ) -> Publisher:
         """Publish a topic from now on; ``paths`` 2: each frame twice, over two disjoint paths where they exist."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
-        publisher = self._publications.add(
-            topic.name, topic.own_secrets, description,
-            reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options,
-        )  # fmt: skip
+        settings = PublisherSettings(reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options)
+        publisher = self._publications.add(topic.name, topic.own_secrets, description, settings)
         self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
         return publisher
 
@@ -481,12 +479,10 @@ class Participant:
     ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
-        publisher = self._publications.add(
-            topic.name, topic.own_secrets, description,
-            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS, paths=paths,
-            options=options,
-        )  # fmt: skip
-        self._publications.enable_unicast(topic.name, topic.own_secrets, urgent=urgent, paths=paths, options=options)
+        patience = CALLS if right is Right.CALL else TOPICS
+        settings = PublisherSettings(urgent=urgent, patience=patience, paths=paths, options=options)
+        publisher = self._publications.add(topic.name, topic.own_secrets, description, settings)
+        self._publications.enable_unicast(topic.name, topic.own_secrets, settings)
         self._subscriptions.add(topic, right, self._now_s, paths, is_session=is_session)
         self._advertisement(topic, right, is_global=is_global, paths=paths, is_session=is_session)
         return publisher

@@ -28,6 +28,7 @@ from gdp.client.key_epochs import KeyEpochs
 from gdp.client.parity_sender import RTT_MIN_S, ParitySender
 from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.redundancy import Redundancy
+from gdp.client.send_options import PublisherSettings
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.frame.codec import second_path_copy
@@ -45,8 +46,6 @@ class Protection:
     Args:
         source: has the budgets of copies and of parity.
         sent_frames: where each frame that leaves is entered.
-        paths_count: as of the publisher.
-        is_urgent: its frames go before those of other topics.
 
     Attributes:
         late: large messages of a best-effort topic that may be repaired.
@@ -65,20 +64,19 @@ class Protection:
         window: SendWindow,
         paths: GoverningPaths,
         sent_frames: SentFrames,
-        paths_count: int,
-        is_urgent: bool,
+        settings: PublisherSettings,
     ) -> None:
         self._readers = readers
         self._queue = queue
         self._window = window
         self._paths = paths
         self._sent_frames = sent_frames
-        self._has_one_path, self._is_urgent = paths_count == 1, is_urgent
-        fec = queue.options.fec
-        self.late = BestEffortCache(queue.options)
-        self.copies = Redundancy(budget=source.copies, is_enabled=is_urgent and fec)
+        self._has_one_path, self._is_urgent = settings.paths == 1, settings.urgent
+        fec = settings.options.fec
+        self.late = BestEffortCache(settings.options)
+        self.copies = Redundancy(budget=source.copies, is_enabled=self._is_urgent and fec)
         self.parity = ParitySender(keys=keys, budget=source.parity, is_enabled=self._has_one_path and fec)
-        self._striper = Striper() if paths_count == SPREAD else None
+        self._striper = Striper() if settings.paths == SPREAD else None
         self._loss: float | None = None  # of frames, where parity may save time
         self.has_more = False
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 from gdp.client.identities import WriterIdentity
@@ -14,9 +15,9 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.path_mtu import PathMtu
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.reader_proxies import CALLS, TOPICS, ReaderTimeouts
+from gdp.client.reader_proxies import TOPICS
 from gdp.client.request_streams import RequestStreams
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.timer_queue import TimerQueue
@@ -92,13 +93,7 @@ class Publications:
         name: Name,
         secrets: Secrets,
         description: bytes,
-        *,
-        reliable: bool,
-        depth: int = 0,
-        urgent: bool,
-        patience: ReaderTimeouts = TOPICS,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
+        settings: PublisherSettings,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
@@ -106,29 +101,15 @@ class Publications:
             source=self._source,
             secrets=secrets,
             description=description,
-            reliable=reliable,
-            depth=depth,
-            urgent=urgent,
+            settings=settings,
             past=self._sequence_registry.of(name),
-            patience=patience,
-            paths=paths,
             reader_paths=self._reader_paths,
-            options=options,
-            fastest_governs=patience is CALLS,
         )
         publisher.published = self.scheduler.add
         self._publishers[name] = publisher
         return publisher
 
-    def enable_unicast(
-        self,
-        name: Name,
-        secrets: Secrets,
-        *,
-        urgent: bool,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
-    ) -> None:
+    def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
         self._requests[name] = RequestStreams(public, partial(self._stream_to, name), paths_to)
@@ -138,10 +119,8 @@ class Publications:
             secrets=secrets,
             sequence_registry=self._sequence_registry,
             published=self.scheduler.add,
-            urgent=urgent,
-            paths=paths,
+            settings=replace(settings, patience=TOPICS),
             reader_paths=self._reader_paths,
-            options=options,
         )
 
     def remove(self, name: Name) -> bool:

@@ -23,8 +23,8 @@ from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
 from gdp.client.protection import Protection
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.reader_proxies import ReaderProxies
+from gdp.client.send_options import RELIABLE, PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
@@ -49,18 +49,14 @@ class Publisher:
     Args:
         secrets: topic secrets by epoch; the newest seals.
         description: what a reader must know to understand the messages; it is sent sealed.
-        depth: how many messages late joiners get (0: none).
-        urgent: its frames go before those of other topics, wherever they queue.
+        settings: what kind of stream it is.
         past: last numbers of an earlier publisher of the same topic, in this incarnation.
-        patience: timeouts of its readers.
         address: destination of the frames; None: the topic.
-        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one. ``SPREAD``: large
-            messages are striped over both.
         reader_paths: what may leave to each reader node; shared by all publishers of a participant.
-        options: how fresh, how much and how often its messages leave.
-        fastest_governs: the first answer to a message counts, so readers on slower paths do not hold it back.
 
     Attributes:
+        paths: over how many paths its frames leave, as in its settings.
+        is_urgent: its frames go before those of other topics.
         options: as set last.
         matched: its readers.
         queue: messages that wait, and the numbers of all.
@@ -84,49 +80,47 @@ class Publisher:
         source: WriterIdentity,
         secrets: Secrets,
         description: bytes,
-        reliable: bool,
-        depth: int = 0,
-        urgent: bool = False,
+        settings: PublisherSettings = RELIABLE,
         past: SequenceState = FIRST,
-        patience: ReaderTimeouts = TOPICS,
         address: Name | None = None,
-        paths: int = 1,
         reader_paths: ReaderPaths | None = None,
-        options: SendOptions = DEFAULT_OPTIONS,
-        fastest_governs: bool = False,
     ) -> None:
+        lag_s = settings.patience.lag_s
         self.topic = topic
-        self._fastest_governs = fastest_governs
-        self.paths = paths
-        self.options = options
-        self.is_urgent = urgent
+        self._fastest_governs = settings.patience.fastest_governs
+        self.paths, self.options, self.is_urgent = settings.paths, settings.options, settings.urgent
         self.has_more = False
         self.published: Callable[[Publisher], None] = lambda _: None
         self._awaits_until_s = _NEVER
         self._node_paths = ReaderPaths() if reader_paths is None else reader_paths
         self._keys = KeyEpochs(topic, source, secrets, address)
-        self._window = SendWindow(history_depth=depth, first_number=past.next_number, lag_s=patience.lag_s)
-        self.queue = SendQueue(
-            keys=self._keys, window=self._window, is_reliable=reliable, is_urgent=urgent, depth=depth,
-            next_number=past.next_number, last_sequence=past.sequence, options=options,
-        )  # fmt: skip
+        self._window = SendWindow(history_depth=settings.depth, first_number=past.next_number, lag_s=lag_s)
+        self.queue = SendQueue(keys=self._keys, window=self._window, settings=settings, past=past)
         self.drops = self.queue.drops
         self.losses = self.queue.ledger.losses
-        self.matched = ReaderProxies(topic, source, patience)
+        self.matched = ReaderProxies(topic, source, settings.patience)
         self._heartbeats = HeartbeatSchedule(description, past.status_number)
-        self.sent_frames = SentFrames(self._node_paths, counts_losses=paths != SPREAD)
+        self.sent_frames = SentFrames(self._node_paths, counts_losses=settings.paths != SPREAD)
         self.acknowledgements = AckNackHandler(
-            readers=self.matched, queue=self.queue, window=self._window, heartbeats=self._heartbeats,
+            readers=self.matched,
+            queue=self.queue,
+            window=self._window,
+            heartbeats=self._heartbeats,
             sent_frames=self.sent_frames,
-        )  # fmt: skip
+        )
         self.governing_paths = GoverningPaths(
-            paths=self._node_paths, readers=self.matched, queue=self.queue, window=self._window, count=paths,
-            lag_s=patience.lag_s, is_urgent=urgent, fastest_governs=fastest_governs,
-        )  # fmt: skip
+            paths=self._node_paths, readers=self.matched, queue=self.queue, window=self._window, settings=settings
+        )
         self.protection = Protection(
-            source=source, keys=self._keys, readers=self.matched, queue=self.queue, window=self._window,
-            paths=self.governing_paths, sent_frames=self.sent_frames, paths_count=paths, is_urgent=urgent,
-        )  # fmt: skip
+            source=source,
+            keys=self._keys,
+            readers=self.matched,
+            queue=self.queue,
+            window=self._window,
+            paths=self.governing_paths,
+            sent_frames=self.sent_frames,
+            settings=settings,
+        )
 
     @property
     def readers(self) -> int:
@@ -139,7 +133,7 @@ class Publisher:
         Args:
             awake_s: monotonic second since which this participant has received without a stall.
         """
-        keeps_up = self._window.has_reader(name) or not self.confirms
+        keeps_up = name in self._window.readers.active or not self.confirms
         return self.queue.mtu is not None and keeps_up and self.matched.is_alive(name, now_s, awake_s)
 
     def cancel(self, sequence: int) -> None:
@@ -153,7 +147,7 @@ class Publisher:
     @property
     def is_wanted(self) -> bool:
         """Return whether a message published now is for a reader, or for one that may return to its window."""
-        return self.queue.mtu is not None and bool(self.matched or (self.confirms and self._window.suspended))
+        return self.queue.mtu is not None and bool(self.matched or (self.confirms and self._window.readers.suspended))
 
     @property
     def confirms(self) -> bool:
@@ -325,7 +319,7 @@ class Publisher:
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self.acknowledgements.handle_timer(now_s)
-        for name in self.governing_paths.slow_readers(now_s):
+        for name in self.governing_paths.blocking.slow(now_s):
             self.acknowledgements.exclude(name, now_s)
         self.protection.late.drop_expired(now_s)
         if now_s >= self._awaits_until_s:
@@ -336,8 +330,8 @@ class Publisher:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._window.next_probe(), self._window.next_slow_reader(), self.matched.next_silent()]
-        times += [self.protection.late.get_timer(), self.governing_paths.get_timer()]
+        times = [self._window.next_probe(), self._window.readers.next_slow(), self.matched.next_silent()]
+        times += [self.protection.late.get_timer(), self.governing_paths.blocking.get_timer()]
         times += [self._awaits_until_s] if self._awaits_until_s < _NEVER else []
         if self.matched and self.queue.mtu is not None:
             times += [self._heartbeats.get_timer(), self.protection.copies.get_timer()]

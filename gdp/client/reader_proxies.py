@@ -41,15 +41,18 @@ class ReaderTimeouts(NamedTuple):
 
     ``lag_s``: a reader that has not confirmed in this time what another has no longer blocks the window. ``quiet_s``: a
     reader that is silent for this time does not keep up. ``idle_s``: a live reader reports at least this often.
+    ``fastest_governs``: the first answer to a message counts, so readers on slower paths do not hold it back.
     """
 
     lag_s: float
     quiet_s: float
     idle_s: float
+    fastest_governs: bool = False
 
 
 TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
-CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
+# other replicas must not wait for a dead one
+CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S, fastest_governs=True)
 
 
 class _Incarnation:

@@ -15,7 +15,7 @@ from typing import Final
 
 from gdp.frame.codec import PARTS_AT
 from gdp.limits import SENDS_MAX
-from gdp.message.repeated_frames import REPEATED_PARTS_MAX
+from gdp.message.second_copies import REPEATED_PARTS_MAX
 from gdp.token_bucket import TokenBucket
 
 __all__ = ["CopyBudget", "Redundancy", "parity_budget", "sends_for"]

@@ -19,7 +19,8 @@ from typing import Final
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.parity_sender import PARITY_BYTES, is_protected
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings, SendOptions
+from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
@@ -36,6 +37,7 @@ _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
 _RELIABLE: Final = int(Flag.RELIABLE)
 _LATCHED: Final = int(Flag.LATCHED)
+_URGENT: Final = int(Flag.URGENT)
 
 
 class SendQueue:
@@ -44,11 +46,8 @@ class SendQueue:
     Args:
         keys: seals the frames.
         window: caches the frames of a topic whose readers acknowledge.
-        is_reliable: readers acknowledge what they get, whatever ``depth``.
-        is_urgent: its frames go before those of other topics.
-        next_number: number of the first message.
-        last_sequence: highest sequence number in use.
-        options: how fresh its best-effort messages leave.
+        settings: of the publisher.
+        past: last numbers of an earlier one.
 
     Attributes:
         is_acknowledged: readers acknowledge what they get (reliable or latched topics).
@@ -64,25 +63,15 @@ class SendQueue:
     """
 
     def __init__(
-        self,
-        *,
-        keys: KeyEpochs,
-        window: SendWindow,
-        is_reliable: bool,
-        is_urgent: bool,
-        depth: int,
-        next_number: int,
-        last_sequence: int,
-        options: SendOptions = DEFAULT_OPTIONS,
+        self, *, keys: KeyEpochs, window: SendWindow, settings: PublisherSettings, past: SequenceState
     ) -> None:
         self._keys = keys
         self._window = window
-        self.next_number = next_number
-        self.ledger = Ledger(last_sequence)
-        self._is_reliable = is_reliable
-        self._urgent = int(Flag.URGENT) if is_urgent else 0
+        self._settings = settings
+        self.next_number = past.next_number
+        self.ledger = Ledger(past.sequence)
         self.awaited = 0
-        self._note_depth(depth)
+        self._note_depth(settings.depth)
         self.mtu: int | None = None
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
@@ -90,7 +79,7 @@ class SendQueue:
         self._deferred = deque[tuple[int, bytes, float | None]]()  # (sequence number, message, since when)
         self._deferred_bytes = 0
         self._gathered = Gathered()
-        self.options = options
+        self.options = options = settings.options
         self.bytes_s: float | None = None
         self.has_parity = False
         self._best_effort = BestEffortQueue(options.deadline_s)
@@ -222,8 +211,9 @@ class SendQueue:
 
     def _note_depth(self, depth: int) -> None:
         self.depth = depth
-        self.is_acknowledged = self._is_reliable or depth > 0
-        self.flags = _RELIABLE * self._is_reliable | _LATCHED * (depth > 0) | self._urgent
+        reliable, urgent = self._settings.reliable, self._settings.urgent
+        self.is_acknowledged = reliable or depth > 0
+        self.flags = _RELIABLE * reliable | _LATCHED * (depth > 0) | _URGENT * urgent
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""

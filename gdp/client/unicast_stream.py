@@ -23,7 +23,7 @@ from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings
 from gdp.client.sequence_numbers import SequenceState
 from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
 from gdp.crypto.session_seal import session_secret
@@ -97,9 +97,8 @@ class UnicastStream(Publisher):
         writer: its source for all readers.
         mtu: smallest on the path; None if not known yet.
         past: of the same stream, if it was forgotten.
-        paths: over how many paths each frame is sent.
+        settings: of the service.
         reader_paths: what may leave to each reader node; shared by all publishers of a participant.
-        options: of the service.
     """
 
     def __init__(
@@ -110,12 +109,10 @@ class UnicastStream(Publisher):
         party: Party,
         secrets: Secrets,
         mtu: int | None,
-        urgent: bool,
+        settings: PublisherSettings,
         past: SequenceState,
         now_s: float,
-        paths: int = 1,
         reader_paths: ReaderPaths | None = None,
-        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self.reader = party.incarnation_id
         self._exchange = party.exchange
@@ -132,13 +129,10 @@ class UnicastStream(Publisher):
             source=source,
             secrets=secrets,
             description=b"",
-            reliable=True,
-            urgent=urgent,
+            settings=settings,
             past=past,
             address=self.reader.name,
-            paths=paths,
             reader_paths=reader_paths,
-            options=options,
         )
         self.note_second_path(party.second_path_s)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)

@@ -211,7 +211,7 @@ def test_a_bundle_that_is_lost_counts_as_a_loss() -> None:
 def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_its_own_first_message() -> None:
     source = source_of(Name(b"p" * 32), 1, WRITER)
     publisher = Publisher(
-        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", reliable=True, past=SequenceState(1_000, 50)
+        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", past=SequenceState(1_000, 50)
     )
     publisher.tree_stands(1_500)
     pipe, (end,) = live(publisher)

@@ -18,6 +18,7 @@ from thin_link.channel import Channel, Loss, Rate
 from gdp.client.identities import WriterIdentity
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.client.send_options import PublisherSettings
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.congestion.delivery_rate import Flight
@@ -155,8 +156,8 @@ class SimulatedRobot:
         name, key = Name(stream.name.encode().ljust(32, b".")), SigningKey.generate()
         source: WriterIdentity = source_of(Name(b"robot".ljust(32, b".")), 1, key)
         publisher = Publisher(
-            topic=name, source=source, secrets=_SECRETS, description=b"", reliable=stream.is_reliable,
-            urgent=stream.is_urgent, reader_paths=self._paths,
+            topic=name, source=source, secrets=_SECRETS, description=b"", reader_paths=self._paths,
+            settings=PublisherSettings(reliable=stream.is_reliable, urgent=stream.is_urgent),
         )  # fmt: skip
         publisher.tree_stands(MTU)
         publisher.published = self._turns.add
