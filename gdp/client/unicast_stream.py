@@ -19,13 +19,14 @@ import hashlib
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from gdp.client.delivery import Ended
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.send_options import PublisherSettings
 from gdp.client.sequence_numbers import SequenceState
-from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
+from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.crypto.session_seal import session_secret
 from gdp.errors import DropReason
 from gdp.frame.codec import Header
@@ -210,8 +211,8 @@ class UnicastReceiver(WriterProxy):
 
     def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
         """Process one DATA or HEARTBEAT frame of this writer; one that is refused is requested again."""
-        if self._public.state is WriterProxyState.NEW and self.delivered_bytes >= PRIVATE_WAIT_BYTES:
-            self.refuse(DropReason.MEMORY_FULL)
+        if self._public.state is WriterProxyState.NEW and self.delivery.delivered_bytes >= PRIVATE_WAIT_BYTES:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
             super().receive(header, frame, now_s, waited_s)
 

@@ -245,7 +245,7 @@ def _overlay(member: Participant, name: Name, right: Right, now: Timestamps) -> 
         "writers": len(proxies),
         "live": sum(each.state is WriterProxyState.LIVE for each in proxies),
         "absent": member.absent_writers(name),
-        "is_reliable": not any(each.is_best_effort for each in proxies),
+        "is_reliable": not any(each.delivery.is_reliable is False for each in proxies),
         "drops": drops,
     }
     if right in (Right.SERVE, Right.CALL):

@@ -219,7 +219,7 @@ class ProxyNode:
             repairs=lambda: {
                 "sent": sum(publisher.protection.repairs for publisher in member.publishers()),
                 "parity": sum(publisher.protection.parity.sent for publisher in member.publishers()),
-                "recovered": sum(writer_proxy.recovered for writer_proxy in member.writer_proxies()),
+                "recovered": sum(writer_proxy.recovery.recovered for writer_proxy in member.writer_proxies()),
             },
             lost=lambda: by_label(member.lost()),
             unconfirmed=lambda: by_label(member.unconfirmed()),

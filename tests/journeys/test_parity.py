@@ -75,7 +75,7 @@ class Camera:
 
     def recovered(self, reader: int = 0) -> int:
         """Return how many frames parity has restored at a reader."""
-        return sum(each.recovered for each in self.readers[reader].writer_proxies())
+        return sum(each.recovery.recovered for each in self.readers[reader].writer_proxies())
 
 
 def camera(*, fec: bool = True, reliable: bool = False, seed: int = 1, readers: int = 1) -> Camera:

@@ -55,7 +55,7 @@ def test_messages_that_wait_together_come_in_order_under_few_numbers(reliable: b
         assert (
             pipe.publisher.acknowledgements.acknowledged
             == pipe.publisher.messages
-            == end.writer_proxy.delivered
+            == end.writer_proxy.delivery.delivered
             == len(SMALL)
         )
 
@@ -113,7 +113,7 @@ def test_what_waits_for_its_seal_is_not_for_a_reader_that_comes_later() -> None:
     publish(pipe.publisher, SMALL[10:20])
     pipe.run(2.0)
     assert (end.messages, late.messages) == (SMALL[:20], SMALL[10:20])
-    assert late.writer_proxy.lost == 0
+    assert late.writer_proxy.losses.total == 0
 
 
 def test_what_publish_returns_is_confirmed_when_so_many_are() -> None:
@@ -172,7 +172,8 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
     assert [each for each in end.messages if len(each) < 20_000] == SMALL
     assert end.messages == other.messages
     assert publisher.acknowledgements.acknowledged == publisher.messages == len(end.messages)
-    assert end.writer_proxy.lost == 0 or not reliable  # numbers that were sealed but never sent look like a loss
+    # numbers that were sealed but never sent look like a loss
+    assert end.writer_proxy.losses.total == 0 or not reliable
 
 
 @pytest.mark.parametrize("body", [b"", pack([b"x"]) + b"y", pack([b"x" * 9])[:-1]], ids=["empty", "trailing", "cut"])
@@ -205,7 +206,7 @@ def test_a_bundle_that_is_lost_counts_as_a_loss() -> None:
     publish(pipe.publisher, [b"here"] * 5)
     pipe.run(0.1)
     assert end.messages == [b"here"] * 5
-    assert 1 <= end.writer_proxy.lost <= 5
+    assert 1 <= end.writer_proxy.losses.total <= 5
 
 
 def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_its_own_first_message() -> None:

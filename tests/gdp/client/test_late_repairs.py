@@ -138,7 +138,7 @@ def test_a_later_message_waits_no_longer_than_the_hold_time() -> None:
     assert got(end) == []
     pipe.run(0.01)
     assert got(end) == [1]
-    assert end.writer_proxy.lost == 1
+    assert end.writer_proxy.losses.total == 1
 
 
 def test_a_small_message_behind_a_large_one_keeps_the_order() -> None:
@@ -300,5 +300,5 @@ def test_what_arrives_is_whole_in_order_and_once_and_the_rest_is_counted(
     pipe.run(3.0)
     assert got(end) == sorted(set(got(end)))
     assert all(message == published[number] for number, message in zip(got(end), end.messages, strict=True))
-    assert len(end.delivered) + end.writer_proxy.lost == 40
+    assert len(end.delivered) + end.writer_proxy.losses.total == 40
     assert end.budget.held_bytes == 0

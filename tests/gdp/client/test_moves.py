@@ -46,7 +46,7 @@ def test_what_is_under_way_when_the_path_narrows_arrives_once_and_in_order() -> 
     narrow(pipe, one)
     assert pipe.run(5, pipe.publisher.is_acknowledged)
     assert one.messages == other.messages == sent
-    assert one.writer_proxy.lost == other.writer_proxy.lost == 0
+    assert one.writer_proxy.losses.total == other.writer_proxy.losses.total == 0
 
 
 def test_numbers_still_rise() -> None:
