@@ -29,7 +29,7 @@ class Robot:
         self._member, self._runtime, self._service = end.member, end.runtime, topic.name
         self._requests, self._body = requests, bytes(size)
         self._stream = end.member.call(topic, b"requests")
-        self._stream.bundle_bytes = 0
+        self._stream.queue.bundle_bytes = 0
 
     def meet(self, peers: int) -> None:
         """Return when it has this many peers."""

@@ -15,8 +15,9 @@ from typing import Final
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.reader_proxies import ReaderProxies, ReaderProxy
 from gdp.client.send_queue import SendQueue
+from gdp.client.sent_frames import SentFrames
 from gdp.message.acknack import AckNack, AckNackFlag
-from gdp.message.heartbeat import StreamStart
+from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.loss import LossReason
 from gdp.message.renumbering import Renumbering
 from gdp.message.send_window import SendWindow
@@ -32,20 +33,48 @@ class AckNackHandler:
 
     Args:
         readers: the known readers.
-        statuses: when a Heartbeat is due, and where new readers begin.
-
-    Attributes:
-        last_sent_s: when frames were last sent.
+        heartbeats: when a Heartbeat is due, and where new readers begin.
+        sent_frames: when frames were last sent.
     """
 
     def __init__(
-        self, *, readers: ReaderProxies, queue: SendQueue, window: SendWindow, heartbeats: HeartbeatSchedule
+        self,
+        *,
+        readers: ReaderProxies,
+        queue: SendQueue,
+        window: SendWindow,
+        heartbeats: HeartbeatSchedule,
+        sent_frames: SentFrames,
     ) -> None:
         self._readers = readers
         self._queue = queue
         self._window = window
         self._heartbeats = heartbeats
-        self.last_sent_s = float("-inf")
+        self._sent_frames = sent_frames
+
+    @property
+    def acknowledged(self) -> int:
+        """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
+        queue, readers = self._queue, self._readers.all()
+        if not queue.is_acknowledged:
+            return self.sent
+        below = min([queue.first_waiting, *(each.sequence for each in readers)])
+        return min(queue.ledger.confirmed(below), max(queue.ledger.messages - self.reader_lost, 0))
+
+    @property
+    def sent(self) -> int:
+        """Return how many messages have left, not counting those that some reader is known not to get."""
+        return self._queue.ledger.confirmed(self._queue.sequences[0])
+
+    @property
+    def reader_lost(self) -> int:
+        """Return how many messages the reader that lost most reports as lost, those that never left included."""
+        return max((each.lost for each in self._readers.all()), default=0)
+
+    def is_reported(self) -> bool:
+        """Return whether nothing waits, and every reader has reported each message as delivered or lost."""
+        last = self._queue.ledger.last
+        return self._queue.is_empty and all(each.sequence > last for each in self._readers.all())
 
     def handle_acknack(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float = 0.0) -> None:
         """Process a report that was opened.
@@ -71,26 +100,43 @@ class AckNackHandler:
         reader.start = None
         if queue.is_acknowledged:
             self._acknowledge(name, acknack, is_new=is_new, now_s=now_s, trip_s=trip_s)
-        if not self._window.is_suspended(name):
+        if name not in self._window.readers.suspended:
             reader.behind_s = None
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
         reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
         (sent, _), (sequence, _) = queue.sent, queue.sequences
         is_stuck = now_s - reader.advanced_s >= _STUCK_S
-        is_settled = queue.is_acknowledged or is_stuck or now_s - self.last_sent_s > _SETTLED_S
+        is_settled = queue.is_acknowledged or is_stuck or now_s - self._sent_frames.last_s > _SETTLED_S
         if acknack.sequence < sequence and is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
+
+    def poll_heartbeat(self, now_s: float, trip_s: float) -> bytes:
+        """Return the wire form of the Heartbeat that is due; ``trip_s``: how long a reader's answer may take."""
+        queue, oldest = self._queue, self._window.oldest
+        (sent_number, sent_part), (sent_sequence, oldest_sequence) = queue.sent, queue.sequences
+        state = Heartbeat(
+            oldest=sent_number if oldest is None else oldest,
+            sent_number=sent_number,
+            sent_part=sent_part,
+            starts={},
+            description=b"",
+            moves=tuple(queue.moves),
+            oldest_sequence=oldest_sequence,
+            sent_sequence=sent_sequence,
+            gone=tuple(queue.ledger.gone),
+        )
+        return self._heartbeats.poll_heartbeat(state, now_s, trip_s)
 
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""
         for name in self._readers.silent(now_s):
-            self._window.suspend(name)
+            self._window.readers.suspend(name)
             self._readers.suspend(name, now_s)
             self._heartbeats.starts.pop(name, None)
         for name in self._window.slow_readers(now_s):
             if self._readers.is_quiet(name, now_s):
-                self._window.suspend(name)
+                self._window.readers.suspend(name)
                 self._readers[name].behind_s = now_s
             else:
                 self.exclude(name, now_s)
@@ -105,7 +151,7 @@ class AckNackHandler:
 
     def exclude(self, name: bytes, now_s: float) -> None:
         """Let a slow reader block the others no longer, for a penalty time."""
-        if self._window.has_reader(name) or (name in self._readers and not self._queue.is_acknowledged):
+        if name in self._window.readers.active or (name in self._readers and not self._queue.is_acknowledged):
             self._readers.suspend_again(name, now_s)
             self._window.drop_reader(name)
             self._heartbeats.wanted = True
@@ -125,8 +171,8 @@ class AckNackHandler:
             self._readers.record_key(name, incarnation, 0, exchange)
             self._readers.admit(name, incarnation, now_s).sequence = self._queue.first_waiting
         self._readers[name].behind_s = None
-        if self._window.is_suspended(name):
-            self._window.resume(name, now_s)
+        if name in self._window.readers.suspended:
+            self._window.readers.resume(name, now_s)
         else:
             self._window.add_reader(name, self._queue.next_number, now_s)
 
@@ -201,8 +247,8 @@ class AckNackHandler:
                 reader.sequence = min(acknack.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
-                    if number < queue.next_number and acknack.next_number and self._window.readers > 1:
-                        self._window.suspend(name)  # the others must not wait for what it missed
+                    if number < queue.next_number and acknack.next_number and len(self._window.readers.active) > 1:
+                        self._window.readers.suspend(name)  # the others must not wait for what it missed
                         reader.behind_s = now_s
             self._heartbeats.starts[name] = reader.start
         self._heartbeats.wanted = True
@@ -223,15 +269,15 @@ class AckNackHandler:
         reader, window, queue = self._readers[name], self._window, self._queue
         self.lose_ended(window.poll_cancelled(acknack))
         oldest = queue.oldest
-        if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
+        if not (name in window.readers.active or name in window.readers.suspended) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before
             if not is_new and acknack.next_number < oldest:
                 end = queue.ledger.begin_of(oldest, queue.first_waiting)
                 queue.ledger.give_up(acknack.sequence, end - 1)
             window.add_reader(name, min(max(acknack.next_number, oldest), queue.next_number), now_s)
-        if window.has_reader(name) or window.is_suspended(name):
+        if name in window.readers.active or name in window.readers.suspended:
             window.handle_acknack(name, acknack, now_s, trip_s)
         lacks_from = acknack.missing[0].number if acknack.missing and not is_new else acknack.next_number
         is_gone = lacks_from < oldest
-        if is_gone or (window.is_suspended(name) and not acknack.missing):
+        if is_gone or (name in window.readers.suspended and not acknack.missing):
             self._heartbeats.is_reminder_wanted = True  # it requests what is gone, or does not know what it lacks

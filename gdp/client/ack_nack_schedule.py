@@ -1,10 +1,11 @@
-"""Schedule of a reader's reports: when the next one is due.
+"""Schedule of a reader's reports: when the next one is due, and what it states of the frames that came.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import Header
@@ -17,6 +18,7 @@ from gdp.limits import (
     REPORT_PAUSE_S,
 )
 from gdp.message.reassembly import Reassembler
+from gdp.message.receipts import sum_of_samples
 
 __all__ = ["AckNackSchedule"]
 
@@ -34,22 +36,36 @@ class AckNackSchedule:
     Attributes:
         due_s: monotonic second of the next report.
         idle_s: longest time between two reports.
+        received: verified DATA frames that came.
+        receipts: sum of the samples among them (``gdp/message/receipts.py``).
+        newest: the highest of them: number, fragment, and when it came.
     """
 
     def __init__(self, data: Reassembler, due_s: float) -> None:
         self._data = data
         self.due_s = due_s
         self.idle_s = REPORT_IDLE_S
+        self.received = self.receipts = 0
+        self.newest = (0, -1, due_s)
         self._unreported_bytes = 0
         self._total_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
         self._has_come = False  # something has, since the report before
         self._missing_s = REPORT_DELAY_S  # until what is missing is requested again
 
-    def count(self, size: int) -> None:
-        """Count received bytes that no report confirms yet."""
+    def count(self, size: int, frames: Sequence[bytes], number: int, part: int, came_s: float) -> None:
+        """Count received bytes that no report confirms yet.
+
+        Args:
+            frames: those that came; none of what parity has restored.
+            number: of the newest one's message; unless a later one came before, because it is a repair.
+        """
         self._unreported_bytes += size
         self._total_bytes += size
+        self.received += len(frames)
+        self.receipts += sum_of_samples(frames)
+        if (number, part) > self.newest[:2]:
+            self.newest = number, part, came_s
 
     def handle_run(self, now_s: float) -> None:
         """Reschedule after fragments that came in order."""

@@ -13,15 +13,15 @@ import struct
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.client.send_options import SendOptions
 from gdp.frame.codec import NUMBER_AT
 from gdp.limits import REPAIR_S, REPAIRS_ABOVE_PARTS
 from gdp.message.acknack import MissingRange
-from gdp.message.history_cache import CachedMessage
-from gdp.message.retransmission import RepairAllowance, RetransmissionQueue
+from gdp.message.history_cache import CachedMessage, HistoryCache
+from gdp.message.retransmission import RetransmissionQueue, repair_allowance
+from gdp.token_bucket import TokenBucket
 
 __all__ = ["CACHE_BYTES", "FIRST_CREDIT_BYTES", "BestEffortCache"]
 
@@ -39,19 +39,7 @@ _EVERYTHING: Final = 1 << 62  # the position before which all cached frames were
 _NUMBER_PART_PARTS: Final = struct.Struct("!QII")
 
 
-@dataclass(slots=True, kw_only=True)
-class _Sending:
-    """Course of one message: what was sent of it, and when."""
-
-    until_s: float
-    frames: list[bytes] = field(default_factory=list)
-    held_bytes: int = 0
-    ends: list[int] = field(default_factory=list)  # count of fragments sent, after each batch
-    sent_s: list[float] = field(default_factory=list)  # ... and the time of the batch
-    is_repaired: bool = False
-
-
-class BestEffortCache:
+class BestEffortCache(HistoryCache):
     """Cache of the frames of one best-effort topic, with the repairs that its readers requested.
 
     Args:
@@ -59,18 +47,16 @@ class BestEffortCache:
     """
 
     def __init__(self, options: SendOptions) -> None:
+        super().__init__()
         self._is_enabled = options.repairs
         self._deadline_s = options.deadline_s
-        self._messages: OrderedDict[int, CachedMessage] = OrderedDict()
-        self._course: dict[int, _Sending] = {}
         self._repairs = RetransmissionQueue()
-        self._allowances: OrderedDict[bytes, RepairAllowance] = OrderedDict()  # by reader
+        self._allowances: OrderedDict[bytes, TokenBucket] = OrderedDict()  # by reader
         self._credit_bytes = float(FIRST_CREDIT_BYTES)
         self._rtt_s: float | None = None
-        self.held_bytes = 0
 
     def __len__(self) -> int:
-        return len(self._messages)
+        return len(self.messages)
 
     @property
     def retransmissions(self) -> int:
@@ -109,7 +95,7 @@ class BestEffortCache:
             rtt_s: smoothed round trip of the path; None: not measured.
         """
         self.drop_expired(now_s)
-        if not self._messages:
+        if not self.messages:
             return
         arrived_s = now_s - _PATIENCE * (rtt_s or self._rtt_s or 0.0)
         missing = [
@@ -120,13 +106,13 @@ class BestEffortCache:
         self._sample_round_trip(missing, now_s)
         allowance = self._allowances.get(reader)
         if allowance is None:
-            allowance = self._allowances[reader] = RepairAllowance()
+            allowance = self._allowances[reader] = repair_allowance()
             if len(self._allowances) > _READERS_MAX:
                 self._allowances.popitem(last=False)
         self._repairs.request(
             missing,
             allowance,
-            self._messages,
+            self,
             sent_at=_EVERYTHING,
             rtt_s=None if self._rtt_s is None else max(_ROUND_TRIPS * self._rtt_s, _ROUND_TRIPS * (rtt_s or 0.0)),
             round_bytes=int(self._credit_bytes),
@@ -138,67 +124,60 @@ class BestEffortCache:
         if not self._repairs:
             return []
         self.drop_expired(now_s)
-        frames = self._repairs.frames_to_send(self._messages, limit, now_s)
+        frames = self._repairs.frames_to_send(self, limit, now_s)
         self._credit_bytes -= sum(map(len, frames))
-        for frame in frames:
-            self._course[_NUMBER_PART_PARTS.unpack_from(frame, NUMBER_AT)[0]].is_repaired = True
         return frames
 
     def drop_expired(self, now_s: float) -> None:
         """Drop the messages whose time is over."""
-        while self._messages and self._course[next(iter(self._messages))].until_s <= now_s:
-            self._drop(next(iter(self._messages)))
+        messages = self.messages
+        while messages and messages[oldest := next(iter(messages))].until_s <= now_s:
+            self.remove(oldest)
 
     def drop_larger(self, mtu: int) -> None:
         """Drop the messages whose frames no longer fit their path."""
-        for number in [number for number, each in self._messages.items() if len(each.frames[0]) > mtu]:
-            self._drop(number)
+        for number in [number for number, each in self.messages.items() if len(each.frames[0]) > mtu]:
+            self.remove(number)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second after which nothing needs to be cached, or None: nothing is."""
-        return self._course[next(reversed(self._messages))].until_s if self._messages else None
+        return self.messages[next(reversed(self.messages))].until_s if self.messages else None
 
     def close(self) -> None:
         """Drop everything."""
-        for number in list(self._messages):
-            self._drop(number)
+        for number in list(self.messages):
+            self.remove(number)
         self._repairs.clear()
 
     def _add(self, number: int, part: int, frames: Sequence[bytes], now_s: float) -> None:
-        course = self._course.get(number)
-        if course is None:
+        message = self.messages.get(number)
+        if message is None:
             if part:
                 return  # the cache was too small for its beginning
             self.drop_expired(now_s)
-            course = self._course[number] = _Sending(until_s=now_s + (self._deadline_s or REPAIR_S))
-            self._messages[number] = CachedMessage(course.frames, 0, 0)
+            message = self.messages[number] = CachedMessage(frames=[])
+        if isinstance(message.frames, list):  # it was made here
+            message.frames += frames
+        message.batches.append((part + len(frames), now_s))
+        if self._deadline_s is None or not part:
+            message.until_s = now_s + (self._deadline_s or REPAIR_S)
         size = sum(map(len, frames))
-        course.frames += frames
-        course.held_bytes += size
-        course.ends.append(part + len(frames))
-        course.sent_s.append(now_s)
-        if self._deadline_s is None:
-            course.until_s = now_s + REPAIR_S
+        message.size += size
         self.held_bytes += size
         self._credit_bytes = min(self._credit_bytes + _SHARE * size, _CREDIT_BYTES)
         while self.held_bytes > CACHE_BYTES:
-            self._drop(next(iter(self._messages)))
+            self.remove(next(iter(self.messages)))
 
     def _clip(self, missing: MissingRange, newest: tuple[int, int], arrived_s: float) -> MissingRange:
         """Return a range without what may be under way: sent after the newest arrival, and after ``arrived_s``."""
-        course = self._course.get(missing.number)
-        if course is None or (missing.number, missing.last) <= newest:
+        message = self.messages.get(missing.number)
+        if message is None or (missing.number, missing.last) <= newest:
             return missing
-        batches = bisect_right(course.sent_s, arrived_s)
-        sent_end = course.ends[batches - 1] if batches else 0
+        batches = bisect_right(message.batches, arrived_s, key=lambda batch: batch[1])
+        sent_end = message.batches[batches - 1][0] if batches else 0
         if missing.number == newest[0]:
             sent_end = max(sent_end, newest[1])
         return missing._replace(last=min(missing.last, sent_end - 1))
-
-    def _drop(self, number: int) -> None:
-        del self._messages[number]
-        self.held_bytes -= self._course.pop(number).held_bytes
-        self._repairs.forget(number)
 
     def _sample_round_trip(self, missing: Sequence[MissingRange], now_s: float) -> None:
         """Estimate the round-trip time: a reader finds a gap when it gets the fragment behind it.
@@ -206,10 +185,10 @@ class BestEffortCache:
         Shorter samples count at once. Longer ones count little, as the first report may have been lost.
         """
         number, _, last = missing[-1]
-        course = self._course.get(number)
-        if course is None or course.is_repaired or last + 1 >= course.ends[-1]:
+        message = self.messages.get(number)
+        if message is None or message.again_s or last + 1 >= message.batches[-1][0]:
             return
-        sample_s = now_s - course.sent_s[bisect_right(course.ends, last + 1)]
+        sample_s = now_s - message.batches[bisect_right(message.batches, last + 1, key=lambda batch: batch[0])][1]
         if self._rtt_s is None or sample_s < self._rtt_s:
             self._rtt_s = sample_s
         else:

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, NamedTuple
 
+from gdp.client.key_epochs import Openers
 from gdp.client.unicast_stream import PeerIncarnation, private_incarnation, private_name
 from gdp.crypto.cbor import decode as decode_cbor
 from gdp.crypto.control_seal import ControlOpener, topic_of
-from gdp.crypto.envelope import Opener, salt_of, seal_key
-from gdp.crypto.parity_seal import ParityOpener
+from gdp.crypto.envelope import salt_of, seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, GdpError, RemoteError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Flag, Kind
@@ -130,8 +130,7 @@ class CaptureOpener:
         self._incarnations: defaultdict[bytes, set[int]] = defaultdict(set)
         self._topics = set(keys.secrets)
         self._streams: dict[tuple[bytes, int, bytes], _Stream | Outcome] = {}
-        self._openers: dict[tuple[int, bytes, int, bytes, bytes], Opener] = {}
-        self._parity_openers: dict[tuple[bytes, int, bytes, bytes], ParityOpener] = {}
+        self._openers: dict[tuple[bytes, int, bytes, int, bytes], Openers] = {}
         self._quota = ReassemblyQuota()
         self._recoveries: dict[tuple[bytes, int, bytes], FrameRecovery] = {}
         self._seen: set[tuple[_Place, int]] = set()
@@ -256,11 +255,7 @@ class CaptureOpener:
         self, header: Header, frame: bytes, stream: _Stream, secret: bytes, now_s: float
     ) -> list[OpenedMessage]:
         """Return the body of a parity frame, and the messages that it completes."""
-        key = header.source, header.incarnation, stream.bound, secret
-        opener = self._parity_openers.get(key)
-        if opener is None:
-            opener = self._parity_openers[key] = ParityOpener(secret, header.source, header.incarnation, stream.bound)
-        body = opener.open(header, frame)
+        body = self._openers_of(header, stream, secret).parity(header.epoch).open(header, frame)
         opened = [OpenedMessage(header, stream.topic, 0, 0, "", body)]
         try:
             restored = self._recovery(header).add_parity(header, body, now_s)
@@ -278,6 +273,14 @@ class CaptureOpener:
             self._seen.add((place, again.part))
         return opened
 
+    def _openers_of(self, header: Header, stream: _Stream, secret: bytes) -> Openers:
+        key = header.source, header.incarnation, stream.bound, header.epoch, secret
+        found = self._openers.get(key)
+        if found is None:
+            secrets, ends = {header.epoch: secret}, (Name(header.source), header.incarnation, Name(stream.bound))
+            found = self._openers[key] = Openers(secrets, *ends, is_signed=True)
+        return found
+
     def _recovery(self, header: Header) -> FrameRecovery:
         key = header.source, header.incarnation, header.destination
         found = self._recoveries.get(key)
@@ -289,12 +292,8 @@ class CaptureOpener:
         self, header: Header, frame: bytes, stream: _Stream, secret: bytes, now_s: float, *, is_restored: bool = False
     ) -> list[OpenedMessage]:
         """Open a part; return the messages that it completes."""
-        key = header.kind, header.source, header.incarnation, stream.bound, secret
-        opener = self._openers.get(key)
-        if opener is None:
-            opener = Opener(secret, header.kind, header.source, header.incarnation, stream.bound)
-            self._openers[key] = opener
-        plain, _, _ = opener.open(header, frame)
+        openers = self._openers_of(header, stream, secret)
+        plain, _, _ = openers.opener(Kind(header.kind), header.epoch).open(header, frame)
         place = header.kind, header.source, header.incarnation, header.destination, header.number
         salt, message = salt_of(frame), self._unfinished.get(place)
         if message is None or (message.parts, message.salt) != (header.parts, salt):

@@ -1,24 +1,36 @@
-"""Delivery of the messages of one writer: unbundles them in order, and accounts for those that are lost.
+"""Delivery in order of one writer's messages: where it begins, what waits behind a gap, and what is given up.
 
-Sans-I/O. Sequence numbers under the seal show what is lost between two messages. Heartbeats show what is lost behind
-the last, and why.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A reliable stream waits for every message that its writer
+still has. A best-effort one waits as long as a late repair, parity or the slower path may bring what is missing.
+
+Sequence numbers under the seal show what is lost between two messages. Heartbeats show what is lost behind the last,
+and why.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, RemoteError
 from gdp.frame.kinds import Flag
-from gdp.limits import NUMBER_MAX, SEQUENCE_BYTES
+from gdp.limits import NUMBER_MAX, REPLAY_WINDOW_MESSAGES, SEQUENCE_BYTES
 from gdp.message.bundle import unpack
+from gdp.message.frame_recovery import FrameRecovery
+from gdp.message.heartbeat import Heartbeat, StreamStart
+from gdp.message.late_repairs import LateRepairs
 from gdp.message.loss import Losses, LossReason, LostRange, explain
-from gdp.message.reassembly import ReassembledMessage
+from gdp.message.reassembly import ReassembledMessage, Reassembler
+from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.renumbering import Renumbering
+from gdp.names import Name
 
-__all__ = ["Delivered", "DeliveryQueue"]
+__all__ = ["NOT_BEGUN", "Delivered", "Delivery", "Ended"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
+_OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
+_NEVER: Final = float("inf")
 
 
 class Delivered(NamedTuple):
@@ -35,80 +47,290 @@ class Delivered(NamedTuple):
     sequence: int = 0
 
 
-class DeliveryQueue:
-    """Messages in order, for the application.
+class Ended(NamedTuple):
+    """Where a writer proxy ended, for a later one of the same publisher: earlier frames are not opened again.
 
     Args:
-        drops: counts malformed messages.
-
-    Attributes:
-        is_reliable: messages between two delivered ones were given up by the writer; else they are gaps.
-        sequence: sequence number of the next message.
-        known: lowest sequence number of unknown fate.
-        gone: ranges that the writer reports as lost for every reader.
-        skipped: why the next gap is skipped; None: unknown.
-        losses: messages that were lost.
-        delivered: messages that were delivered.
-        delivered_bytes: size of what was passed to ``deliver``.
+        number: of the next message.
+        status: number of the newest Heartbeat seen.
+        sequence: of the next message.
+        known: the first sequence number of unknown fate: messages between the two were published, and did not arrive.
+        resumes: the writer proxy ended without its reader's will: what it misses meanwhile is lost, and requested
+            again.
     """
 
-    def __init__(self, publisher: bytes, incarnation: int, drops: Counter[DropReason]) -> None:
+    number: int = 0
+    status: int = 0
+    sequence: int = 0
+    known: int = 0
+    resumes: bool = False
+
+
+NOT_BEGUN: Final = Ended()
+
+
+class Delivery:
+    """Delivery of the messages of one incarnation of a writer to the application.
+
+    Args:
+        budget: memory of all writer proxies; messages that wait are reserved there.
+        data: reassembles the messages.
+        recovery: keeps frames for parity.
+        late: requests what best-effort messages lack.
+        lag_s: returns how long a copy may take to bring what is missing; 0: none comes.
+
+    Attributes:
+        is_live: it has begun.
+        is_reliable: messages between two delivered ones were given up by the writer; else they are gaps. None: the
+            writer has not said so far.
+        expected: number of the message that is delivered next.
+        sequence: its sequence number.
+        known: lowest sequence number of unknown fate.
+        losses: messages that were lost.
+        delivered: messages that were delivered.
+        delivered_bytes: size of what was to be delivered.
+    """
+
+    def __init__(
+        self,
+        publisher: Name,
+        incarnation: int,
+        budget: ReassemblyQuota,
+        *,
+        data: Reassembler,
+        recovery: FrameRecovery,
+        late: LateRepairs,
+        lag_s: Callable[[], float],
+    ) -> None:
+        self._data = data
+        self._recovery = recovery
+        self._late = late
+        self._lag_s = lag_s
+        self.is_live = False
+        self.is_reliable: bool | None = None
+        self.expected = self.sequence = self.known = 0
+        self.losses = Losses()
+        self.delivered = self.delivered_bytes = 0
         self._publisher = publisher
         self._incarnation = incarnation
-        self._drops = drops
-        self._queue: deque[Delivered] = deque()
-        self.is_reliable = False
-        self.sequence = 0
-        self.known = 0
-        self.gone: tuple[LostRange, ...] = ()
-        self.skipped: LossReason | None = None
-        self.losses = Losses()
-        self.delivered = 0
-        self.delivered_bytes = 0
+        self._budget = budget
+        self._ready: list[Delivered] = []
+        self._gone: tuple[LostRange, ...] = ()  # that the writer reports as lost for every reader
+        self._skipped: LossReason | None = None  # why the next gap is skipped; None: unknown
+        self._waiting: dict[int, ReassembledMessage] = {}  # behind a gap, by number
+        self._gap_until_s = _NEVER  # best effort, two paths: until then the slower one may bring what is missing
+        self._gap_at = 0  # ... and the number that is missing
+        self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
 
-    def __len__(self) -> int:
-        return len(self._queue)
+    def begin(
+        self, status: Heartbeat, start: StreamStart, before: Ended, *, is_latched: bool, is_restarted: bool
+    ) -> None:
+        """Begin at the publisher's start, and count what came between that and the last message read before."""
+        expected = start.number
+        if before.resumes or not is_latched:
+            expected = max(start.number, before.number)
+        begun, why = start.confirmed, LossReason.READER_RESTARTED
+        if before.resumes and before.sequence:
+            begun, why = before.sequence, LossReason.DETACHED
+        elif is_restarted:
+            begun, why = 1, LossReason.PUBLISHER_RESTARTED
+        self._gone = status.gone if why is LossReason.DETACHED else ()
+        self.sequence = begun or start.sequence
+        self._lose_until(start.sequence, why)
+        self._gone = status.gone
+        self.begin_at(expected, max(start.sequence, before.sequence) if expected > start.number else start.sequence)
+
+    def begin_at(self, number: int, sequence: int) -> None:
+        """Begin at a message."""
+        self.is_live = True
+        self.sequence = sequence
+        self.expected = number
+        for each in [each for each in self._waiting if not 0 <= each - number < REPLAY_WINDOW_MESSAGES]:
+            self._pop(each)
+        self._data.start_at(number, self._numbers)
+
+    def add(self, reassembled: ReassembledMessage, now_s: float) -> None:
+        """Order a complete message, and deliver the consecutive ones."""
+        number = reassembled.number
+        skips = not self.is_reliable and self._lag_s() <= 0 and number < self._late.hold((), now_s)
+        if self.is_live and (skips or number == self.expected):
+            if number > self.expected:
+                self._skip_to(number)
+            self._unpack(reassembled)
+            self.expected = number + 1
+            self._deliver(now_s)
+        elif self._put(reassembled):
+            self.known = max(self.known, min(int.from_bytes(reassembled.head, "big"), NUMBER_MAX) + 1)
+            if not self.is_reliable:
+                self._deliver(now_s)
+        elif self.is_live:
+            self._give_up_until(number)
+            self._unpack(reassembled)
+            self.expected += 1
+            self._deliver(now_s)
+        else:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
+
+    def skip_gap(self, now_s: float) -> None:
+        """Go on without the messages before those that wait: the memory behind the gap is exhausted."""
+        if self.is_live and self._waiting:
+            self._give_up_until(min(self._waiting))
+            self._deliver(now_s)
+
+    def handle_heartbeat(self, status: Heartbeat, now_s: float, *, is_newest: bool) -> None:
+        """Apply what a Heartbeat says of messages that are renumbered or gone, once a copy can bring them no more."""
+        if is_newest:
+            self._gone = status.gone
+        for move in status.moves:
+            if move.is_before(self.expected):
+                self._renumber(move)
+        lag_s = max(self._lag_s(), self._late.wait_s(status.oldest, now_s))
+        if self.is_reliable or lag_s <= 0:
+            self._apply_progress(status, now_s)
+        else:
+            self._held.append((now_s + lag_s, status))
+
+    def handle_timer(self, now_s: float) -> None:
+        """Go on without what neither path nor a repair brought in time."""
+        while self._held and self._held[0][0] <= now_s:
+            self._apply_progress(self._held.popleft()[1], now_s)
+        is_released = self._late.give_up(now_s)
+        if self._gap_until_s <= now_s:
+            numbers = self._numbers
+            if numbers and numbers[0] < self._late.hold(numbers, now_s):
+                self._skip_to(numbers[0])
+            self._deliver(now_s)
+        elif is_released:
+            self._deliver(now_s)
+
+    def get_timer(self) -> float:
+        """Return the monotonic second of the next ``handle_timer``; infinity: none."""
+        return min(self._gap_until_s, self._held[0][0] if self._held else _NEVER)
+
+    def finish(self) -> None:
+        """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""
+        if self.is_live:
+            self._skipped = LossReason.PUBLISHER_RESTARTED
+            for number in self._numbers:
+                self._unpack(self._pop(number))
+            self._lose_until(self.known, LossReason.PUBLISHER_RESTARTED)
+
+    def close(self) -> None:
+        """Release all memory."""
+        for number in self._numbers:
+            self._pop(number)
+        self._gap_until_s = _NEVER
+        self._held.clear()
+
+    def poll(self) -> list[Delivered]:
+        """Remove and return the messages that are ready, in order."""
+        ready, self._ready = self._ready, []
+        return ready
+
+    def _deliver(self, now_s: float) -> None:
+        """Deliver the consecutive messages, and without a reliable writer those behind a gap that nothing fills."""
+        waiting = self._waiting
+        gap_until_s, self._gap_until_s = self._gap_until_s, _NEVER
+        if not self.is_live or not waiting:
+            return
+        while self.expected in waiting:
+            self._unpack(self._pop(self.expected))
+            self.expected += 1
+        if not waiting or self.is_reliable:
+            return
+        lag_s, free_to = self._lag_s(), self._late.hold(self._numbers, now_s)
+        if lag_s > 0:
+            is_same = self._gap_at == self.expected and now_s < gap_until_s < _NEVER
+            self._gap_at, self._gap_until_s = self.expected, gap_until_s if is_same else now_s + lag_s
+        elif free := [number for number in self._numbers if number < free_to]:
+            self._skip_to(free[-1] + 1)
+
+    def _skip_to(self, number: int) -> None:
+        """Accept that missing messages before ``number`` will not come."""
+        self.expected = number
+        for each in self._numbers:
+            if each < number:
+                self._unpack(self._pop(each))
+        self._data.forget(number)
+        self._late.forget(number)
+        self._recovery.forget_below(number)
+
+    def _give_up_until(self, number: int) -> None:
+        self._skipped = LossReason.READER_MEMORY
+        self._skip_to(number)
+
+    def _apply_progress(self, status: Heartbeat, now_s: float) -> None:
+        """Go on where a Heartbeat says that nothing before will come, and count that as lost."""
+        otherwise = self._gap_reason
+        if status.oldest > self.expected:
+            self._skip_to(status.oldest)
+            self._lose_until(status.oldest_sequence, otherwise)
+        self._deliver(now_s)
+        if self.expected == status.sent_number:
+            self._lose_until(status.sent_sequence, otherwise)
+        self.known = max(self.known, status.sent_sequence)
+
+    def _renumber(self, move: Renumbering) -> None:
+        """Apply a renumbering, also to the messages that wait."""
+        if self.expected < move.first:
+            self._skip_to(move.first)
+        self.expected = move.new_number(self.expected)
+        early = [self._pop(number) for number in list(self._waiting) if move.is_before(number)]
+        for number in [number for number in self._waiting if number < self.expected]:
+            self._pop(number)  # it was delivered under its old number
+        self._data.forget(self.expected)
+        for each in early:
+            number = move.new_number(each.number)
+            if number not in self._waiting and self._put(each._replace(number=number)):
+                self._data.skip(number)
 
     @property
-    def gap_reason(self) -> LossReason:
-        """Return the reason of losses for which no other reason is known."""
-        return LossReason.GIVEN_UP if self.is_reliable else LossReason.GAP
+    def _numbers(self) -> list[int]:
+        """Return the numbers that wait, lowest first."""
+        return sorted(self._waiting)
 
-    def record_published(self, sequence: int) -> None:
-        """Note that messages before a sequence number were published."""
-        self.known = max(self.known, sequence)
+    def _put(self, reassembled: ReassembledMessage) -> bool:
+        """Let a message wait; return False if the budget is exhausted."""
+        if not self._budget.reserve(self._publisher, len(reassembled.message) + _OVERHEAD_BYTES):
+            return False
+        self._waiting[reassembled.number] = reassembled
+        return True
 
-    def lose_until(self, sequence: int, otherwise: LossReason) -> None:
-        """Count what lies before a sequence number as lost, with reason ``otherwise`` if the writer gives none."""
-        if self.sequence < sequence:
-            for lost in explain(self.sequence, sequence - 1, self.gone, otherwise):
-                self.losses.add(lost)
-            self.sequence = sequence
+    def _pop(self, number: int) -> ReassembledMessage:
+        reassembled = self._waiting.pop(number)
+        self._budget.release(self._publisher, len(reassembled.message) + _OVERHEAD_BYTES)
+        return reassembled
 
-    def deliver(self, reassembled: ReassembledMessage) -> None:
+    def _unpack(self, reassembled: ReassembledMessage) -> None:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
         sequence, messages = int.from_bytes(reassembled.head, "big"), [reassembled.message]
         self.delivered_bytes += len(reassembled.message)
         if len(reassembled.head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
-            self._drops[DropReason.MALFORMED] += 1
+            self._data.drops[DropReason.MALFORMED] += 1
             return
         if reassembled.flags & _BUNDLE:
             try:
                 messages = unpack(reassembled.message)
             except RemoteError as error:
-                self._drops[error.reason] += 1
+                self._data.drops[error.reason] += 1
                 return
-        otherwise, self.skipped = self.skipped or self.gap_reason, None
-        self.lose_until(sequence, otherwise)
+        otherwise, self._skipped = self._skipped or self._gap_reason, None
+        self._lose_until(sequence, otherwise)
         self.sequence = max(self.sequence, sequence + len(messages))
         self.delivered += len(messages)
         number, way = reassembled.number, (reassembled.parts, reassembled.hops)
         for place, message in enumerate(messages):
             at = place, sequence + place
-            self._queue.append(Delivered(self._publisher, self._incarnation, number, message, *way, *at))
+            self._ready.append(Delivered(self._publisher, self._incarnation, number, message, *way, *at))
 
-    def poll(self) -> list[Delivered]:
-        """Remove and return what is queued, in order."""
-        delivered = list(self._queue)
-        self._queue.clear()
-        return delivered
+    @property
+    def _gap_reason(self) -> LossReason:
+        """Return the reason of losses for which no other reason is known."""
+        return LossReason.GIVEN_UP if self.is_reliable else LossReason.GAP
+
+    def _lose_until(self, sequence: int, otherwise: LossReason) -> None:
+        """Count what lies before a sequence number as lost, with reason ``otherwise`` if the writer gives none."""
+        if self.sequence < sequence:
+            for lost in explain(self.sequence, sequence - 1, self._gone, otherwise):
+                self.losses.add(lost)
+            self.sequence = sequence

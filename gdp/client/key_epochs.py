@@ -1,4 +1,5 @@
-"""Key epochs of a topic at its writer: the newest seals; the previous one still opens reports for a while.
+"""Key epochs of a topic: at its writer the newest seals, and the previous one still opens reports for a while; its
+readers open what is sealed under any of them.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: epochs of DTLS 1.3 (RFC 9147).
 """
@@ -9,14 +10,14 @@ from collections.abc import Mapping
 from typing import Final
 
 from gdp.client.identities import WriterIdentity
-from gdp.crypto.envelope import Sealer
-from gdp.crypto.parity_seal import ParitySealer
+from gdp.crypto.envelope import Opener, Sealer
+from gdp.crypto.parity_seal import ParityOpener, ParitySealer
 from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import EPOCH_GRACE_S
 from gdp.names import Name
 
-__all__ = ["KeyEpochs", "Secrets"]
+__all__ = ["KeyEpochs", "Openers", "Secrets"]
 
 Secrets = Mapping[int, bytes]  # key epoch -> topic secret, 32 bytes
 
@@ -109,6 +110,48 @@ class KeyEpochs:
             random_bytes=writer.random_bytes,
             address=self._address,
         )
+
+
+class Openers:
+    """Openers of what one incarnation of a writer seals.
+
+    Args:
+        is_signed: its messages have signatures.
+    """
+
+    def __init__(self, secrets: Secrets, publisher: Name, incarnation: int, topic: Name, *, is_signed: bool) -> None:
+        self._secrets = secrets
+        self._ends = publisher, incarnation, topic
+        self._is_signed = is_signed
+        self._openers: dict[tuple[int, int], Opener] = {}
+        self._parity: dict[int, ParityOpener] = {}
+
+    def renew(self, secrets: Secrets) -> None:
+        """Replace the topic's secrets; an epoch that is still among them opens as before."""
+        self._secrets = secrets
+        self._openers.clear()
+        self._parity.clear()
+
+    def opener(self, kind: Kind, epoch: int) -> Opener:
+        """Return the opener of messages or Heartbeats. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""
+        opener = self._openers.get((kind, epoch))
+        if opener is None:
+            secret = self._secret(epoch)
+            opener = self._openers[kind, epoch] = Opener(secret, kind, *self._ends, is_signed=self._is_signed)
+        return opener
+
+    def parity(self, epoch: int) -> ParityOpener:
+        """Return the opener of parity frames. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""
+        opener = self._parity.get(epoch)
+        if opener is None:
+            opener = self._parity[epoch] = ParityOpener(self._secret(epoch), *self._ends)
+        return opener
+
+    def _secret(self, epoch: int) -> bytes:
+        secret = self._secrets.get(epoch)
+        if secret is None:
+            raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
+        return secret
 
 
 def _checked(secrets: Secrets) -> Secrets:

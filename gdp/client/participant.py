@@ -19,9 +19,9 @@ from gdp.client.control_keys import ControlKeys
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
-from gdp.client.reader_proxies import CALLS, TOPICS
+from gdp.client.reader_proxies import CALLS, TOPICS, ReaderProxies
 from gdp.client.request_streams import RequestStreams
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.client.timer_queue import TimerQueue
 from gdp.client.unicast_stream import Party, PeerIncarnation
@@ -151,10 +151,8 @@ class Participant:
     ) -> Publisher:
         """Publish a topic from now on; ``paths`` 2: each frame twice, over two disjoint paths where they exist."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
-        publisher = self._publications.add(
-            topic.name, topic.own_secrets, description,
-            reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options,
-        )  # fmt: skip
+        settings = PublisherSettings(reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options)
+        publisher = self._publications.add(topic.name, topic.own_secrets, description, settings)
         self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
         return publisher
 
@@ -231,13 +229,13 @@ class Participant:
 
     def connected_peers(self, service: Name) -> list[Name]:
         """Return all connected peers, those that do not keep up included; ``peers`` returns a subset."""
-        return self._peers(service, Publisher.is_read_by)
+        return self._peers(service, ReaderProxies.is_read_by)
 
     def silent_peers(self, service: Name) -> list[Name]:
         """Return the peers that have stopped reporting and may return, such as those behind a dead access point."""
-        return self._peers(service, Publisher.is_silent)
+        return self._peers(service, ReaderProxies.is_suspended)
 
-    def _peers(self, service: Name, fits: Callable[[Publisher, Name], bool]) -> list[Name]:
+    def _peers(self, service: Name, fits: Callable[[ReaderProxies, Name], bool]) -> list[Name]:
         """Return the peers with a live writer proxy whose state as readers of the service's publisher fits."""
         publisher = self._publications.get(service)
         if publisher is None:
@@ -245,7 +243,7 @@ class Participant:
         return [
             writer_proxy.publisher
             for writer_proxy in self.writer_proxies_of(service)
-            if writer_proxy.state is WriterProxyState.LIVE and fits(publisher, writer_proxy.publisher)
+            if writer_proxy.state is WriterProxyState.LIVE and fits(publisher.matched, writer_proxy.publisher)
         ]
 
     def withdraw(self, name: Name) -> None:
@@ -481,12 +479,10 @@ class Participant:
     ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
-        publisher = self._publications.add(
-            topic.name, topic.own_secrets, description,
-            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS, paths=paths,
-            options=options,
-        )  # fmt: skip
-        self._publications.enable_unicast(topic.name, topic.own_secrets, urgent=urgent, paths=paths, options=options)
+        patience = CALLS if right is Right.CALL else TOPICS
+        settings = PublisherSettings(urgent=urgent, patience=patience, paths=paths, options=options)
+        publisher = self._publications.add(topic.name, topic.own_secrets, description, settings)
+        self._publications.enable_unicast(topic.name, topic.own_secrets, settings)
         self._subscriptions.add(topic, right, self._now_s, paths, is_session=is_session)
         self._advertisement(topic, right, is_global=is_global, paths=paths, is_session=is_session)
         return publisher

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 from gdp.client.identities import WriterIdentity
@@ -14,9 +15,9 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.path_mtu import PathMtu
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.reader_proxies import CALLS, TOPICS, ReaderTimeouts
+from gdp.client.reader_proxies import TOPICS
 from gdp.client.request_streams import RequestStreams
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.timer_queue import TimerQueue
@@ -77,11 +78,11 @@ class Publications:
         what is kept for those that may come.
         """
         each_of = self._all_of(name)
-        return all((each.is_acknowledged() or not each.is_wanted) and not each.is_awaiting for each in each_of)
+        return all((each.is_acknowledged() or not each.is_wanted) and not each.queue.awaited for each in each_of)
 
     def unacknowledged(self, name: Name) -> int:
         """Return how many messages on a name some reader has not confirmed, or have not left if none does."""
-        return sum(each.messages - each.acknowledged for each in self._all_of(name) if each.is_wanted)
+        return sum(each.messages - each.acknowledgements.acknowledged for each in self._all_of(name) if each.is_wanted)
 
     def get(self, name: Name) -> Publisher | None:
         """Return the publisher of a name, or None."""
@@ -92,13 +93,7 @@ class Publications:
         name: Name,
         secrets: Secrets,
         description: bytes,
-        *,
-        reliable: bool,
-        depth: int = 0,
-        urgent: bool,
-        patience: ReaderTimeouts = TOPICS,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
+        settings: PublisherSettings,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
@@ -106,29 +101,15 @@ class Publications:
             source=self._source,
             secrets=secrets,
             description=description,
-            reliable=reliable,
-            depth=depth,
-            urgent=urgent,
+            settings=settings,
             past=self._sequence_registry.of(name),
-            patience=patience,
-            paths=paths,
             reader_paths=self._reader_paths,
-            options=options,
-            fastest_governs=patience is CALLS,
         )
         publisher.published = self.scheduler.add
         self._publishers[name] = publisher
         return publisher
 
-    def enable_unicast(
-        self,
-        name: Name,
-        secrets: Secrets,
-        *,
-        urgent: bool,
-        paths: int = 1,
-        options: SendOptions = DEFAULT_OPTIONS,
-    ) -> None:
+    def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
         self._requests[name] = RequestStreams(public, partial(self._stream_to, name), paths_to)
@@ -138,10 +119,8 @@ class Publications:
             secrets=secrets,
             sequence_registry=self._sequence_registry,
             published=self.scheduler.add,
-            urgent=urgent,
-            paths=paths,
+            settings=replace(settings, patience=TOPICS),
             reader_paths=self._reader_paths,
-            options=options,
         )
 
     def remove(self, name: Name) -> bool:
@@ -217,7 +196,7 @@ class Publications:
         """Note that a tree is installed, and its MTU."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.path > 1:
-            publisher.second_path_until_s = now_s + join.lease_s
+            publisher.governing_paths.second_until_s = now_s + join.lease_s
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
             mtu, is_split = path.receive_mtu(join.mtu, now_s), False
@@ -263,7 +242,7 @@ class Publications:
         streams, heard = self._private.get(service), self._heard(service, party)
         if streams is None or heard is None:
             raise LocalError(f"{party.short} is not heard on {service.short}")
-        return streams.stream(heard, self._publishers[service].mtu, now_s)
+        return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""
@@ -280,7 +259,7 @@ class Publications:
             if known is not None:
                 return known
             try:
-                return streams.stream(heard, self._publishers[service].mtu, now_s)
+                return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
             except LocalError as error:
                 raise StatementError(DropReason.QUOTA, "private streams") from error
         raise StatementError(DropReason.NOT_FOR_US)

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from gdp.congestion.controller import FIRST_RTT_S, PathController
+from gdp.congestion.delivery_rate import Flight
 from gdp.congestion.states import State
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 
@@ -49,11 +50,13 @@ class ReaderPath:
 
     def __init__(self, mtu: int, now_s: float) -> None:
         self._mtu = mtu
-        self._number = self._left = self.sent_bytes = 0
+        self.sent_bytes = 0
+        self.controller = PathController(mtu)
         self.restart(now_s)
 
     def restart(self, now_s: float) -> None:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
+        self.controller.forget_all()
         self.controller = PathController(self._mtu)
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
         self._late_reports = 0  # in a row
@@ -97,41 +100,33 @@ class ReaderPath:
         if self.controller.inflight < self.controller.limit:
             self.controller.app_limited()
 
-    def sent(self, size: int, frames: int, now_s: float) -> int:
-        """Count frames that leave at once; return the number under which they are confirmed."""
+    def sent(self, size: int, frames: int, now_s: float) -> Flight:
+        """Count frames that leave at once; return the flight as which they are confirmed."""
         if not self.controller.inflight:
             self._confirmed_s = now_s
             self._answered_s = self._answered_s if self._timeouts else now_s
-        self._number += 1
         self.sent_bytes += size
         self.may_probe = False
-        self.controller.sent(self._number, size, now_s, frames)
-        return self._number
+        return self.controller.sent(size, now_s, frames)
 
-    def frames_sent(self, now_s: float) -> None:
-        """Note that what was counted since the last call leaves now."""
-        for number in range(self._left + 1, self._number + 1):
-            self.controller.frames_sent(number, now_s)
-        self._left = self._number
-
-    def acknowledged(self, numbers: Iterable[int], lost: int, held_s: float | None, now_s: float) -> None:
+    def acknowledged(self, flights: Iterable[Flight], lost: int, held_s: float | None, now_s: float) -> None:
         """Take what a report confirms; ``lost`` of these frames did not arrive.
 
         Args:
             held_s: how long the reader held the report back; None: it gives no round trip.
         """
         before = self.controller.inflight
-        self.controller.acknowledged(numbers, now_s, held_s=held_s, lost=lost)
+        self.controller.acknowledged(flights, now_s, held_s=held_s, lost=lost)
         if self.controller.inflight < before:
             self._confirmed_s, self._has_probed = now_s, False
             if self.controller.rtt_s is not None:  # not one of before a timeout
                 self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.rtt_s, 0
 
-    def handle_part(self, number: int, held_s: float | None, now_s: float) -> None:
+    def handle_part(self, flight: Flight, held_s: float | None, now_s: float) -> None:
         """Note that a part of a flight came, which delays the timeout; ``held_s`` as in ``acknowledged``."""
         self._confirmed_s = now_s
         if held_s is not None:
-            self.controller.measure_first(number, now_s, held_s)
+            self.controller.measure_first(flight, now_s, held_s)
 
     def handle_held(self, held_s: float) -> None:
         """Note how long the newest frame of a report had waited at the reader when it left."""
@@ -308,7 +303,7 @@ class ReaderPaths:
     def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""
         for path in self._paths.values():
-            path.frames_sent(now_s)
+            path.controller.frames_sent(now_s)
 
     def handle_timer(self, now_s: float) -> bool:
         """Let silent paths start again, and forget unused ones; return whether any may carry more now."""

@@ -41,15 +41,18 @@ class ReaderTimeouts(NamedTuple):
 
     ``lag_s``: a reader that has not confirmed in this time what another has no longer blocks the window. ``quiet_s``: a
     reader that is silent for this time does not keep up. ``idle_s``: a live reader reports at least this often.
+    ``fastest_governs``: the first answer to a message counts, so readers on slower paths do not hold it back.
     """
 
     lag_s: float
     quiet_s: float
     idle_s: float
+    fastest_governs: bool = False
 
 
 TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
-CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
+# other replicas must not wait for a dead one
+CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S, fastest_governs=True)
 
 
 class _Incarnation:
@@ -109,7 +112,11 @@ class ReaderProxy:
 
 
 class ReaderProxies:
-    """Readers of one publisher, by name."""
+    """Readers of one publisher, by name.
+
+    Attributes:
+        is_reachable: a tree to them is installed.
+    """
 
     def __init__(self, topic: Name, source: WriterIdentity, patience: ReaderTimeouts = TOPICS) -> None:
         self._topic = topic
@@ -118,6 +125,7 @@ class ReaderProxies:
         self._readers: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
+        self.is_reachable = False
 
     def __len__(self) -> int:
         return len(self._readers)
@@ -130,6 +138,14 @@ class ReaderProxies:
 
     def __iter__(self) -> Iterator[bytes]:
         return iter(list(self._readers))
+
+    def is_read_by(self, name: bytes) -> bool:
+        """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
+        return self.is_reachable and name in self._readers
+
+    def reporting(self, now_s: float) -> list[bytes]:
+        """Return the readers to which a tree is installed; those that have missed reports come last."""
+        return sorted(self._readers, key=lambda name: self.is_quiet(name, now_s)) if self.is_reachable else []
 
     def names(self) -> list[bytes]:
         """Return the names of all, suspended ones included."""

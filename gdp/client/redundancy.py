@@ -11,16 +11,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import Final
 
-from gdp.frame.codec import NUMBER_AT, PARTS_AT
+from gdp.frame.codec import PARTS_AT
 from gdp.limits import SENDS_MAX
-from gdp.message.acknack import AckNack
-from gdp.message.frame_loss import FrameLoss, Readers
-from gdp.message.repeated_frames import REPEATED_PARTS_MAX
+from gdp.message.second_copies import REPEATED_PARTS_MAX
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["CopyBudget", "PathQuality", "Redundancy", "parity_budget", "sends_for"]
+__all__ = ["CopyBudget", "Redundancy", "parity_budget", "sends_for"]
 
 _OFFSETS_S: Final = (0.004, 0.007)  # of the second and the third sending after the first
 _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings leave at most 0.1 % undelivered
@@ -32,20 +30,7 @@ _PARITY_BYTES_S: Final = 125_000.0  # ... of a path of unknown rate: a tenth of 
 _LEAST_BYTES_S: Final = 8_000.0
 _BURST_S: Final = 0.25
 _RATE_CHANGE: Final = 0.1
-_NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
 _PARTS: Final = slice(PARTS_AT, PARTS_AT + 4)
-
-
-class PathQuality(Protocol):
-    """What is measured of the path to the readers."""
-
-    @property
-    def path_loss(self) -> float:
-        """Return the share of frames lost lately, 0 to 1; 0 also if nothing is measured."""
-
-    @property
-    def capacity_bytes_s(self) -> float | None:
-        """Return how many bytes a second the path carries; None: unknown."""
 
 
 class CopyBudget:
@@ -91,48 +76,44 @@ class Redundancy:
 
     Args:
         budget: of all publishers of the participant.
-        path: what is measured of the path, and not by the reports of the readers.
+        is_enabled: the frames are urgent, and their rule allows copies.
 
     Attributes:
-        is_enabled: the frames are urgent, and their rule allows copies.
+        is_enabled: as set.
         copies: frames that were sent again against loss.
     """
 
-    def __init__(self, *, budget: CopyBudget, path: PathQuality, is_enabled: bool) -> None:
+    def __init__(self, *, budget: CopyBudget, is_enabled: bool) -> None:
         self._budget = budget
-        self._path = path
         self.is_enabled = is_enabled
-        self._reported = FrameLoss()
         self._waiting = tuple(deque[tuple[float, bytes]]() for _ in _OFFSETS_S)
         self.copies = 0
 
-    def loss(self, readers: Readers, now_s: float) -> float | None:
-        """Return the share of frames lost on the way to ``readers``, 0 to 1; None: unknown."""
-        measured = self._reported.loss(readers, now_s), self._path.path_loss or None
-        return max((each for each in measured if each is not None), default=None)
+    def handle_sent(
+        self,
+        frames: Sequence[bytes],
+        loss: float | None,
+        path_bytes_s: float | None,
+        now_s: float,
+        *,
+        has_pair: bool = False,
+    ) -> None:
+        """Note DATA frames that leave now, and queue their copies.
 
-    def handle_sent(self, frames: Sequence[bytes], readers: Readers, now_s: float, *, has_pair: bool = False) -> None:
-        """Note DATA frames that leave now, and queue their copies; ``has_pair``: each leaves over two paths."""
-        if not self.is_enabled or not frames:
-            return
-        self._reported.handle_sent(int.from_bytes(frame[_NUMBER], "big") for frame in frames)
-        sends = sends_for(self.loss(readers, now_s))
+        Args:
+            loss: measured share of lost frames, 0 to 1; None: unknown.
+            path_bytes_s: what the path carries; None: unknown.
+            has_pair: each frame leaves over two paths.
+        """
+        sends = sends_for(loss)
         extra = (sends - 1) // 2 if has_pair else sends - 1
-        rate = self._path.capacity_bytes_s
         for waiting, offset_s in zip(self._waiting[:extra], _OFFSETS_S, strict=False):
             for frame in frames:
                 if int.from_bytes(frame[_PARTS], "big") > REPEATED_PARTS_MAX:
                     continue
-                if not self._budget.spend(now_s, len(frame), rate):
+                if not self._budget.spend(now_s, len(frame), path_bytes_s):
                     return
                 waiting.append((now_s + offset_s, frame))
-
-    def handle_report(self, reader: bytes, acknack: AckNack, *, is_new: bool) -> None:
-        """Process a reader's report; ``is_new``: the reader, or this incarnation of it, was unknown before."""
-        if is_new:
-            self._reported.forget(reader)
-        elif self.is_enabled and acknack.next_number:
-            self._reported.handle_report(reader, acknack.next_number, acknack.next_part, acknack.frames)
 
     def poll_copies(self, now_s: float) -> list[bytes]:
         """Remove and return the copies that are due."""
@@ -140,9 +121,7 @@ class Redundancy:
         for waiting in self._waiting:
             while waiting and waiting[0][0] <= now_s:
                 due.append(waiting.popleft()[1])
-        if due:
-            self._reported.handle_sent(int.from_bytes(frame[_NUMBER], "big") for frame in due)
-            self.copies += len(due)
+        self.copies += len(due)
         return due
 
     def get_timer(self) -> float | None:

@@ -58,7 +58,7 @@ class RequestStreams:
         Raises:
             LocalError: above the limits.
         """
-        servers, fits = self._paths.fastest_first(self._public.active_readers(now_s), len(message), now_s)
+        servers, fits = self._paths.fastest_first(self._public.matched.reporting(now_s), len(message), now_s)
         if len(servers) < 2 or (fits and not self._apart):
             self._public.publish(message)
             self._requests.setdefault(call, _Request(message)).copies.append(self._newest(self._public))
@@ -111,7 +111,9 @@ class RequestStreams:
 
     def _may_follow(self, request: _Request, now_s: float) -> bool:
         """Return whether the next copy may begin: those before have left, or the newest is late."""
-        if request.server is None or all(publisher.is_sent(sequence) for publisher, sequence in request.copies):
+        if request.server is None or all(
+            publisher.queue.sequences[0] > sequence for publisher, sequence in request.copies
+        ):
             return True
         if now_s < request.check_s:
             return False

@@ -1,4 +1,4 @@
-"""Send options of one topic: how fresh, how much and how often its messages leave.
+"""Settings of a publisher, and its send options: how fresh, how much and how often its messages leave.
 
 Sans-I/O.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
+from gdp.client.reader_proxies import TOPICS, ReaderTimeouts
 from gdp.errors import LocalError
 from gdp.limits import WINDOW_BYTES
 
@@ -19,8 +20,10 @@ __all__ = [
     "PRIORITIES",
     "RATE_MAX_BITS_S",
     "RATE_MIN_BITS_S",
+    "RELIABLE",
     "WEIGHT_MAX",
     "Priority",
+    "PublisherSettings",
     "SendOptions",
     "checked",
     "is_urgent",
@@ -89,6 +92,31 @@ def is_urgent(priority: Priority) -> bool:
 
 
 DEFAULT_OPTIONS: Final = SendOptions()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublisherSettings:
+    """Settings of a topic, or of all streams of a service.
+
+    Attributes:
+        reliable: readers acknowledge what they get, and lose nothing.
+        depth: how many messages late joiners get (0: none).
+        urgent: its frames go before those of other topics, wherever they queue.
+        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one. ``SPREAD``: large
+            messages are striped over both.
+        patience: timeouts of its readers.
+        options: how fresh, how much and how often its messages leave.
+    """
+
+    reliable: bool = True
+    depth: int = 0
+    urgent: bool = False
+    paths: int = 1
+    patience: ReaderTimeouts = TOPICS
+    options: SendOptions = DEFAULT_OPTIONS
+
+
+RELIABLE: Final = PublisherSettings()
 
 
 def checked(options: SendOptions) -> SendOptions:

@@ -19,7 +19,8 @@ from typing import Final
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.parity_sender import PARITY_BYTES, is_protected
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings, SendOptions
+from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
@@ -34,6 +35,9 @@ __all__ = ["SendQueue"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
+_RELIABLE: Final = int(Flag.RELIABLE)
+_LATCHED: Final = int(Flag.LATCHED)
+_URGENT: Final = int(Flag.URGENT)
 
 
 class SendQueue:
@@ -42,9 +46,8 @@ class SendQueue:
     Args:
         keys: seals the frames.
         window: caches the frames of a topic whose readers acknowledge.
-        next_number: number of the first message.
-        last_sequence: highest sequence number in use.
-        options: how fresh its best-effort messages leave.
+        settings: of the publisher.
+        past: last numbers of an earlier one.
 
     Attributes:
         is_acknowledged: readers acknowledge what they get (reliable or latched topics).
@@ -60,22 +63,15 @@ class SendQueue:
     """
 
     def __init__(
-        self,
-        *,
-        keys: KeyEpochs,
-        window: SendWindow,
-        next_number: int,
-        last_sequence: int,
-        options: SendOptions = DEFAULT_OPTIONS,
+        self, *, keys: KeyEpochs, window: SendWindow, settings: PublisherSettings, past: SequenceState
     ) -> None:
         self._keys = keys
         self._window = window
-        self.next_number = next_number
-        self.ledger = Ledger(last_sequence)
-        self.is_acknowledged = True
-        self.depth = 0
+        self._settings = settings
+        self.next_number = past.next_number
+        self.ledger = Ledger(past.sequence)
         self.awaited = 0
-        self.flags = 0
+        self._note_depth(settings.depth)
         self.mtu: int | None = None
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
@@ -83,7 +79,7 @@ class SendQueue:
         self._deferred = deque[tuple[int, bytes, float | None]]()  # (sequence number, message, since when)
         self._deferred_bytes = 0
         self._gathered = Gathered()
-        self.options = options
+        self.options = options = settings.options
         self.bytes_s: float | None = None
         self.has_parity = False
         self._best_effort = BestEffortQueue(options.deadline_s)
@@ -209,9 +205,15 @@ class SendQueue:
     def set_depth(self, depth: int) -> None:
         """Change how many messages are latched; what is beyond that is dropped."""
         self.seal_gathered()
-        self.depth = depth
+        self._note_depth(depth)
         self._window.set_history_depth(self.kept, self.next_number)
         self.drops[DropReason.NO_READER] += self._drop_deferred(self.kept)
+
+    def _note_depth(self, depth: int) -> None:
+        self.depth = depth
+        reliable, urgent = self._settings.reliable, self._settings.urgent
+        self.is_acknowledged = reliable or depth > 0
+        self.flags = _RELIABLE * reliable | _LATCHED * (depth > 0) | _URGENT * urgent
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""

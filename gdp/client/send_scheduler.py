@@ -88,22 +88,22 @@ class SendScheduler:
         """Count what the only publisher sent: after its frames have left, so that they need not wait for that."""
         publisher, self._uncounted = self._uncounted, None
         if publisher is not None:
-            publisher.count_sent()
+            publisher.sent_frames.count()
             if self._is_idle:
-                publisher.note_idle()
+                publisher.governing_paths.note_idle()
 
     def _poll_only(self, now_s: float) -> list[bytes]:
         """Return frames of the only publisher that waits, an ordinary one: it shares with no other."""
         (publisher,) = self._ordinary or self._new
-        publisher.path_share = 1.0
-        allowance = publisher.allowance(now_s)
+        publisher.governing_paths.share = 1.0
+        allowance = publisher.governing_paths.allowance(now_s)
         frames = publisher.poll_frames(now_s, min(allowance, self._at_once))
         self._asked(publisher)
         self._uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
         self._new.clear()
         self._ordinary = {publisher: 0} if allowance <= 0 or publisher.has_more else {}
         if self._ordinary and not frames:
-            self._held_until_s = _or_never(publisher.next_send_s(now_s)) if allowance <= 0 else _NEVER
+            self._held_until_s = _or_never(publisher.governing_paths.next_send_s(now_s)) if allowance <= 0 else _NEVER
         return frames
 
     def _poll_urgent(self, now_s: float) -> tuple[list[bytes], float]:
@@ -111,10 +111,10 @@ class SendScheduler:
         frames: list[bytes] = []
         due_s = _NEVER
         for publisher in sorted(self._urgent, key=lambda each: each.options.rank):
-            allowance = publisher.allowance(now_s)
+            allowance = publisher.governing_paths.allowance(now_s)
             frames += self._poll(publisher, min(allowance, self._at_once), now_s)
             if allowance <= 0:
-                due_s = min(due_s, _or_never(publisher.next_send_s(now_s)))
+                due_s = min(due_s, _or_never(publisher.governing_paths.next_send_s(now_s)))
             elif not publisher.has_more:
                 self._urgent.pop(publisher, None)
         return frames, due_s
@@ -127,12 +127,15 @@ class SendScheduler:
         total, least = sum(shares), min(shares, default=1)
         reserved = frozenset[bytes]()
         for publisher, left_of_round in list(self._ordinary.items()):
-            publisher.path_share = publisher.options.share / total
-            allowance = publisher.allowance(now_s)
-            is_reserved = bool(reserved) and publisher.has_any(reserved)
+            publisher.governing_paths.share = publisher.options.share / total
+            allowance = publisher.governing_paths.allowance(now_s)
+            is_reserved = bool(reserved) and any(name in publisher.matched for name in reserved)
             if allowance <= 0 or is_reserved:
                 frames += self._poll(publisher, 0, now_s)
-                due_s = min(due_s, self._reserved_until_s if is_reserved else _or_never(publisher.next_send_s(now_s)))
+                due_s = min(
+                    due_s,
+                    self._reserved_until_s if is_reserved else _or_never(publisher.governing_paths.next_send_s(now_s)),
+                )
                 reserved = reserved or self._reserve(publisher, now_s)
                 continue
             if publisher is self._reserving:
@@ -140,7 +143,7 @@ class SendScheduler:
             is_shared = allowance < left and len(self._ordinary) > 1
             deficit = left_of_round
             if is_shared and deficit <= 0:
-                deficit += _QUANTUM_FRAMES * publisher.options.share * (publisher.mtu or MTU_MIN_BYTES) // least
+                deficit += _QUANTUM_FRAMES * publisher.options.share * (publisher.queue.mtu or MTU_MIN_BYTES) // least
             polled = self._poll(publisher, min(allowance, deficit if is_shared else left), now_s)
             size = sum(map(len, polled))
             frames += polled
@@ -160,18 +163,18 @@ class SendScheduler:
     def _reserve(self, publisher: Publisher, now_s: float) -> frozenset[bytes]:
         """Reserve the paths of a publisher that has to wait for several; return its readers, or none."""
         is_its = publisher is self._reserving and now_s < self._reserved_until_s
-        if (not is_its and now_s < self._reserved_until_s + _RESERVED_S) or publisher.is_limited(now_s):
+        if (not is_its and now_s < self._reserved_until_s + _RESERVED_S) or publisher.governing_paths.is_limited(now_s):
             return frozenset()
-        if (readers := publisher.awaited_readers()) and not is_its:
+        if (readers := publisher.governing_paths.awaited_readers()) and not is_its:
             self._reserving, self._reserved_until_s = publisher, now_s + _RESERVED_S
         return readers
 
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
-        publisher.count_sent()
+        publisher.sent_frames.count()
         self._asked(publisher)
         if limit_bytes > 0 and not publisher.has_more and len(self._ordinary) + len(self._urgent) + len(self._new) == 1:
-            publisher.note_idle()  # the path could carry more than there is
+            publisher.governing_paths.note_idle()  # the path could carry more than there is
         return frames
 
 

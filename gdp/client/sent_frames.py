@@ -1,4 +1,4 @@
-"""Frames that one publisher has sent, until its readers' reports show what became of them.
+"""Ledger of the frames that one publisher has sent, until its readers' reports show what became of them.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
@@ -6,6 +6,10 @@ A report states how many frames its reader has received, and the newest of them.
 everything that left up to that frame has arrived or is lost, and the count shows how many are lost. Frames that leave
 at once form flights of at most ``_FLIGHT_FRAMES``; a flight is confirmed as a whole. A frame that is sent again gives
 no round trip, because its confirmation may be that of the first time (Karn's rule).
+
+Each frame is entered once, when it leaves. What a report shows of it is handed to the path of its reader
+(``reader_path.py``), to the check of receipts (``gdp/message/receipts.py``) and to the estimate of loss
+(``gdp/message/frame_loss.py``).
 """
 
 from __future__ import annotations
@@ -16,8 +20,10 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.congestion.delivery_rate import Flight
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.message.acknack import AckNack
+from gdp.message.frame_loss import FrameLoss
 from gdp.message.receipts import ReceiptCheck, samples_of
 
 __all__ = ["SentFrames"]
@@ -25,13 +31,6 @@ __all__ = ["SentFrames"]
 _FLIGHT_FRAMES: Final = 16
 _MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
-
-
-class _Flight(NamedTuple):
-    end: int  # count of frames sent up to its last one
-    frames: int
-    number: int  # on the reader's path
-    is_repair: bool  # all its frames were sent before
 
 
 class _Run(NamedTuple):
@@ -50,7 +49,7 @@ class _Run(NamedTuple):
 class _Reader:
     """What one reader has not confirmed yet."""
 
-    flights: deque[_Flight] = field(default_factory=deque)
+    flights: deque[Flight] = field(default_factory=deque)
     resolved: int = 0  # count of frames whose fate is known
     received: int = -1  # count in its latest report; -1: none yet
     newest: tuple[int, int] = (0, 0)  # message and fragment in its latest report
@@ -62,20 +61,37 @@ class _Reader:
 
 
 class SentFrames:
-    """Frames of one publisher under way to its readers.
+    """Ledger of the frames of one publisher.
 
     Args:
         paths: of the participant.
         counts_losses: frames keep their order; not so if they are striped over two paths.
+
+    Attributes:
+        loss: share of urgent frames lost, copies included.
+        last_s: when frames other than copies last left.
     """
 
     def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
         self._paths = paths
         self._counts_losses = counts_losses
+        self._leaving: tuple[Sequence[bytes], Sequence[bytes], float, int] | None = None
+        self.loss = FrameLoss()
+        self.last_s = float("-inf")
         self._readers: dict[bytes, _Reader] = {}
         self._count = 0
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
         self._uncounted: dict[int, set[int]] = {}  # fragments sent again to several readers: they give no round trip
+
+    def leave(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int) -> None:
+        """Note frames as in ``sent``; they are entered by ``count``, so that they need not wait for that."""
+        self._leaving = frames, names, now_s, again
+
+    def count(self) -> None:
+        """Enter the frames that left last."""
+        leaving, self._leaving = self._leaving, None
+        if leaving is not None:
+            self.sent(*leaving)
 
     def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
         """Count frames that leave now to the readers of these names; the first ``again`` of them were sent before.
@@ -115,8 +131,9 @@ class SentFrames:
                 path, reader = self._paths.path(name, now_s), self._readers.get(name)
                 if reader is None:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
-                number = path.sent(size, len(flight), now_s)
-                reader.flights.append(_Flight(count, len(flight), number, is_repair))
+                record = path.sent(size, len(flight), now_s)
+                record.place, record.is_repair = count, is_repair
+                reader.flights.append(record)
                 reader.receipts.sent(samples, is_repair=is_repair)
 
     def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
@@ -145,20 +162,22 @@ class SentFrames:
                 return run.place + part - run.first, run.is_repair or part in self._uncounted.get(number, ())
         return 0, False
 
-    def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
-        """Note over how many hops a reader's report came."""
-        path = self._paths.get(name)
-        if path is not None:
-            path.handle_hops(hops, now_s)
-
-    def handle_report(self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0) -> bool:
+    def handle_report(
+        self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0, hops: int | None = None
+    ) -> bool:
         """Confirm on the reader's path what a report shows, which came ``waited_s`` before.
 
-        Return whether its receipts prove fewer frames than it counts.
+        Args:
+            hops: that it had left when it came by the first path; None: it came by the second one.
+
+        Returns:
+            whether its receipts prove fewer frames than it counts.
         """
         is_unproven = False
         reader, path = self._readers.get(name), self._paths.get(name)
         if path is not None:
+            if hops is not None:
+                path.handle_hops(hops, now_s)
             if reader is not None and acknack.received:
                 is_unproven = self._confirm(reader, path, acknack, now_s, waited_s)
                 self._forget_places()
@@ -166,8 +185,8 @@ class SentFrames:
         return is_unproven
 
     def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> bool:
-        while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
-            reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
+        while reader.flights and not reader.flights[0].is_under_way:
+            reader.resolved, reader.partial = reader.flights.popleft().place, 0  # it was given up with a silence
         came = (acknack.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
         has_begun = reader.received < 0 or came > _COUNT_MASK // 2
         newest = acknack.newest, acknack.newest_part
@@ -179,17 +198,16 @@ class SentFrames:
             self._confirm_repairs(reader, path, 0 if has_begun else came, place, now_s)
         if not is_newer or place <= reader.resolved:  # what came now was given up before
             return False
-        before, numbers, reader.partial = reader.resolved, [], 0
-        while reader.flights and reader.flights[0].end <= place:
-            flight = reader.flights.popleft()
-            reader.resolved = flight.end
-            numbers.append(flight.number)
+        before, confirmed, reader.partial = reader.resolved, list[Flight](), 0
+        while reader.flights and reader.flights[0].place <= place:
+            confirmed.append(reader.flights.popleft())
+            reader.resolved = confirmed[-1].place
         if has_begun:
             reader.unseen, reader.lost = (place - acknack.received) & _COUNT_MASK, 0
         held_s = None if is_repair else acknack.held_us / 1e6 + waited_s
-        if not numbers:
-            if reader.flights and reader.flights[0].end - reader.flights[0].frames < place:  # a part of it came
-                path.handle_part(reader.flights[0].number, held_s, now_s)
+        if not confirmed:
+            if reader.flights and reader.flights[0].place - reader.flights[0].frames < place:  # a part of it came
+                path.handle_part(reader.flights[0], held_s, now_s)
             return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
@@ -200,7 +218,7 @@ class SentFrames:
         if is_unproven and held_s is not None:
             held_s = waited_s  # nor is it believed how long it held its report
         path.handle_held(acknack.held_us / 1e6)
-        path.acknowledged(numbers, max(min(judged, frames - 1), 0), held_s, now_s)
+        path.acknowledged(confirmed, max(min(judged, frames - 1), 0), held_s, now_s)
         return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:
@@ -214,12 +232,12 @@ class SentFrames:
         """
         is_over = not came and reader.partial > 0
         came += reader.partial
-        numbers, lost = list[int](), 0
+        confirmed, lost = list[Flight](), 0
         while reader.flights:
             flight = reader.flights[0]
-            size = flight.end - reader.resolved
+            size = flight.place - reader.resolved
             if not flight.is_repair and came and any(each.is_repair for each in reader.flights):
-                lost += flight.end - max(reader.resolved, place)
+                lost += flight.place - max(reader.resolved, place)
             elif not flight.is_repair and not reader.repairs:
                 came = 0
                 break
@@ -229,19 +247,19 @@ class SentFrames:
                 came, is_over = max(came - size, 0), False
                 reader.repairs -= 0 if flight.is_repair else min(size, reader.repairs)
             reader.flights.popleft()
-            reader.resolved = flight.end
-            numbers.append(flight.number)
+            reader.resolved = flight.place
+            confirmed.append(flight)
         reader.partial = came if reader.flights else 0
         reader.lost += lost
-        if numbers:
-            path.acknowledged(numbers, lost if self._counts_losses else 0, None, now_s)
+        if confirmed:
+            path.acknowledged(confirmed, lost if self._counts_losses else 0, None, now_s)
 
     def keep(self, readers: Iterable[bytes]) -> None:
         """Take off the account what is under way to other readers than these: it will not be confirmed."""
         for name in self._readers.keys() - set(readers):
             path, reader = self._paths.get(name), self._readers.pop(name)
             if path is not None:
-                path.controller.forget(flight.number for flight in reader.flights)
+                path.controller.forget(reader.flights)
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from gdp.client.delivery import Delivered
+from gdp.client.delivery import Delivered, Ended
 from gdp.client.identities import ReaderIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.unicast_stream import PeerIncarnation, UnicastReceiver, private_incarnation, private_name
-from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
+from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.control.query import Response
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
@@ -250,7 +250,7 @@ class Subscriptions:
                 subscription.set_advertisement(writer_proxy, advertisement)
                 return change
             if is_restarted:
-                writer_proxy.finish()
+                writer_proxy.delivery.finish()
             rest = [Message(response.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
@@ -311,7 +311,7 @@ class Subscriptions:
         subscription.writer_proxies[party] = writer_proxy
         subscription.set_advertisement(writer_proxy, advertisement)
         if subscription.right is Right.SERVE:
-            writer_proxy.idle_s = CALL_IDLE_S
+            writer_proxy.schedule.idle_s = CALL_IDLE_S
         if subscription.right is not Right.READ:
             stream = self._stream_from(subscription, writer_proxy)
             verifier = None if subscription.has_session(writer_proxy) else advertisement.member.key

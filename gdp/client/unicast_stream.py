@@ -19,13 +19,14 @@ import hashlib
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from gdp.client.delivery import Ended
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import PublisherSettings
 from gdp.client.sequence_numbers import SequenceState
-from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
+from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.crypto.session_seal import session_secret
 from gdp.errors import DropReason
 from gdp.frame.codec import Header
@@ -97,9 +98,8 @@ class UnicastStream(Publisher):
         writer: its source for all readers.
         mtu: smallest on the path; None if not known yet.
         past: of the same stream, if it was forgotten.
-        paths: over how many paths each frame is sent.
+        settings: of the service.
         reader_paths: what may leave to each reader node; shared by all publishers of a participant.
-        options: of the service.
     """
 
     def __init__(
@@ -110,12 +110,10 @@ class UnicastStream(Publisher):
         party: Party,
         secrets: Secrets,
         mtu: int | None,
-        urgent: bool,
+        settings: PublisherSettings,
         past: SequenceState,
         now_s: float,
-        paths: int = 1,
         reader_paths: ReaderPaths | None = None,
-        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self.reader = party.incarnation_id
         self._exchange = party.exchange
@@ -132,25 +130,22 @@ class UnicastStream(Publisher):
             source=source,
             secrets=secrets,
             description=b"",
-            reliable=True,
-            urgent=urgent,
+            settings=settings,
             past=past,
             address=self.reader.name,
-            paths=paths,
             reader_paths=reader_paths,
-            options=options,
         )
         self.note_second_path(party.second_path_s)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def note_second_path(self, came_s: float) -> None:
         """Note when a frame of the reader last came by a second path: copies to it go up the same tree."""
-        self.second_path_until_s = came_s + _SECOND_PATH_S
+        self.governing_paths.second_until_s = came_s + _SECOND_PATH_S
 
     def mark_in_use(self, now_s: float) -> None:
         """Note that the stream is in use; a silent reader becomes active."""
         self._touched_s = now_s
-        self.connect(*self.reader, self._exchange, now_s)
+        self.acknowledgements.connect(*self.reader, self._exchange, now_s)
 
     def renew(self, secrets: Secrets, now_s: float) -> None:
         """Replace the service's secrets."""
@@ -216,8 +211,8 @@ class UnicastReceiver(WriterProxy):
 
     def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
         """Process one DATA or HEARTBEAT frame of this writer; one that is refused is requested again."""
-        if self._public.state is WriterProxyState.NEW and self.delivered_bytes >= PRIVATE_WAIT_BYTES:
-            self.refuse(DropReason.MEMORY_FULL)
+        if self._public.state is WriterProxyState.NEW and self.delivery.delivered_bytes >= PRIVATE_WAIT_BYTES:
+            self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
             super().receive(header, frame, now_s, waited_s)
 

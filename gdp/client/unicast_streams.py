@@ -13,7 +13,7 @@ from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import RELIABLE, PublisherSettings
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, UnicastStream, private_name
 from gdp.errors import DropReason, LocalError
@@ -29,12 +29,10 @@ class UnicastStreams:
     """A server's streams to its clients, or a client's to its servers.
 
     Args:
-        urgent: whether their frames go before those that are not urgent.
-        pasts: last numbers of forgotten streams; shared by all publishers of this incarnation.
+        sequence_registry: last numbers of forgotten streams; shared by all publishers of this incarnation.
         published: called with each stream that has frames to send.
-        paths: over how many paths each frame is sent.
+        settings: of each stream.
         reader_paths: what may leave to each reader node; shared by all publishers of a participant.
-        options: of each stream.
     """
 
     def __init__(
@@ -45,10 +43,8 @@ class UnicastStreams:
         secrets: Secrets,
         sequence_registry: SequenceRegistry,
         published: Callable[[Publisher], None],
-        urgent: bool,
-        paths: int = 1,
+        settings: PublisherSettings = RELIABLE,
         reader_paths: ReaderPaths | None = None,
-        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self._service = service
         self._reader_paths = reader_paths
@@ -56,9 +52,7 @@ class UnicastStreams:
         self._secrets = secrets
         self._sequence_registry = sequence_registry
         self._published = published
-        self._urgent = urgent
-        self._paths = paths
-        self._options = options
+        self._settings = settings
         self._streams: dict[Name, UnicastStream] = {}  # by reader
         self._look_at_s = 0.0  # no stream is idle for long enough before
         self._drops: Counter[DropReason] = Counter()  # of closed streams
@@ -111,10 +105,8 @@ class UnicastStreams:
                 party=party,
                 secrets=self._secrets,
                 mtu=mtu,
-                urgent=self._urgent,
-                paths=self._paths,
+                settings=self._settings,
                 reader_paths=self._reader_paths,
-                options=self._options,
                 past=past,
                 now_s=now_s,
             )

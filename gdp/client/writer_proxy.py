@@ -5,12 +5,11 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 A writer proxy begins ``NEW``: it sends introductions until a Heartbeat brings its start and the description. When
 ``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and as fresh as repairs allow.
 
-It joins seven parts:
+It joins six parts:
 
 - ``gdp/message/reassembly.py``: reassembly of the fragments;
 - ``gdp/message/frame_recovery.py``: lost frames from parity;
-- ``reordering.py``: messages that wait behind a gap;
-- ``delivery.py``: messages in order, and losses;
+- ``delivery.py``: messages that wait behind a gap, messages in order, and losses;
 - ``gdp/message/late_repairs.py``: what is requested again of a best-effort topic, and how long that is awaited;
 - ``ack_nack_schedule.py``: when a report is due;
 - ``ack_nack_sealer.py``: the keys under which it is sealed.
@@ -18,19 +17,17 @@ It joins seven parts:
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from enum import Enum
-from typing import Final, NamedTuple
+from functools import partial
+from typing import Final
 
 from gdp.client.ack_nack_schedule import AckNackSchedule
 from gdp.client.ack_nack_sealer import AckNackSealer
-from gdp.client.delivery import Delivered, DeliveryQueue
+from gdp.client.delivery import NOT_BEGUN, Delivered, Delivery, Ended
 from gdp.client.identities import ReaderIdentity
-from gdp.client.key_epochs import Secrets
-from gdp.client.reordering import ReorderingBuffer
-from gdp.crypto.envelope import Opener
-from gdp.crypto.parity_seal import ParityOpener
+from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
 from gdp.frame.kinds import Flag, Kind
@@ -46,20 +43,18 @@ from gdp.limits import (
 )
 from gdp.message.acknack import FRAMES_MASK, AckNack, AckNackFlag, MissingRange
 from gdp.message.frame_recovery import FrameRecovery
-from gdp.message.heartbeat import Heartbeat, StreamStart
+from gdp.message.heartbeat import Heartbeat
 from gdp.message.late_repairs import LateRepairs
-from gdp.message.loss import Losses, LossReason
 from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
-from gdp.message.receipts import RECEIPTS_MASK, sum_of_samples
-from gdp.message.renumbering import Renumbering
+from gdp.message.receipts import RECEIPTS_MASK
 from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.message.striping import StripedPaths
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["Ended", "WriterProxy", "WriterProxyState"]
+__all__ = ["WriterProxy", "WriterProxyState"]
 
 ANNOUNCE_S: Final = 0.1
 _NEVER: Final = float("inf")
@@ -72,28 +67,6 @@ class WriterProxyState(Enum):
 
     NEW = "new"
     LIVE = "live"
-
-
-class Ended(NamedTuple):
-    """Where a writer proxy ended, for a later one of the same publisher: earlier frames are not opened again.
-
-    Args:
-        number: of the next message.
-        status: number of the newest Heartbeat seen.
-        sequence: of the next message.
-        known: the first sequence number of unknown fate: messages between the two were published, and did not arrive.
-        resumes: the writer proxy ended without its reader's will: what it misses meanwhile is lost, and requested
-            again.
-    """
-
-    number: int = 0
-    status: int = 0
-    sequence: int = 0
-    known: int = 0
-    resumes: bool = False
-
-
-_NOT_BEGUN: Final = Ended()
 
 
 class WriterProxy:
@@ -113,6 +86,10 @@ class WriterProxy:
     Attributes:
         advertisement: newest advertisement of the publisher.
         description: the publisher's description of its messages.
+        delivery: messages that wait or are ready, in order, and losses.
+        losses: which messages are known to be lost, and why.
+        recovery: lost frames that parity has restored.
+        schedule: when reports are due.
         second_path_s: when a frame of the publisher last came by a second path.
 
     Raises:
@@ -131,7 +108,7 @@ class WriterProxy:
         secrets: Secrets,
         budget: ReassemblyQuota,
         now_s: float,
-        ended: Ended = _NOT_BEGUN,
+        ended: Ended = NOT_BEGUN,
         restarted: bool = False,
         waits_since_s: float | None = None,
         introduces: bool = True,
@@ -141,15 +118,12 @@ class WriterProxy:
         self.topic = topic
         self.exchange = exchange
         self._reader = reader
-        self._secrets = secrets
-        self._is_signed = writer is not None
+        self._keys = Openers(secrets, publisher, incarnation, topic, is_signed=writer is not None)
         self._before = ended
         self._is_restarted = restarted
         self._waits_since_s = now_s if waits_since_s is None else waits_since_s
         self._described = 0  # number of the Heartbeat that brought it
-        self._openers: dict[tuple[int, int], Opener] = {}
-        self._parity_openers: dict[int, ParityOpener] = {}
-        self._recovery = FrameRecovery(publisher, budget)
+        self.recovery = FrameRecovery(publisher, budget)
         self._sealer = AckNackSealer(
             topic=topic,
             reader=reader,
@@ -161,22 +135,17 @@ class WriterProxy:
             now_s=now_s,
         )
         self._data = Reassembler(
-            publisher, lambda epoch: self._opener(Kind.DATA, epoch), writer, budget, head_bytes=SEQUENCE_BYTES
+            publisher, partial(self._keys.opener, Kind.DATA), writer, budget, head_bytes=SEQUENCE_BYTES
         )
-        self._status = Reassembler(publisher, lambda epoch: self._opener(Kind.HEARTBEAT, epoch), writer, budget)
-        self._schedule = AckNackSchedule(self._data, now_s)
-        self._order = ReorderingBuffer(publisher, budget)
-        self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
+        self._status = Reassembler(publisher, partial(self._keys.opener, Kind.HEARTBEAT), writer, budget)
+        self.schedule = AckNackSchedule(self._data, now_s)
         self._copies: SecondCopies | StripedPaths | None = None
-        self._gap_until_s = float("inf")  # best effort, two paths: until then the slower one may bring what is missing
-        self._gap_at = 0  # ... and the number that is missing
-        self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
         self._deferred = DeferredRequests()
-        self._received = 0  # verified DATA frames
-        self._receipts = 0  # the sum of the samples among them
-        self._newest = (0, -1, now_s)  # the highest of them: number, fragment, and when it came
-        self._late = LateRepairs(self._data, self._lag_s, self._recovery.awaited_s)
-        self._is_reliable: bool | None = None
+        self._late = LateRepairs(self._data, self._lag_s, self.recovery.awaited_s)
+        self.delivery = Delivery(
+            publisher, incarnation, budget, data=self._data, recovery=self.recovery, late=self._late, lag_s=self._lag_s
+        )
+        self.losses = self.delivery.losses
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
         self.description = b""
@@ -184,17 +153,10 @@ class WriterProxy:
         self.advertisement_sequence = 0
         self.second_path_s = float("-inf")
         if not introduces:
-            self._begin_at(max(ended.number, 1), max(ended.sequence, 1), now_s)
-
-    @property
-    def idle_s(self) -> float:
-        """Return the longest time between two reports."""
-        return self._schedule.idle_s
-
-    @idle_s.setter
-    def idle_s(self, idle_s: float) -> None:
-        """Set the longest time between two reports."""
-        self._schedule.idle_s = idle_s
+            self.state = WriterProxyState.LIVE
+            self._set_reliable(_WAITING)
+            self.delivery.begin_at(max(ended.number, 1), max(ended.sequence, 1))
+            self.schedule.due_s = now_s + REPORT_IDLE_S
 
     @property
     def paths(self) -> int:
@@ -218,57 +180,14 @@ class WriterProxy:
         return self._data.drops + self._status.drops
 
     @property
-    def is_best_effort(self) -> bool:
-        """Return whether the publisher has said that it repeats nothing for good."""
-        return self._is_reliable is False
-
-    @property
-    def delivered(self) -> int:
-        """Return how many messages were delivered."""
-        return self._delivery.delivered
-
-    @property
-    def delivered_bytes(self) -> int:
-        """Return the size of what was delivered."""
-        return self._delivery.delivered_bytes
-
-    @property
-    def recovered(self) -> int:
-        """Return how many lost frames parity has restored."""
-        return self._recovery.recovered
-
-    @property
-    def losses(self) -> Losses:
-        """Return which messages are known to be lost, and why."""
-        return self._delivery.losses
-
-    @property
-    def lost(self) -> int:
-        """Return how many messages are known to be lost."""
-        return self._delivery.losses.total
-
-    @property
     def ended(self) -> Ended:
         """Return where it ended, for a later one that continues after it."""
-        before, delivery = self._before, self._delivery
+        before, delivery = self._before, self.delivery
         status = max(self._status.window.top, before.status)
         if self.state is WriterProxyState.NEW:
             return before._replace(status=status)
-        number, known = max(self._order.expected, before.number), max(delivery.known, delivery.sequence)
+        number, known = max(self.delivery.expected, before.number), max(delivery.known, delivery.sequence)
         return Ended(number, status, delivery.sequence, known)
-
-    def finish(self) -> None:
-        """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""
-        if self.state is WriterProxyState.LIVE:
-            delivery = self._delivery
-            delivery.skipped = LossReason.PUBLISHER_RESTARTED
-            for reassembled in self._order.poll_all():
-                delivery.deliver(reassembled)
-            delivery.lose_until(delivery.known, LossReason.PUBLISHER_RESTARTED)
-
-    def refuse(self, reason: DropReason) -> None:
-        """Count a frame that is dropped unread."""
-        self._data.drops[reason] += 1
 
     def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
         """Process one DATA, HEARTBEAT or PARITY frame of this publisher, which came ``waited_s`` before."""
@@ -296,48 +215,35 @@ class WriterProxy:
                 second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
                 number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
-            self._recovery.keep_run(arrivals, at, taken, now_s)
-            self._schedule.count(taken * len(arrivals[at].frame))
-            self._received += taken
-            self._receipts += sum_of_samples(arrival.frame for arrival in arrivals[at : at + taken])
-            number, part = NUMBER_AND_PART.unpack_from(arrivals[at + taken - 1].frame, NUMBER_AT)
-            self._note_newest(number, part, now_s - arrivals[at + taken - 1].waited_s)
+            self.recovery.keep_run(arrivals, at, taken, now_s)
+            frames, last = [each.frame for each in arrivals[at : at + taken]], arrivals[at + taken - 1]
+            number, part = NUMBER_AND_PART.unpack_from(last.frame, NUMBER_AT)
+            self.schedule.count(taken * len(last.frame), frames, number, part, now_s - last.waited_s)
             if self.state is WriterProxyState.LIVE:
-                self._schedule.handle_run(now_s)
+                self.schedule.handle_run(now_s)
         return taken
 
     def handle_timer(self, now_s: float) -> None:
         """Drop what waited too long for its fragments, and go on without what neither path brought (best effort)."""
-        is_final = self.state is WriterProxyState.LIVE and not self._is_reliable
-        while self._held and self._held[0][0] <= now_s:
-            self._apply_progress(self._held.popleft()[1], now_s)
-        is_released = self._late.give_up(now_s)
-        if self._gap_until_s <= now_s:
-            numbers = self._order.numbers
-            if numbers and numbers[0] < self._late.hold(numbers, now_s):
-                self._skip_to(numbers[0])
-            self._deliver(now_s)
-        elif is_released:
-            self._deliver(now_s)
+        is_final = self.state is WriterProxyState.LIVE and not self.delivery.is_reliable
+        self.delivery.handle_timer(now_s)
         self._data.drop_expired(now_s, for_good=is_final)
         self._status.drop_expired(now_s, for_good=False)
-        self._recovery.drop_expired(now_s)
+        self.recovery.drop_expired(now_s)
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
         expiries = [self._status.next_expiry(), self._data.next_expiry()]
-        held_s = self._held[0][0] if self._held else float("inf")
-        due_s = min(self._schedule.due_s, self._gap_until_s, held_s, self._late.get_timer())
-        due_s = min(due_s, self._recovery.next_expiry())
+        due_s = min(self.schedule.due_s, self.delivery.get_timer(), self._late.get_timer(), self.recovery.next_expiry())
         return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def is_report_due(self, now_s: float) -> bool:
         """Return whether ``control_to_send`` has a report now."""
-        return now_s >= self._schedule.due_s or self._late.is_due(now_s)
+        return now_s >= self.schedule.due_s or self._late.is_due(now_s)
 
     def control_to_send(self, now_s: float) -> list[bytes]:
         """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""
-        schedule = self._schedule
+        schedule = self.schedule
         late = self._late.poll_missing(now_s) if self._late.is_due(now_s) else ()
         if now_s < schedule.due_s and not late:
             return []
@@ -348,78 +254,54 @@ class WriterProxy:
             waited_us = max(round((now_s - self._waits_since_s) * 1e6), 0)
             acknack = AckNack(AckNackFlag.NEW, number, 0, (), sequence, held_us=waited_us)
             return self._over_paths(self._sealer.seal_first(acknack))
-        missing, awaited_s = self._missing(now_s) if self._is_reliable else ((), _NEVER)
-        if (self._copies is not None or self._data.repeats.copies) and self._is_reliable:
+        missing, awaited_s = self._missing(now_s) if self.delivery.is_reliable else ((), _NEVER)
+        if (self._copies is not None or self._data.repeats.copies) and self.delivery.is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
         schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
-        expected = self._order.expected
-        part, sequence = self._data.progress(expected), self._delivery.sequence
+        expected = self.delivery.expected
+        part, sequence = self._data.progress(expected), self.delivery.sequence
         share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
-        newest, newest_part, came_s = self._newest
+        newest, newest_part, came_s = schedule.newest
         acknack = AckNack(
-            AckNackFlag.NONE, expected, part, missing or late, sequence, self.lost, share,
-            self._received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
-            (self._data.frames - self._recovery.recovered) & FRAMES_MASK, self._receipts & RECEIPTS_MASK,
+            AckNackFlag.NONE, expected, part, missing or late, sequence, self.losses.total, share,
+            schedule.received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
+            (self._data.frames - self.recovery.recovered) & FRAMES_MASK, schedule.receipts & RECEIPTS_MASK,
         )  # fmt: skip
         return self._over_paths(self._sealer.seal_all(acknack, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
         """Remove and return the messages that are ready, in order."""
-        return self._delivery.poll()
+        return self.delivery.poll()
 
     def close(self) -> list[bytes]:
         """Release all memory; return the frames of the goodbye."""
         self._data.close()
         self._status.close()
-        self._recovery.close()
-        self._order.poll_all()
+        self.recovery.close()
+        self.delivery.close()
         self._late.close()
-        self._schedule.due_s = self._gap_until_s = float("inf")
-        self._held.clear()
-        acknack = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
+        self.schedule.due_s = _NEVER
+        delivery, expected = self.delivery, self.delivery.expected
+        acknack = AckNack(AckNackFlag.BYE, expected, 0, (), delivery.sequence, self.losses.total)
         return self._over_paths([self._sealer.seal(acknack)])
 
     def renew(self, secrets: Secrets) -> None:
         """Replace the topic's secrets; an epoch that is still among them opens as before."""
-        self._secrets = secrets
-        self._openers.clear()
-        self._parity_openers.clear()
+        self._keys.renew(secrets)
         self._sealer.renew(secrets)
-
-    def _note_newest(self, number: int, part: int, came_s: float) -> None:
-        """Note a fragment, unless it is a repair: a later one came before."""
-        if (number, part) > self._newest[:2]:
-            self._newest = number, part, came_s
 
     def _over_paths(self, notes: list[bytes]) -> list[bytes]:
         """Return notes, and their second copies if there are two paths."""
         return notes if self._copies is None else [*notes, *map(second_path_copy, notes)]
-
-    def _opener(self, kind: Kind, epoch: int) -> Opener:
-        opener = self._openers.get((kind, epoch))
-        if opener is None:
-            secret = self._secrets.get(epoch)
-            if secret is None:
-                raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
-            ends = self.publisher, self.incarnation, self.topic
-            opener = Opener(secret, kind, *ends, is_signed=self._is_signed)
-            self._openers[kind, epoch] = opener
-        return opener
 
     def _handle_parity(self, header: Header, frame: bytes, now_s: float) -> None:
         """Restore what is lost, as far as parity suffices; it arrives now, and counts as lost on the way."""
         try:
             if self._data.window.is_finished(header.number):
                 raise EnvelopeError(DropReason.UNUSED_PARITY, "its message is complete")
-            opener = self._parity_openers.get(header.epoch)
-            if opener is None:
-                secret = self._secrets.get(header.epoch)
-                if secret is None:
-                    raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(header.epoch))
-                opener = ParityOpener(secret, self.publisher, self.incarnation, self.topic)
-                self._parity_openers[header.epoch] = opener
-            restored = self._recovery.add_parity(header, opener.open(header, frame), now_s)
+            body = self._keys.parity(header.epoch).open(header, frame)
+            restored = self.recovery.add_parity(header, body, now_s)
         except EnvelopeError as error:
             self._data.drops[error.reason] += 1
             return
@@ -429,7 +311,7 @@ class WriterProxy:
     def _handle_data(
         self, header: Header, frame: bytes, now_s: float, came_s: float, *, is_restored: bool = False
     ) -> None:
-        reassembler, expected = self._data, self._order.expected
+        reassembler, expected = self._data, self.delivery.expected
         if header.number > NUMBER_MAX:
             reassembler.drops[DropReason.MALFORMED] += 1
             return
@@ -448,61 +330,29 @@ class WriterProxy:
             second = int(header.hops_left & SECOND_PATH > 0)
             striped.handle_arrivals(header.number, 1 - second, second, now_s)
         if is_first:
-            if self._is_reliable is None:
+            if self.delivery.is_reliable is None:
                 self._set_reliable(header.flags)
-            self._schedule.count(header.length)
-            if is_restored:
-                self._recovery.recovered += 1
-            else:
-                self._received += 1
-                self._receipts += sum_of_samples((frame,))
+            self.recovery.recovered += is_restored
+            frames = () if is_restored else (frame,)
+            self.schedule.count(header.length, frames, header.number, header.part, came_s)
             if reassembled is None:
-                self._recovery.keep(header, frame, now_s)
-            self._note_newest(header.number, header.part, came_s)
+                self.recovery.keep(header, frame, now_s)
             if self.state is WriterProxyState.LIVE:
-                self._schedule.handle_part(header, highest, expected, now_s)
-                if reassembled is None and not self._is_reliable:
+                self.schedule.handle_part(header, highest, expected, now_s)
+                if reassembled is None and not self.delivery.is_reliable:
                     self._late.handle_part(header, now_s)
         if reassembled is not None:
-            self._recovery.forget(header.number)
-            if self.state is WriterProxyState.LIVE and not self._is_reliable:
+            self.recovery.forget(header.number)
+            if self.state is WriterProxyState.LIVE and not self.delivery.is_reliable:
                 self._late.handle_complete(reassembled.number, header.part, now_s)
             if striped is not None:
                 striped.handle_complete(reassembled.number)
                 if striped.has_news:
-                    self._schedule.due_s = min(self._schedule.due_s, now_s + REPORT_DELAY_S)
+                    self.schedule.due_s = min(self.schedule.due_s, now_s + REPORT_DELAY_S)
             self._sealer.handle_message(reassembled.number, header.epoch, now_s)
-            self._arrange(reassembled, now_s)
-        elif (
-            reassembler.drops[DropReason.MEMORY_FULL] > refused and self.state is WriterProxyState.LIVE and self._order
-        ):
-            self._delivery.skipped = LossReason.READER_MEMORY
-            # the memory behind the gap is exhausted: go on without the missing messages
-            self._skip_to(self._order.numbers[0])
-            self._deliver(now_s)
-
-    def _arrange(self, reassembled: ReassembledMessage, now_s: float) -> None:
-        """Order a complete message, and deliver the consecutive ones."""
-        order, delivery = self._order, self._delivery
-        skips = not self._is_reliable and self._lag_s() <= 0 and reassembled.number < self._late.hold((), now_s)
-        if self.state is WriterProxyState.LIVE and (skips or reassembled.number == order.expected):
-            if reassembled.number > order.expected:
-                self._skip_to(reassembled.number)
-            delivery.deliver(reassembled)
-            order.expected = reassembled.number + 1
-            self._deliver(now_s)
-        elif order.put(reassembled):
-            delivery.record_published(min(int.from_bytes(reassembled.head, "big"), NUMBER_MAX) + 1)
-            if not self._is_reliable:
-                self._deliver(now_s)
-        elif self.state is WriterProxyState.NEW:
-            self._data.drops[DropReason.MEMORY_FULL] += 1
-        else:
-            delivery.skipped = LossReason.READER_MEMORY
-            self._skip_to(reassembled.number)
-            delivery.deliver(reassembled)
-            order.expected += 1
-            self._deliver(now_s)
+            self.delivery.add(reassembled, now_s)
+        elif reassembler.drops[DropReason.MEMORY_FULL] > refused:
+            self.delivery.skip_gap(now_s)
 
     def _missing(self, now_s: float) -> tuple[tuple[MissingRange, ...], float]:
         """Return what is known to be missing, and the first second at which parity may no longer fill what else is.
@@ -513,11 +363,11 @@ class WriterProxy:
         due_s = _NEVER
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
-        for number in self._data.window.unfinished(self._order.expected, end):
+        for number in self._data.window.unfinished(self.delivery.expected, end):
             capacity = NACKS_PER_REPORT - len(missing)
             if capacity <= 0:
                 break
-            awaited_s = self._recovery.awaited_s(number, now_s)
+            awaited_s = self.recovery.awaited_s(number, now_s)
             if awaited_s > now_s:
                 due_s = min(due_s, awaited_s)
                 continue
@@ -540,101 +390,19 @@ class WriterProxy:
             start = status.starts.get(self._reader.name)
             if start is None or start.incarnation != self._reader.incarnation:
                 return
-            self._begin(status, start, is_latched=bool(reassembled.flags & _LATCHED))
+            is_latched = bool(reassembled.flags & _LATCHED)
+            self.delivery.begin(status, start, self._before, is_latched=is_latched, is_restarted=self._is_restarted)
+            self.state = WriterProxyState.LIVE
         if status.description and reassembled.number > self._described:
             self.description, self._described = status.description, reassembled.number
-        order, delivery = self._order, self._delivery
-        if is_newest:
-            delivery.gone = status.gone
         self._sent = max(self._sent, (status.sent_number, status.sent_part))
-        for move in status.moves:
-            if move.is_before(order.expected):
-                self._renumber(move)
-        lag_s = max(self._lag_s(), self._late.wait_s(status.oldest, now_s))
-        if self._is_reliable or lag_s <= 0:
-            self._apply_progress(status, now_s)
-        else:
-            self._held.append((now_s + lag_s, status))
-        self._schedule.due_s = now_s
-
-    def _apply_progress(self, status: Heartbeat, now_s: float) -> None:
-        """Go on where a Heartbeat says that nothing before will come, and count that as lost."""
-        order, delivery = self._order, self._delivery
-        otherwise = delivery.gap_reason
-        if status.oldest > order.expected:
-            self._skip_to(status.oldest)
-            delivery.lose_until(status.oldest_sequence, otherwise)
-        self._deliver(now_s)
-        if order.expected == status.sent_number:
-            delivery.lose_until(status.sent_sequence, otherwise)
-        delivery.record_published(status.sent_sequence)
-
-    def _begin(self, status: Heartbeat, start: StreamStart, *, is_latched: bool) -> None:
-        """Begin at the publisher's start, and count what came between that and the last message read before."""
-        before, delivery = self._before, self._delivery
-        expected = start.number
-        if before.resumes or not is_latched:
-            expected = max(start.number, before.number)
-        begun, why = start.confirmed, LossReason.READER_RESTARTED
-        if before.resumes and before.sequence:
-            begun, why = before.sequence, LossReason.DETACHED
-        elif self._is_restarted:
-            begun, why = 1, LossReason.PUBLISHER_RESTARTED
-        delivery.gone = status.gone if why is LossReason.DETACHED else ()
-        delivery.sequence = begun or start.sequence
-        delivery.lose_until(start.sequence, why)
-        delivery.gone = status.gone
-        delivery.sequence = max(start.sequence, before.sequence) if expected > start.number else start.sequence
-        self.state = WriterProxyState.LIVE
-        self._order.start_at(expected)
-        self._data.start_at(expected, self._order.numbers)
-
-    def _begin_at(self, number: int, sequence: int, now_s: float) -> None:
-        """Begin a reliable stream at a message, without a Heartbeat."""
-        self.state = WriterProxyState.LIVE
-        self._is_reliable = self._delivery.is_reliable = True
-        self._order.expected, self._delivery.sequence = number, sequence
-        self._data.start_at(number, ())
-        self._schedule.due_s = now_s + REPORT_IDLE_S
+        self.delivery.handle_heartbeat(status, now_s, is_newest=is_newest)
+        self.schedule.due_s = now_s
 
     def _set_reliable(self, flags: int) -> None:
-        self._is_reliable = self._delivery.is_reliable = bool(flags & _WAITING)
-        if self._is_reliable:
+        self.delivery.is_reliable = bool(flags & _WAITING)
+        if self.delivery.is_reliable:
             self._late.close()
-
-    def _renumber(self, move: Renumbering) -> None:
-        """Apply a renumbering, also to the messages that wait."""
-        if self._order.expected < move.first:
-            self._skip_to(move.first)
-        moved = self._order.renumber(move)
-        self._data.forget(self._order.expected)
-        for reassembled in moved:
-            if reassembled.number not in self._order and self._order.put(reassembled):
-                self._data.skip(reassembled.number)
-
-    def _skip_to(self, number: int) -> None:
-        """Accept that missing messages before ``number`` will not come."""
-        for reassembled in self._order.skip_to(number):
-            self._delivery.deliver(reassembled)
-        self._data.forget(number)
-        self._late.forget(number)
-        self._recovery.forget_below(number)
-
-    def _deliver(self, now_s: float) -> None:
-        order = self._order
-        gap_until_s, self._gap_until_s = self._gap_until_s, float("inf")
-        if self.state is WriterProxyState.NEW or not order:
-            return
-        for reassembled in order.consecutive():
-            self._delivery.deliver(reassembled)
-        if not order or self._is_reliable:
-            return
-        lag_s, free_to = self._lag_s(), self._late.hold(order.numbers, now_s)
-        if lag_s > 0:
-            is_same = self._gap_at == order.expected and now_s < gap_until_s < float("inf")
-            self._gap_at, self._gap_until_s = order.expected, gap_until_s if is_same else now_s + lag_s
-        elif free := [number for number in order.numbers if number < free_to]:
-            self._skip_to(free[-1] + 1)
 
     def _lag_s(self) -> float:
         """Return how long a copy may take to bring what the faster path, or the first frame, did not; 0: none comes."""

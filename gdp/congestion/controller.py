@@ -81,8 +81,8 @@ _TRIAL_S, _TRIAL_SHARE, _TRIAL_ROUNDS = 10.0, 0.8, 6
 class PathController:
     """Controller of one path.
 
-    Flights have numbers that ascend as they leave. A flight is one frame, or a few that leave at once. The caller
-    reports each flight that leaves, is confirmed, or is taken for lost, and asks ``next_send_s`` before it sends.
+    A flight is one frame, or a few that leave at once. The caller reports each flight that leaves, is confirmed, or is
+    taken for lost, and asks ``next_send_s`` before it sends.
 
     Args:
         mtu: bytes of a full frame.
@@ -92,6 +92,8 @@ class PathController:
         window: bytes that may be under way.
         inflight: bytes that are.
         limit: bytes that may be unconfirmed: those under way, and those that the reader has not reported yet.
+        rtt_s: smoothed round trip; None before the first one.
+        loss: share of frames that were lost lately, 0 to 1.
         confirmed_sent_s: when the newest flight left that was confirmed.
         due_s: monotonic second of the next frame by the pace alone.
         pacing_bytes_s: rate at which frames may leave; none is limited before the first round trip.
@@ -101,9 +103,10 @@ class PathController:
         self.state = State.STARTUP
         self._mtu = mtu
         self._rate = DeliveryRate()
-        self._flights: dict[int, Flight] = {}
+        self._flights: dict[Flight, None] = {}  # in the order in which they left
+        self._leaving: list[Flight] = []  # counted, and perhaps not sealed yet
         self.inflight = 0
-        self.due_s = self._changed_s = self._loss = 0.0
+        self.due_s = self._changed_s = self.loss = 0.0
         self.confirmed_sent_s = float("-inf")
         self._is_paced = False
         self.window = float(_FIRST_FRAMES * mtu)
@@ -113,7 +116,7 @@ class PathController:
     def _start(self) -> None:
         """Forget the path; the window begins no larger than it was, because another path may be as thin."""
         self.window = min(self.window, float(_FIRST_FRAMES * self._mtu))
-        self._srtt_s: float | None = None
+        self.rtt_s: float | None = None
         self._base = WindowedExtreme(is_lowest=True)
         self._standing = WindowedExtreme(is_lowest=True)
         self._highest = WindowedExtreme(is_lowest=False)
@@ -130,7 +133,7 @@ class PathController:
         self._recent = WindowedExtreme(is_lowest=False)
         self._peaks = WindowedExtreme(is_lowest=False)
         self._capacities = WindowedExtreme(is_lowest=False)
-        self._full_rounds = self._lossy_rounds = 0
+        self._full_rounds = self.lossy_rounds = 0
         self._probe_from_s = 0.0
         self._cubic: Cubic | None = None
         self._lost_until_s = 0.0
@@ -155,30 +158,20 @@ class PathController:
         return self._base.value(FIRST_RTT_S)
 
     @property
-    def rtt_s(self) -> float | None:
-        """Return the smoothed round trip; None before the first one."""
-        return self._srtt_s
-
-    @property
     def queue_s(self) -> float:
         """Return the standing queue of the path, in seconds."""
         return max(self._standing_s - self._empty_path_s, 0.0)
 
     @property
-    def loss(self) -> float:
-        """Return the share of frames that were lost lately, 0 to 1."""
-        return self._loss
-
-    @property
     def credit_s(self) -> float:
         """Return how much time of the pace a sender that was scheduled late may catch up with."""
-        return min(_CREDIT_SHARE * (self._srtt_s or 0.0), _CREDIT_MOST_S) if self._is_paced else 0.0
+        return min(_CREDIT_SHARE * (self.rtt_s or 0.0), _CREDIT_MOST_S) if self._is_paced else 0.0
 
     def _set_limits(self) -> None:
         """Compute what each sender asks for: after every event, because frames are more frequent."""
         self.limit = self.window + self.bytes_s * self._hold.value(0.0)
         gain = _PACING_STARTUP if self.state is State.STARTUP else _PACING
-        self.pacing_bytes_s = float("inf") if self._srtt_s is None else gain * self.window / self._standing_s
+        self.pacing_bytes_s = float("inf") if self.rtt_s is None else gain * self.window / self._standing_s
 
     @property
     def _standing_s(self) -> float:
@@ -196,18 +189,21 @@ class PathController:
             return None
         return self.due_s
 
-    def sent(self, number: int, size: int, now_s: float, frames: int = 1) -> None:
-        """Count a flight of so many bytes and frames, which leaves now."""
-        self._flights[number] = self._rate.sent(size, now_s, self.inflight, frames)
+    def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
+        """Count and return a flight of so many bytes and frames, which leaves now."""
+        flight = self._rate.sent(size, now_s, self.inflight, frames)
+        self._flights[flight] = None
+        self._leaving.append(flight)
         self.inflight += size
         self._was_used = self._was_used or self.inflight + self._mtu > self.window
         self.charge(size, now_s)
+        return flight
 
-    def frames_sent(self, number: int, now_s: float) -> None:
-        """Note when a flight really leaves: its frames are sealed after ``sent``."""
-        flight = self._flights.get(number)
-        if flight is not None:
+    def frames_sent(self, now_s: float) -> None:
+        """Note when the flights counted since the last call really leave: their frames are sealed after ``sent``."""
+        for flight in self._leaving:
             flight.sent_s = now_s
+        self._leaving.clear()
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take.
@@ -227,24 +223,24 @@ class PathController:
         self._rate.app_limited(self.inflight)
         self._is_paced = False
 
-    def acknowledged(self, numbers: Iterable[int], now_s: float, *, held_s: float | None = 0.0, lost: int = 0) -> None:
-        """Take an acknowledgement of one flight or many, in any order; unknown numbers are ignored.
+    def acknowledged(
+        self, flights: Iterable[Flight], now_s: float, *, held_s: float | None = 0.0, lost: int = 0
+    ) -> None:
+        """Take an acknowledgement of one flight or many, in any order; those not under way any more are ignored.
 
         Args:
             held_s: how long the reader held it back; None: it gives no round trip.
             lost: how many of the frames did not arrive.
         """
         newest, first_s, size, frames = None, now_s, 0, 0
-        for number in numbers:
-            flight = self._flights.pop(number, None)
-            if flight is None:
+        for flight in flights:
+            if not self._remove(flight):
                 continue
             size, frames, first_s = size + flight.size, frames + flight.frames, min(first_s, flight.sent_s)
             if newest is None or flight.sent_s > newest.sent_s:
                 newest = flight
         if newest is None:
             return
-        self.inflight -= size
         self.confirmed_sent_s = max(self.confirmed_sent_s, newest.sent_s)
         if newest.sent_s < self._changed_s:  # it says nothing about this path
             self._rate.acknowledged(newest, size, now_s, 0.0)
@@ -255,7 +251,7 @@ class PathController:
             self._hold.add(now_s, min(hold_s, _HOLD_MOST_S), now_s - _HOLD_WINDOW_S)
             self._measure_rtt(max(now_s - newest.sent_s - held_s, _LEAST_RTT_S), now_s)
         sample = self._rate.acknowledged(newest, size, now_s, self.base_rtt_s)
-        if self._srtt_s is None:  # it may be of what was given up before: nothing is known of the path yet
+        if self.rtt_s is None:  # it may be of what was given up before: nothing is known of the path yet
             return
         self._round_frames += frames
         self._reported_lost += lost
@@ -279,49 +275,47 @@ class PathController:
             self._end_round(sample, now_s)
         self._set_limits()
 
-    def measure_first(self, number: int, now_s: float, held_s: float) -> None:
+    def measure_first(self, flight: Flight, now_s: float, held_s: float) -> None:
         """Measure the first round trip by a part of a flight: the rest may be lost, and then nothing else does.
 
         Args:
             held_s: how long the reader held the report back.
         """
-        flight = self._flights.get(number)
-        if self._srtt_s is None and flight is not None and flight.sent_s >= self._changed_s:
+        if self.rtt_s is None and flight.is_under_way and flight.sent_s >= self._changed_s:
             self._measure_rtt(max(now_s - flight.sent_s - held_s, _LEAST_RTT_S), now_s)
             self._set_limits()
 
-    def lost(self, numbers: Iterable[int], now_s: float) -> None:
-        """Take frames that are taken for lost; unknown numbers are ignored."""
-        flights = [flight for number in numbers if (flight := self._flights.pop(number, None)) is not None]
+    def lost(self, flights: Iterable[Flight], now_s: float) -> None:
+        """Take flights that are taken for lost; those not under way any more are ignored."""
+        flights = [flight for flight in flights if self._remove(flight)]
         if not flights:
             return
-        self.inflight -= sum(flight.size for flight in flights)
         frames = sum(flight.frames for flight in flights)
         self._round_frames += frames
         self._note_loss(frames, frames)
         self._record_lost(frames, max(flight.sent_s for flight in flights), now_s)
         self._set_limits()
 
-    def forget(self, numbers: Iterable[int]) -> None:
+    def forget(self, flights: Iterable[Flight]) -> None:
         """Take flights off the account whose fate will not be known."""
-        for number in numbers:
-            flight = self._flights.pop(number, None)
-            if flight is not None:
-                self.inflight -= flight.size
+        for flight in flights:
+            self._remove(flight)
 
     def forget_before(self, sent_s: float) -> None:
-        """Take flights off the account that left before ``sent_s``; numbers ascend, so the oldest are first."""
-        old = takewhile(lambda each: each[1].sent_s < sent_s, self._flights.items())
-        self.forget([number for number, _ in old])
-
-    def is_under_way(self, number: int) -> bool:
-        """Return whether a flight is on the account."""
-        return number in self._flights
+        """Take flights off the account that left before ``sent_s``."""
+        self.forget(list(takewhile(lambda flight: flight.sent_s < sent_s, self._flights)))
 
     def forget_all(self) -> None:
         """Take everything under way off the account."""
-        self._flights.clear()
-        self.inflight = 0
+        self.forget(list(self._flights))
+
+    def _remove(self, flight: Flight) -> bool:
+        """Take a flight off the account; return whether it was on it."""
+        was_under_way, flight.is_under_way = flight.is_under_way, False
+        if was_under_way:
+            del self._flights[flight]
+            self.inflight -= flight.size
+        return was_under_way
 
     def timed_out(self, now_s: float) -> None:
         """Start again with two frames: nothing that is under way was confirmed."""
@@ -333,7 +327,7 @@ class PathController:
     def _note_loss(self, frames: int, lost: int) -> None:
         """Average the share of lost frames over about ``_LOSS_FRAMES``."""
         part = min(frames / _LOSS_FRAMES, 1.0)
-        self._loss += (lost / max(frames, 1) - self._loss) * part
+        self.loss += (lost / max(frames, 1) - self.loss) * part
 
     def _record_lost(self, frames: int, sent_s: float, now_s: float) -> None:
         """Count lost frames, the last of which left at ``sent_s``."""
@@ -357,11 +351,11 @@ class PathController:
         self._set_limits()
 
     def _measure_rtt(self, rtt_s: float, now_s: float) -> None:
-        self._srtt_s = rtt_s if self._srtt_s is None else self._srtt_s + (rtt_s - self._srtt_s) / 8
+        self.rtt_s = rtt_s if self.rtt_s is None else self.rtt_s + (rtt_s - self.rtt_s) / 8
         is_held = self.state in (State.COMPETITIVE, State.PROBE)  # the other flow hides the empty path
         self._base.add(now_s, rtt_s, float("-inf") if is_held else now_s - _BASE_WINDOW_S)
-        self._standing.add(now_s, rtt_s, now_s - self._srtt_s / 2)
-        self._highest.add(now_s, rtt_s, now_s - 4 * self._srtt_s)
+        self._standing.add(now_s, rtt_s, now_s - self.rtt_s / 2)
+        self._highest.add(now_s, rtt_s, now_s - 4 * self.rtt_s)
 
     def _note_queue(self, now_s: float) -> None:
         """Signal an empty queue at once."""
@@ -392,7 +386,7 @@ class PathController:
             self._drain()
         elif self.state is State.COMPETITIVE and self._cubic is not None:
             if may_grow:
-                self._cubic.acknowledged(size / self._mtu, now_s, self._srtt_s or FIRST_RTT_S)
+                self._cubic.acknowledged(size / self._mtu, now_s, self.rtt_s or FIRST_RTT_S)
             if now_s < self._claims_until_s:
                 self._cubic.raise_to(self._half_window() / self._mtu)
             self.window = self._cubic.window * self._mtu
@@ -425,7 +419,7 @@ class PathController:
         delivered = self._rate.delivered - self._round_delivered
         frames = self._round_frames
         is_lossy = frames >= _HEAVY_FRAMES and self._lost_frames > _SHRUNK_LOSS * frames
-        self._lossy_rounds = self._lossy_rounds + 1 if is_lossy and self.state is State.COMPETITIVE else 0
+        self.lossy_rounds = self.lossy_rounds + 1 if is_lossy and self.state is State.COMPETITIVE else 0
         if frames >= _HEAVY_FRAMES and self._lost_frames > _HEAVY_LOSS * frames and self.state is not State.COMPETITIVE:
             self._signal(Signal.PATH_FULL, now_s)
             self.window = max(min(self.window, _AFTER_HEAVY * delivered), float(_LEAST_FRAMES * self._mtu))
@@ -441,7 +435,7 @@ class PathController:
                 self._signal(Signal.QUEUE_STANDS, now_s)
             elif self._cubic is not None:
                 self._try_alone(sample, now_s)
-        elif self._lossy_rounds >= (_COLLAPSED_ROUNDS if self._has_collapsed() else _SHRUNK_ROUNDS):
+        elif self.lossy_rounds >= (_COLLAPSED_ROUNDS if self._has_collapsed() else _SHRUNK_ROUNDS):
             self._shrink(delivered * self._arrived, now_s)
         elif self.state is State.COMPETITIVE:
             is_full = self._was_alone and self._last_rate > _FULL_SHARE * self._capacity
@@ -467,7 +461,7 @@ class PathController:
         self._signal(Signal.PATH_SHRANK, now_s)
         for rates in self._rates, self._recent, self._peaks, self._capacities:
             rates.clear()
-        self._cubic, self._lossy_rounds = None, 0
+        self._cubic, self.lossy_rounds = None, 0
         self.window = max(_AFTER_HEAVY * delivered, float(_LEAST_FRAMES * self._mtu))
 
     def _try_alone(self, sample: RateSample | None, now_s: float) -> None:

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 __all__ = ["DeliveryRate", "Flight", "RateSample"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Flight:
-    """Frames under way that left at once, with the state of the path when they did; ``inflight`` includes them."""
+    """Frames of one stream that left at once, with the state of the path when they did; ``inflight`` includes them.
+
+    ``place`` counts the frames of its stream up to its last one. ``is_repair``: all its frames were sent before.
+    """
 
     size: int
     frames: int
@@ -24,6 +27,9 @@ class Flight:
     delivered_s: float
     is_app_limited: bool
     inflight: int
+    place: int = 0
+    is_repair: bool = False
+    is_under_way: bool = True
 
 
 @dataclass(frozen=True, slots=True)

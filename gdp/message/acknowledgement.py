@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.limits import READER_LEASE_S
-from gdp.message.retransmission import RepairAllowance
+from gdp.message.retransmission import repair_allowance
+from gdp.token_bucket import TokenBucket
 
 __all__ = ["ReaderPosition", "ReaderPositions"]
 
@@ -36,7 +37,7 @@ class ReaderPosition:
     last_progress_s: float
     mark_at: int
     mark_s: float
-    allowance: RepairAllowance = field(default_factory=RepairAllowance)
+    allowance: TokenBucket = field(default_factory=repair_allowance)
 
 
 class ReaderPositions:

@@ -34,14 +34,15 @@ class RoundTripEstimator:
     def handle_acknowledged(self, acked_at: int, now_s: float) -> None:
         """Finish the sample if its position is acknowledged."""
         if self._sample is not None and acked_at >= self._sample[0]:
-            self._update(now_s - self._sample[1])
+            self.add(now_s - self._sample[1])
             self._sample = None
 
     def discard_sample(self) -> None:
         """Discard the running sample: the acknowledgement of a retransmitted frame is ambiguous (Karn's rule)."""
         self._sample = None
 
-    def _update(self, sample_s: float) -> None:
+    def add(self, sample_s: float) -> None:
+        """Add a sample, in seconds."""
         if self.rtt_s is None:
             self.rtt_s, self.deviation_s = sample_s, sample_s / 2
             return

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from math import exp
 from typing import Final, Protocol
 
+from gdp.frame.codec import NUMBER_AT
 from gdp.message.acknack import FRAMES_MASK
 
 __all__ = ["FrameLoss", "Readers"]
@@ -22,6 +23,7 @@ _MEMORY_FRAMES: Final = 1_000
 _LEAST_FRAMES: Final = 64  # before this many were reported, nothing is known
 _MARKS_MAX: Final = 16_384  # message numbers whose place among the sent frames is remembered
 _REFRESH_S: Final = 0.1
+_NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
 _BACKWARDS: Final = FRAMES_MASK >> 1  # a larger step is a count that began again
 
 
@@ -55,10 +57,11 @@ class FrameLoss:
         self._is_stale = False
         self._next_s = float("-inf")
 
-    def handle_sent(self, numbers: Iterable[int]) -> None:
-        """Count frames that leave now, by their message numbers; those of copies and repairs are lower than others."""
+    def handle_sent(self, frames: Iterable[bytes]) -> None:
+        """Count DATA frames that leave now; the message numbers of copies and repairs are lower than others."""
         marks = self._numbers
-        for number in numbers:
+        for frame in frames:
+            number = int.from_bytes(frame[_NUMBER], "big")
             if not marks or number > marks[-1]:
                 marks.append(number)
                 self._sent_before.append(self._sent)

@@ -65,6 +65,7 @@ class FrameRecovery:
 
     Attributes:
         recovered: frames that were rebuilt, and fit.
+        unfinished_bytes: memory that the kept frames hold.
     """
 
     def __init__(self, source: bytes, budget: ReassemblyQuota) -> None:
@@ -72,14 +73,9 @@ class FrameRecovery:
         self._budget = budget
         self._is_enabled = erasure.is_available()
         self._messages: dict[int, _Protected] = {}
-        self._held_bytes = 0
+        self.unfinished_bytes = 0
         self.recovered = 0
         budget.register(self, source)
-
-    @property
-    def unfinished_bytes(self) -> int:
-        """Return how much memory the kept frames hold."""
-        return self._held_bytes
 
     def give_way(self) -> None:
         """Forget the message that is needed last, because reassembly needs the memory."""
@@ -228,14 +224,14 @@ class FrameRecovery:
 
     def _reserve(self, message: _Protected, size: int) -> bool:
         cost = size + _OVERHEAD_BYTES
-        if self._held_bytes + cost > RECOVERY_BYTES or not self._budget.reserve(self._source, cost):
+        if self.unfinished_bytes + cost > RECOVERY_BYTES or not self._budget.reserve(self._source, cost):
             return False
-        self._held_bytes += cost
+        self.unfinished_bytes += cost
         message.held_bytes += cost
         return True
 
     def _release(self, message: _Protected, size: int) -> None:
-        self._held_bytes -= size
+        self.unfinished_bytes -= size
         message.held_bytes -= size
         self._budget.release(self._source, size)
 

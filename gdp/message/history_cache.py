@@ -1,26 +1,40 @@
-"""History cache: the messages that a reliable writer can send again.
+"""History cache: the messages that a writer can send again, and when their fragments left.
 
-Sans-I/O. Source: HistoryCache of the RTPS specification (OMG DDSI-RTPS 2.5, section 8.2.2). Positions count bytes of
-frames from the first message on.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: HistoryCache of the RTPS specification (OMG DDSI-RTPS
+2.5, section 8.2.2). Positions count bytes of frames from the first message on.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import NamedTuple
 
 __all__ = ["CachedMessage", "HistoryCache"]
 
 
-class CachedMessage(NamedTuple):
-    """The frames of one message, and the position of its first byte."""
+@dataclass(slots=True, kw_only=True)
+class CachedMessage:
+    """One message, and what of it has left.
+
+    Attributes:
+        frames: all of them, or of a best-effort message those that have left.
+        begin_at: position of its first byte.
+        size: bytes of its frames.
+        added_s: when it was added.
+        until_s: when its repair comes too late.
+        batches: count of fragments sent, and when, after each batch of a best-effort message.
+        again_s: when a fragment was last sent again.
+    """
 
     frames: Sequence[bytes]
-    begin_at: int
-    size: int
-    added_s: float = 0.0  # monotonic
+    begin_at: int = 0
+    size: int = 0
+    added_s: float = 0.0
+    until_s: float = float("inf")
+    batches: list[tuple[int, float]] = field(default_factory=list)
+    again_s: dict[int, float] = field(default_factory=dict)
 
     @property
     def end_at(self) -> int:
@@ -47,14 +61,16 @@ class HistoryCache:
         age_s: a message stays for so many seconds at most; None: the depth alone counts.
         held_bytes: size of all frames.
         end_at: position behind the newest message.
+        repaired: how many of the messages were sent again, at least in part.
     """
 
-    def __init__(self, depth: int) -> None:
+    def __init__(self, depth: int = 0) -> None:
         self.depth = depth
         self.depth_bytes: int | None = None
         self.age_s: float | None = None
         self.held_bytes = 0
         self.end_at = 0
+        self.repaired = 0
         self.messages: OrderedDict[int, CachedMessage] = OrderedDict()
 
     def __bool__(self) -> bool:
@@ -67,7 +83,7 @@ class HistoryCache:
 
     def add(self, number: int, frames: Sequence[bytes], size: int, added_s: float = 0.0) -> None:
         """Add the newest message, of ``size`` bytes."""
-        self.messages[number] = CachedMessage(frames, self.end_at, size, added_s)
+        self.messages[number] = CachedMessage(frames=frames, begin_at=self.end_at, size=size, added_s=added_s)
         self.held_bytes += size
         self.end_at += size
 
@@ -75,7 +91,15 @@ class HistoryCache:
         """Remove and return a message. Raises ``KeyError``: it is not cached."""
         message = self.messages.pop(number)
         self.held_bytes -= message.size
+        self.repaired -= bool(message.again_s)
         return message
+
+    def note_repair(self, number: int, part: int, now_s: float) -> bytes:
+        """Note that a fragment is sent again now, and return it. Raises ``KeyError``: its message is not cached."""
+        message = self.messages[number]
+        self.repaired += not message.again_s
+        message.again_s[part] = now_s
+        return message.frames[part]
 
     def beyond_depth(self, now_s: float = 0.0) -> list[int]:
         """Return the numbers that no late joiner needs, oldest first."""

@@ -36,6 +36,7 @@ from typing import Final
 from gdp.frame.codec import Header
 from gdp.limits import NACKS_PER_REPORT, REPAIR_S, REPAIRS_ABOVE_PARTS, REPORT_DELAY_S, REPORT_GAP_S
 from gdp.message.acknack import MissingRange
+from gdp.message.flow_control import RoundTripEstimator
 from gdp.message.reassembly import SCAN_PARTS, Reassembler
 
 __all__ = ["HOLD_S", "LateRepairs"]
@@ -110,8 +111,7 @@ class LateRepairs:
         self._hold_s = _NEVER  # until when complete messages wait
         self._highest = -1  # number of the latest message that has begun
         self._unanswered = 0  # messages in a row
-        self._repair_s: float | None = None  # from a request to its repair, and its mean deviation
-        self._deviation_s = 0.0
+        self._repair = RoundTripEstimator()  # from a request to its repair
 
     def get_timer(self) -> float:
         """Return the monotonic second at which a request may be due, or a wait ends."""
@@ -261,14 +261,9 @@ class LateRepairs:
         for request in entry.requests:
             if request.first <= part < request.end and not request.is_answered:
                 request.is_answered = True
-                before_s = self._repair_s
+                before_s = self._repair.rtt_s
                 is_last = request.tries == 1 or (before_s is not None and now_s - request.last_s > _FASTEST * before_s)
-                sample_s = now_s - (request.last_s if is_last else request.first_s)
-                if before_s is None:
-                    self._repair_s, self._deviation_s = sample_s, sample_s / 2
-                else:
-                    self._deviation_s += (abs(sample_s - before_s) - self._deviation_s) / 4
-                    self._repair_s = before_s + (sample_s - before_s) / 8
+                self._repair.add(now_s - (request.last_s if is_last else request.first_s))
 
     def _poll_ranges(
         self, number: int, entry: _Incomplete, extent: tuple[int, int, float], limit: int, now_s: float
@@ -352,9 +347,10 @@ class LateRepairs:
 
     def _repeated_s(self, request: _Request) -> float:
         """Return when a request is repeated."""
-        if self._repair_s is None:
+        repair = self._repair
+        if repair.rtt_s is None:
             return request.last_s + REPORT_DELAY_S * (1 << request.tries - 1)
-        return request.last_s + max(self._repair_s + max(4 * self._deviation_s, _MARGIN_S), REPORT_DELAY_S)
+        return request.last_s + max(repair.rtt_s + max(4 * repair.deviation_s, _MARGIN_S), REPORT_DELAY_S)
 
     def _next_s(self, entry: _Incomplete) -> float:
         """Return when something of a message may be requested next."""

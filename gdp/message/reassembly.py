@@ -27,9 +27,8 @@ from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, 
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
-from gdp.message.repeated_frames import REPEATED_PARTS_MAX, RepeatedFrames
 from gdp.message.replay import ReplayWindow
-from gdp.message.second_copies import SecondCopies
+from gdp.message.second_copies import REPEATED_PARTS_MAX, RepeatedFrames, SecondCopies
 from gdp.message.striping import StripedPaths
 from gdp.sansio import ReceivedFrame
 
@@ -128,6 +127,7 @@ class Reassembler:
     Attributes:
         copies: delay of the second copies, of a source that sends each frame over two paths; None: it does not.
         repeats: copies of urgent frames over one path.
+        unfinished_bytes: memory that unfinished messages hold.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Reassembler:
         self._budget = budget
         self._patience_s = patience_s
         self._unfinished: dict[int, _PartialMessage] = {}
-        self._unfinished_bytes = 0
+        self.unfinished_bytes = 0
         budget.register(self, source)
         self.window = ReplayWindow()
         self.drops: Counter[DropReason] = Counter()
@@ -356,11 +356,6 @@ class Reassembler:
         """Return how many frames came that were new, or a copy against loss."""
         return self.new_parts + self.repeats.copies
 
-    @property
-    def unfinished_bytes(self) -> int:
-        """Return how much memory unfinished messages hold."""
-        return self._unfinished_bytes
-
     def give_way(self) -> None:
         """Drop the message that is needed last, because a stream that holds less needs the memory."""
         if self._unfinished:
@@ -369,11 +364,11 @@ class Reassembler:
 
     def _reserve_memory(self, size: int) -> bool:
         is_taken = self._budget.reserve(self._source, size, self)
-        self._unfinished_bytes += size if is_taken else 0
+        self.unfinished_bytes += size if is_taken else 0
         return is_taken
 
     def _release_memory(self, size: int) -> None:
-        self._unfinished_bytes -= size
+        self.unfinished_bytes -= size
         self._budget.release(self._source, size)
 
     def _free_space(self, number: int) -> bool:

@@ -13,32 +13,31 @@ __all__ = ["ReplayWindow"]
 
 
 class ReplayWindow:
-    """The last ``size`` message numbers of one incarnation; older ones count as finished."""
+    """The last ``size`` message numbers of one incarnation; older ones count as finished.
 
-    __slots__ = ("_bits", "_mask", "_size", "_top")
+    Attributes:
+        top: the highest finished number; -1 when there is none.
+    """
+
+    __slots__ = ("_bits", "_mask", "_size", "top")
 
     def __init__(self, size: int = REPLAY_WINDOW_MESSAGES) -> None:
         self._size = size
         self._mask = (1 << size) - 1
-        self._top = -1  # highest finished number
+        self.top = -1
         self._bits = 0  # bit i: number top - i is finished
-
-    @property
-    def top(self) -> int:
-        """Return the highest finished number; -1 when there is none."""
-        return self._top
 
     def is_finished(self, number: int) -> bool:
         """Return whether a message was finished, or is older than the window."""
-        behind = self._top - number
+        behind = self.top - number
         return behind >= 0 and (behind >= self._size or bool(self._bits >> behind & 1))
 
     def finish(self, number: int) -> None:
         """Mark a message as finished: opened, or given up for good."""
-        ahead = number - self._top
+        ahead = number - self.top
         if ahead > 0:
             self._bits = (self._bits << ahead | 1) & self._mask if ahead < self._size else 1
-            self._top = number
+            self.top = number
         elif -ahead < self._size:
             self._bits |= 1 << -ahead
 
@@ -47,14 +46,14 @@ class ReplayWindow:
 
         Each costs the same, however many finished ones lie between and however far apart the two bounds are.
         """
-        begin = max(begin, self._top - self._size + 1)
-        behind = self._top - begin
+        begin = max(begin, self.top - self._size + 1)
+        behind = self.top - begin
         if behind >= 0:
             holes = ~self._bits & (2 << behind) - 1
             while holes:
                 at = holes.bit_length() - 1
-                if self._top - at >= end:
+                if self.top - at >= end:
                     return
-                yield self._top - at
+                yield self.top - at
                 holes ^= 1 << at
-        yield from range(max(begin, self._top + 1), end)
+        yield from range(max(begin, self.top + 1), end)

@@ -42,6 +42,7 @@ class SendWindow:
         lag_s: how long a reader may block the window while others have acknowledged.
 
     Attributes:
+        readers: what each has acknowledged, and which block nothing.
         governing: the reader that alone governs what leaves; None: all do, and the slowest decides.
         evicted: messages removed from a full window before every reader had them.
     """
@@ -57,7 +58,7 @@ class SendWindow:
         self._budget_bytes = budget_bytes
         self._cache = HistoryCache(history_depth)
         self._flow = FlowControl()
-        self._readers = ReaderPositions(lag_s)
+        self.readers = ReaderPositions(lag_s)
         self._repairs = RetransmissionQueue()
         self._late_repairs = RetransmissionQueue()  # of readers that do not govern: they leave after what is new
         self._cancelled: set[int] = set()  # messages that were sent, and are not repaired
@@ -79,37 +80,19 @@ class SendWindow:
         """Return how many fragments were sent again."""
         return self._repairs.retransmissions + self._late_repairs.retransmissions
 
-    @property
-    def readers(self) -> int:
-        """Return how many readers are active."""
-        return len(self._readers.active)
-
-    def has_reader(self, reader: bytes) -> bool:
-        """Return whether a reader is active."""
-        return reader in self._readers.active
-
     def is_ahead(self, reader: bytes, number: int) -> bool:
         """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
-        position = self._readers.active.get(reader)
+        position = self.readers.active.get(reader)
         return position is not None and position.next_number > number
-
-    def is_suspended(self, reader: bytes) -> bool:
-        """Return whether a reader is suspended."""
-        return reader in self._readers.suspended
-
-    @property
-    def suspended(self) -> int:
-        """Return how many readers are suspended."""
-        return len(self._readers.suspended)
 
     def has_space(self) -> bool:
         """Return whether ``add`` would evict no message that a reader waits for."""
-        is_idle = bool(self._readers.suspended) and not self._readers.active
+        is_idle = bool(self.readers.suspended) and not self.readers.active
         return is_idle or self._cache.end_at - self._acked_at() < self._budget_bytes
 
     def is_acknowledged(self) -> bool:
         """Return whether every reader has everything, suspended ones included."""
-        has_all = all(each.next_number > self._newest for each in self._readers.suspended.values())
+        has_all = all(each.next_number > self._newest for each in self.readers.suspended.values())
         return has_all and self._acked_at() == self._cache.end_at
 
     @property
@@ -120,7 +103,7 @@ class SendWindow:
     @property
     def acknowledged(self) -> int:
         """Return the highest message number that every reader, suspended or not, has acknowledged."""
-        return min(self._readers.least(), self._newest + 1) - 1
+        return min(self.readers.least(), self._newest + 1) - 1
 
     def first_since(self, since_s: float) -> int | None:
         """Return the number of the first cached message that was added since a second, or None."""
@@ -157,7 +140,7 @@ class SendWindow:
             if self._cache.held_bytes + size <= self._budget_now():
                 break
             oldest = next(iter(self._cache.messages))
-            if oldest >= self._readers.least():
+            if oldest >= self.readers.least():
                 evicted.append(oldest)
             self._release(oldest)
         self.evicted += len(evicted)
@@ -211,7 +194,7 @@ class SendWindow:
         self._flow.round_trip.discard_sample()
         for number, each, size in frames:
             self.add(number, each, size, ages_s.get(number))
-        positions = self._readers.all()
+        positions = self.readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
         self._skip_received()
@@ -223,28 +206,16 @@ class SendWindow:
         """Make a reader active from a message on."""
         message = self._cache.messages.get(first_number)
         acked_at = min(message.begin_at, self._sent_at) if message else self._sent_at
-        self._readers.add(reader, acked_at, first_number, now_s)
+        self.readers.add(reader, acked_at, first_number, now_s)
 
     def drop_reader(self, reader: bytes) -> None:
         """Remove a reader, and release what was cached for it alone."""
-        if self._readers.remove(reader):
+        if self.readers.remove(reader):
             self._release_acknowledged()
-
-    def suspend(self, reader: bytes) -> None:
-        """Suspend a silent reader: it blocks nothing, but what it lacks stays cached while the budget allows."""
-        self._readers.suspend(reader)
-
-    def resume(self, reader: bytes, now_s: float) -> None:
-        """Reactivate a suspended reader at its position."""
-        self._readers.resume(reader, now_s)
 
     def slow_readers(self, now_s: float) -> list[bytes]:
         """Return the active readers that must no longer block the window."""
-        return self._readers.slow(self._sent_at, now_s)
-
-    def next_slow_reader(self) -> float | None:
-        """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
-        return self._readers.next_slow()
+        return self.readers.slow(self._sent_at, now_s)
 
     def handle_acknack(self, reader: bytes, acknack: AckNack, now_s: float, trip_s: float = 0.0) -> None:
         """Process the report of a known reader: release what all have, and queue repairs.
@@ -255,20 +226,20 @@ class SendWindow:
         self._now_s = now_s
         message = self._cache.messages.get(acknack.next_number)
         position = message.position(acknack.next_part) if message else self._cache.begin_of(acknack.next_number)
-        suspended = self._readers.suspended.get(reader)
+        suspended = self.readers.suspended.get(reader)
         if suspended is not None:
-            if self._readers.active and position < self._acked_at():  # the others must not wait for it
+            if self.readers.active and position < self._acked_at():  # the others must not wait for it
                 suspended.next_number = max(suspended.next_number, acknack.next_number)
                 self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()
                 return
             suspended.acked_at = min(position, self._sent_at)
-            self.resume(reader, now_s)
-        state = self._readers.active[reader]
+            self.readers.resume(reader, now_s)
+        state = self.readers.active[reader]
         state.next_number = max(state.next_number, acknack.next_number)
         self._skip_received()
         before = self._acked_at()
-        self._readers.acknowledge(state, min(position, self._sent_at), now_s)
+        self.readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self._acked_at()
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
         self._request_repairs(reader, acknack, now_s, trip_s)
@@ -277,7 +248,7 @@ class SendWindow:
     @property
     def has_frames(self) -> bool:
         """Return whether something waits to be sent, or sent again; or no reader waits for it."""
-        return bool(self._unsent or self._repairs) or not self._readers.active
+        return bool(self._unsent or self._repairs) or not self.readers.active
 
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
@@ -289,12 +260,12 @@ class SendWindow:
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
         if self._unsent:
-            self._readers.reset_stall_timers(self._sent_at, now_s)
-            first_at = self._readers.first_at() if self.governing is not None else acked_at
+            self.readers.reset_stall_timers(self._sent_at, now_s)
+            first_at = self.readers.first_at() if self.governing is not None else acked_at
             frames += self._new_frames(first_at + self._flow.window_bytes, limit - len(frames))
-        if frames and not (self._repairs.has_repaired or self._late_repairs.has_repaired):
+        if frames and not self._cache.repaired:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
-        if not self._readers.active and not self._unsent:
+        if not self.readers.active and not self._unsent:
             self._release_acknowledged()
         return frames
 
@@ -314,25 +285,25 @@ class SendWindow:
         return self._flow.next_probe() if self._is_probing() else None
 
     def _is_probing(self) -> bool:
-        return bool(self._readers.active) and self._sent_at != self._acked_at()
+        return bool(self.readers.active) and self._sent_at != self._acked_at()
 
     def _acked_at(self) -> int:
-        return self._readers.acked_at(self._sent_at)
+        return self.readers.acked_at(self._sent_at)
 
     def _repaired_frames(self, limit: int, now_s: float, repairs: RetransmissionQueue) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
         messages, acked_at = self._cache.messages, self._acked_at()
-        least = self._readers.least() if self._readers.suspended else 0
+        least = self.readers.least() if self.readers.suspended else 0
 
         def is_lacked(number: int, part: int) -> bool:
             return messages[number].position(part) >= acked_at or number >= least > 0
 
-        return repairs.frames_to_send(messages, limit, now_s, is_lacked)
+        return repairs.frames_to_send(self._cache, limit, now_s, is_lacked)
 
     def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
         frames: list[bytes] = []
-        least = self._readers.least_active() if self.governing is None else self._readers.most_active()
+        least = self.readers.least_active() if self.governing is None else self.readers.most_active()
         below = least + FLIGHT_MESSAGES_MAX
         while self._unsent and self._sent_at < may_reach and len(frames) < limit and self._unsent[0][0] < below:
             number, part = self._unsent[0]
@@ -352,27 +323,27 @@ class SendWindow:
 
     def _skip_received(self) -> None:
         """Do not send again, under its new number, what every active reader has received under its old one."""
-        least = min(self._readers.least_active(), self._sent_before) if self._readers.active else 0
+        least = min(self.readers.least_active(), self._sent_before) if self.readers.active else 0
         while self._unsent and self._unsent[0][0] < least:
             self._sent_at = self._cache.messages[self._unsent.popleft()[0]].end_at
-            for reader in self._readers.active.values():
+            for reader in self.readers.active.values():
                 reader.acked_at = max(reader.acked_at, self._sent_at)
 
     def _budget_now(self) -> int:
         """Return how many bytes may be cached: fewer if the oldest message is cached for suspended readers alone."""
-        oldest, readers = self._cache.oldest, self._readers
+        oldest, readers = self._cache.oldest, self.readers
         is_spare = len(self._cache.messages) > self._cache.depth
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
     def _request_repairs(self, reader: bytes, acknack: AckNack, now_s: float, trip_s: float) -> None:
         """Queue the fragments that a reader lacks."""
-        position = self._readers.active.get(reader) or self._readers.suspended[reader]
+        position = self.readers.active.get(reader) or self.readers.suspended[reader]
         is_late = self.governing not in (None, reader)
         (self._late_repairs if is_late else self._repairs).request(
             acknack.missing,
             position.allowance,
-            self._cache.messages,
+            self._cache,
             sent_at=self._sent_at,
             rtt_s=max(self._flow.round_trip.rtt_s or 0.0, trip_s),
             round_bytes=REPAIRS_MAX_BYTES,
@@ -380,9 +351,9 @@ class SendWindow:
         )
 
     def _release_acknowledged(self) -> None:
-        least = self._readers.least()
+        least = self.readers.least()
         for number in self._cache.beyond_depth(self._now_s):
-            is_unsent = self._readers.active and self._cache.messages[number].end_at > self._sent_at
+            is_unsent = self.readers.active and self._cache.messages[number].end_at > self._sent_at
             if number >= least or is_unsent:
                 break
             self._release(number)
@@ -394,7 +365,5 @@ class SendWindow:
             self._unsent.popleft()
 
     def _forget(self, number: int) -> CachedMessage:
-        self._repairs.forget(number)
-        self._late_repairs.forget(number)
         self._cancelled.discard(number)
         return self._cache.remove(number)

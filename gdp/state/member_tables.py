@@ -39,9 +39,9 @@ def participant_tables(state: MemberState) -> dict[str, TableSource]:
             peer(each.topic, each.publisher, "writer", each.state.name.lower()) for each in member.writer_proxies()
         ]
         readers = [
-            peer(each.topic, reader, "reader", "silent" if each.is_silent(reader) else "live")
+            peer(each.topic, reader, "reader", "silent" if each.matched.is_suspended(reader) else "live")
             for each in member.publishers()
-            for reader in each.reader_names()
+            for reader in map(Name, each.matched.names())
         ]
         return sorted(writers + readers, key=lambda row: (str(row["local"]), row["is"], row["peer"]))
 

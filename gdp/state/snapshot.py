@@ -156,9 +156,9 @@ def member_snapshot(member: Participant, flows: Iterable[Mapping[str, object]] =
     received: dict[str, dict[str, int]] = {}
     for proxy in islice(member.writer_proxies(), FLOWS_MAX):
         sums = received.setdefault(short_id(proxy.topic), {"messages": 0, "bytes": 0, "lost": 0, "publishers": 0})
-        sums["messages"] += proxy.delivered
-        sums["bytes"] += proxy.delivered_bytes
-        sums["lost"] += proxy.lost
+        sums["messages"] += proxy.delivery.delivered
+        sums["bytes"] += proxy.delivery.delivered_bytes
+        sums["lost"] += proxy.losses.total
         sums["publishers"] += 1
     shown, left = _split(flows, FLOWS_MAX)
     switch = member.attachment.switch

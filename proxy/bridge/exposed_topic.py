@@ -14,6 +14,7 @@ from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
 from gdp.limits import READER_LEASE_S
 from gdp.message.loss import LossReason
+from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.adaptation import adaptation_of
@@ -149,8 +150,8 @@ class ExposedTopic:
         publisher = self.publisher
         if publisher is None:
             return []
-        names = publisher.reader_names()
-        return [Party("reader", name.to_text(), is_silent=publisher.is_silent(name)) for name in names]
+        readers = publisher.matched
+        return [Party("reader", Name(each).to_text(), is_silent=readers.is_suspended(each)) for each in readers.names()]
 
     @property
     def profile(self) -> Qos | None:
@@ -221,13 +222,15 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if not publisher.is_wanted and not publisher.keeps_unread:
+        if not publisher.is_wanted and not publisher.queue.kept:
             traffic.unread += 1
             publisher.skip(LossReason.NO_READER, now_s)
             self._count(event)
             return
-        adaptation = self._adaptation
-        if adaptation is not None and not adaptation.may_send(publisher, now_s):
+        adaptation, path = self._adaptation, publisher.governing_paths
+        if adaptation is not None and not adaptation.may_send(
+            publisher.losses, publisher.acknowledgements.acknowledged, path.bytes_s, now_s
+        ):
             traffic.thinned += 1
             return
         if not publisher.has_space():

@@ -245,7 +245,7 @@ def _overlay(member: Participant, name: Name, right: Right, now: Timestamps) -> 
         "writers": len(proxies),
         "live": sum(each.state is WriterProxyState.LIVE for each in proxies),
         "absent": member.absent_writers(name),
-        "is_reliable": not any(each.is_best_effort for each in proxies),
+        "is_reliable": not any(each.delivery.is_reliable is False for each in proxies),
         "drops": drops,
     }
     if right in (Right.SERVE, Right.CALL):
@@ -268,13 +268,13 @@ def _exposed(flow: ExposedTopic, now: Timestamps) -> dict[str, object]:
     if publisher is not None:
         known |= {
             "readers": publisher.readers,
-            "sent": publisher.sent,
+            "sent": publisher.acknowledgements.sent,
             "lost": by_label(publisher.losses.counts),
             "is_reliable": publisher.confirms,
-            "mtu": publisher.mtu or 0,
-            "is_throttled": publisher.is_limited(now.mono_s),
+            "mtu": publisher.queue.mtu or 0,
+            "is_throttled": publisher.governing_paths.is_limited(now.mono_s),
         }
-        if (governing := publisher.governing_reader()) is not None:
+        if (governing := publisher.governing_paths.governing_reader()) is not None:
             reader, rtt_s, bytes_s = governing
             known |= {
                 "governing": reader.to_text(),

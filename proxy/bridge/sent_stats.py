@@ -40,7 +40,8 @@ class SentStats:
     def of(cls, topic: str, publisher: Publisher) -> SentStats:
         """Return the statistics of a publisher at this moment."""
         dropped = publisher.losses.by_label()
-        return cls(topic, publisher.messages, publisher.sent, dropped, publisher.readers, publisher.reader_lost)
+        confirmed = publisher.acknowledgements
+        return cls(topic, publisher.messages, confirmed.sent, dropped, publisher.readers, confirmed.reader_lost)
 
     @property
     def is_whole(self) -> bool:

@@ -95,9 +95,9 @@ def proxy_sources(state: ProxyState) -> Sources:
         messages=traffic.messages,
         message_bytes=traffic.message_bytes,
         repairs=lambda: {
-            "sent": sum(publisher.repairs for publisher in member.publishers()),
-            "parity": sum(publisher.parity.sent for publisher in member.publishers()),
-            "recovered": sum(writer_proxy.recovered for writer_proxy in member.writer_proxies()),
+            "sent": sum(publisher.protection.repairs for publisher in member.publishers()),
+            "parity": sum(publisher.protection.parity.sent for publisher in member.publishers()),
+            "recovered": sum(writer_proxy.recovery.recovered for writer_proxy in member.writer_proxies()),
         },
         lost=lambda: by_label(member.lost()),
         unconfirmed=lambda: by_label(member.unconfirmed()),

@@ -154,7 +154,7 @@ class Replay:
     @property
     def confirmed(self) -> int:
         """Return the number of messages of reliable topics that every reader has confirmed."""
-        return sum(each.publisher.acknowledged for each in self.topics if each.publisher.confirms)
+        return sum(each.publisher.acknowledgements.acknowledged for each in self.topics if each.publisher.confirms)
 
     @property
     def sent_best_effort(self) -> int:
@@ -174,9 +174,9 @@ class Replay:
         """Return the reliable topics with unconfirmed messages."""
         publishers = [(each.topic, each.publisher) for each in self.topics]
         return [
-            Unconfirmed(topic, each.messages, each.acknowledged, _why(each), each.losses.by_label())
+            Unconfirmed(topic, each.messages, each.acknowledgements.acknowledged, _why(each), each.losses.by_label())
             for topic, each in publishers
-            if each.confirms and each.acknowledged < each.messages
+            if each.confirms and each.acknowledgements.acknowledged < each.messages
         ]
 
     def wait_for_readers(self, timeout_s: float) -> list[str]:
@@ -220,7 +220,7 @@ class Replay:
                 return False
         best_effort = [each.publisher for each in self.topics if not each.publisher.confirms]
         report_until_s = time.monotonic() + REPORT_S
-        self._node.runtime.run(lambda: all(each.is_reported() for each in best_effort), report_until_s)
+        self._node.runtime.run(lambda: all(each.acknowledgements.is_reported() for each in best_effort), report_until_s)
         return not self._node.runtime.is_stopped
 
     def _continue(self) -> bool:
@@ -249,7 +249,7 @@ def _why(publisher: Publisher) -> str:
     if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
         return "no reader"
     known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]
-    rest = publisher.messages - publisher.acknowledged - publisher.losses.total
+    rest = publisher.messages - publisher.acknowledgements.acknowledged - publisher.losses.total
     if rest > 0:
         known.append(f"{rest} not confirmed by a reader that {'lags' if publisher.readers else 'fell silent'}")
     return ", ".join(known)

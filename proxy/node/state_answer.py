@@ -47,7 +47,7 @@ def answer_for_proxy(state: ProxyState, bridge: Bridge) -> None:
 
     def holders(name: Name, _now_s: float) -> set[Name]:
         publishers = (each for each in member.publishers() if each.topic == name)
-        readers = {reader for each in publishers for reader in each.reader_names()}
+        readers = {reader for each in publishers for reader in map(Name, each.matched.names())}
         return readers | {each.publisher for each in member.writer_proxies_of(name)}
 
     answer_state(member.diagnostics, policy, gather, holders)

@@ -309,4 +309,4 @@ def test_reliable_messages_that_were_published_all_come_whatever_the_books_say_o
     flow.stream(200, 0.002, 5_000)
     assert books.network.run(20, lambda: flow.has(B, 200))
     (writer_proxy,) = books.world.members[B].writer_proxies_of(flow.topic.name)
-    assert (flow.numbers(B), writer_proxy.lost) == (list(range(200)), 0)
+    assert (flow.numbers(B), writer_proxy.losses.total) == (list(range(200)), 0)

@@ -57,7 +57,7 @@ def test_bundles_survive_loss_and_links_that_narrow() -> None:
     assert network.run(20, lambda: flow.has(SERVER, 10_000))
     network.run(2)
     assert flow.numbers(SERVER) == list(range(10_000))
-    assert flow.publisher.acknowledged == 10_000
+    assert flow.publisher.acknowledgements.acknowledged == 10_000
     flow.outlive()
 
 

@@ -26,4 +26,4 @@ def test_best_effort_images_cross_a_lossy_uplink_of_60_ms(loss: float, least: fl
     numbers = flow.numbers(READER)
     assert len([number for number in numbers if number >= 5]) >= least * 20  # the first ones measure the path
     assert numbers == sorted(set(numbers))
-    assert flow.publisher.repairs < 2 * 25 * 600 * loss
+    assert flow.publisher.protection.repairs < 2 * 25 * 600 * loss

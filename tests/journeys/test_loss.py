@@ -48,7 +48,7 @@ def test_who_is_away_within_the_grace_time_costs_a_reliable_topic_nothing(label:
     away(flow, label, away_s)
     assert_complete(flow)
     assert flow.numbers(READER) == list(range(flow.publisher.messages))
-    assert flow.publisher.acknowledged == flow.publisher.messages
+    assert flow.publisher.acknowledgements.acknowledged == flow.publisher.messages
 
 
 def test_a_publisher_that_was_alone_for_longer_still_has_what_its_reader_lacks() -> None:
@@ -62,7 +62,7 @@ def test_a_reader_that_was_away_for_longer_costs_what_both_ends_count() -> None:
     away(flow, READER, READER_LEASE_S + READER_GRACE_S + 5.0)
     assert_complete(flow)
     lost = flow.world.members[READER].losses_of(flow.topic.name)
-    assert lost.total == flow.publisher.messages - flow.publisher.acknowledged > 0
+    assert lost.total == flow.publisher.messages - flow.publisher.acknowledgements.acknowledged > 0
     assert lost.counts.keys() <= {LossReason.GIVEN_UP, LossReason.NO_READER}
 
 

@@ -75,7 +75,7 @@ class Camera:
 
     def recovered(self, reader: int = 0) -> int:
         """Return how many frames parity has restored at a reader."""
-        return sum(each.recovered for each in self.readers[reader].writer_proxies())
+        return sum(each.recovery.recovered for each in self.readers[reader].writer_proxies())
 
 
 def camera(*, fec: bool = True, reliable: bool = False, seed: int = 1, readers: int = 1) -> Camera:
@@ -140,7 +140,7 @@ def test_a_reliable_topic_delivers_everything_in_order_with_fewer_repairs() -> N
         made.cable.loss = 0.03
         made.stream(80, 0.15, JPEG_BYTES)
         assert list(made.came_s[0]) == list(range(80))
-        repairs.append(made.flow.publisher.repairs)
+        repairs.append(made.flow.publisher.protection.repairs)
         latest.append(made.in_time(20))
     assert repairs[1] < 0.4 * repairs[0]
     assert latest[1] > 0.9 > latest[0]
@@ -163,7 +163,7 @@ def test_a_reliable_bulk_transfer_is_not_slower_by_more_than_its_parity() -> Non
 def test_a_path_without_loss_carries_no_parity() -> None:
     made = camera()
     made.stream(60, 0.1, JPEG_BYTES)
-    assert made.bytes_of[Kind.PARITY] == made.recovered() == made.flow.publisher.parity.sent == 0
+    assert made.bytes_of[Kind.PARITY] == made.recovered() == made.flow.publisher.protection.parity.sent == 0
     assert made.in_time(5) == 1.0
 
 
@@ -191,7 +191,7 @@ def test_restored_frames_count_as_lost_for_the_measurement() -> None:
     made.cable.loss = 0.05
     made.stream(150, 0.1, JPEG_BYTES)
     assert made.recovered() > 100
-    assert 0.03 < made.flow.publisher.path_loss < 0.08
+    assert 0.03 < made.flow.publisher.governing_paths.loss < 0.08
 
 
 def test_each_of_several_readers_restores_what_it_lost_itself() -> None:

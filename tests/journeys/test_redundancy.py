@@ -124,7 +124,7 @@ def test_reliable_urgent_messages_come_in_time_and_are_hardly_ever_requested() -
     made.publish(2_000, 0.02)
     assert made.came == list(range(made.sent))
     assert len(made.late) <= 0.01 * made.sent  # later messages wait for the one that is repaired
-    assert made.flow.publisher.repairs <= 0.002 * made.sent
+    assert made.flow.publisher.protection.repairs <= 0.002 * made.sent
     assert made.alarms() == {}
 
 

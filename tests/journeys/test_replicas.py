@@ -163,15 +163,15 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
     world, client, (one,) = cluster(SERVERS[0])
     (public,) = one.member.writer_proxies_of(one.service)
     public.state = WriterProxyState.NEW  # as if its first Heartbeat had been lost
-    public._schedule.due_s = float("inf")
+    public.schedule.due_s = float("inf")
     messages = 40
     for number in range(messages):
         ask(client, one, bytes([number]) * 20_000)
     world.network.run(2)
     (private,) = [writer_proxy for writer_proxy in one.member.writer_proxies() if writer_proxy is not public]
-    assert len(private._delivery) * 20_000 <= PRIVATE_WAIT_BYTES + 20_000
+    assert private.delivery.delivered * 20_000 <= PRIVATE_WAIT_BYTES + 20_000
     assert private.drops[DropReason.MEMORY_FULL] > 0
-    public._schedule.due_s = world.network.now.mono_s
+    public.schedule.due_s = world.network.now.mono_s
     public.state = WriterProxyState.LIVE
     client.publish(b"?")
     assert work(world, one, until_s=5, have=messages + 1)
@@ -306,7 +306,7 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
     servers = [Party(world, f"{name}/proxy", Right.SERVE, answers=False) for name in names]
     client = Party(world, "robot/proxy", Right.CALL)
     assert meet(world, client, *servers)
-    client.stream.bundle_bytes = 0
+    client.stream.queue.bundle_bytes = 0
     uplink, branches = Tap("robot", "gateway"), [Tap("gateway", name) for name in names]
     world.network.taps += [uplink, *branches]
     for number in range(200):

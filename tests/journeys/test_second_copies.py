@@ -119,7 +119,7 @@ def test_what_one_path_loses_is_awaited_from_the_other_and_not_requested(reliabl
     made.publish(400, 3_000)
     made.at.world.network.run(1.0 + 400 * period_s)
     made.check_all_came()
-    assert made.flow.publisher.repairs == 0
+    assert made.flow.publisher.protection.repairs == 0
 
 
 def test_what_neither_path_brings_is_requested() -> None:
@@ -129,7 +129,7 @@ def test_what_neither_path_brings_is_requested() -> None:
     made.at.world.network.run(2.0 + 200 * PERIOD_S)
     assert made.flow.numbers(READER) == list(range(made.sent))
     assert made.reader.losses_of(made.flow.topic.name).total == 0
-    assert 0 < made.flow.publisher.repairs < 100
+    assert 0 < made.flow.publisher.protection.repairs < 100
 
 
 def test_a_reader_confirms_over_both_paths_and_its_reports_count_once() -> None:
@@ -145,7 +145,7 @@ def test_a_reader_confirms_over_both_paths_and_its_reports_count_once() -> None:
     made.at.world.network.run(2.0)
     second = [note for note in notes if note[HOPS_AT] & SECOND_PATH]
     assert len(notes) == 2 * len(second) > 0
-    assert made.flow.publisher.acknowledged == made.sent
+    assert made.flow.publisher.acknowledgements.acknowledged == made.sent
     assert made.flow.publisher.is_acknowledged()
     made.check_all_came()
 

@@ -265,7 +265,7 @@ def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_n
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=3)
     assert client.bodies() == [b"before", b"meanwhile", b"after"]
-    assert sum(writer_proxy.lost for writer_proxy in client.member.writer_proxies()) == 0
+    assert sum(writer_proxy.losses.total for writer_proxy in client.member.writer_proxies()) == 0
 
 
 def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it_lost() -> None:
@@ -281,7 +281,7 @@ def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=2)
     assert client.bodies() == [b"before", b"after"]
-    assert sum(writer_proxy.lost for writer_proxy in client.member.writer_proxies()) == 1
+    assert sum(writer_proxy.losses.total for writer_proxy in client.member.writer_proxies()) == 1
     outlive(world, client, server)
 
 
@@ -308,7 +308,7 @@ def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -
         for writer_proxy in client.member.writer_proxies()
         if writer_proxy not in client.member.writer_proxies_of(client.service)
     ]
-    writer_proxy._schedule.due_s = float("inf")  # it sends nothing any more
+    writer_proxy.schedule.due_s = float("inf")  # it sends nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")

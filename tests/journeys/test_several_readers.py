@@ -145,7 +145,7 @@ def test_the_slowest_reader_of_a_topic_is_known_to_govern_it() -> None:
     thin.bytes_s, thin.fifo_s = 2e6 / 8, 0.2
     flow.stream(150, 1 / 30, IMAGE_BYTES)
     world.network.run(5.0)
-    governing = flow.publisher.governing_reader()
+    governing = flow.publisher.governing_paths.governing_reader()
     assert governing is not None
     reader, rtt_s, bytes_s = governing
     assert reader == world.members["s4/r4"].name

@@ -285,12 +285,12 @@ class BasePublisher(Opened[_D]):
     @property
     def confirmed(self) -> int:
         """Return how many messages every reader has confirmed; readers confirm none that is best effort."""
-        return self._publisher.acknowledged if self._publisher.confirms else 0
+        return self._publisher.acknowledgements.acknowledged if self._publisher.confirms else 0
 
     @property
     def sent(self) -> int:
         """Return how many messages have left this node, not counting those that some reader is known not to get."""
-        return self._publisher.sent
+        return self._publisher.acknowledgements.sent
 
     @property
     def expired(self) -> int:
@@ -300,7 +300,7 @@ class BasePublisher(Opened[_D]):
     @property
     def reader_lost(self) -> int:
         """Return how many messages the reader that lost most reports as lost, those that never left included."""
-        return self._publisher.reader_lost
+        return self._publisher.acknowledgements.reader_lost
 
     @property
     def lost(self) -> int:
@@ -310,12 +310,12 @@ class BasePublisher(Opened[_D]):
     @property
     def resent(self) -> int:
         """Return how many fragments were retransmitted because a reader lacked them."""
-        return self._publisher.repairs
+        return self._publisher.protection.repairs
 
     @property
     def can_restore(self) -> bool:
         """Return whether large messages get parity against loss: the rule allows it, and NumPy is installed."""
-        return self._publisher.parity.is_enabled and self._publisher.parity.is_available
+        return self._publisher.protection.parity.is_enabled and self._publisher.protection.parity.is_available
 
     def close(self) -> None:
         """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""

@@ -6,32 +6,16 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 from __future__ import annotations
 
 from collections import deque
-from typing import Final, Protocol
+from typing import Final
 
 from gdp.message.loss import Losses, LossReason
 from proxy.config.reduction import Adapt
 from proxy.config.rule import Rule
 from proxy.reduce.adaptive import AdaptBounds, AdaptiveQuality
 
-__all__ = ["Adaptation", "SendPath", "adaptation_of"]
+__all__ = ["Adaptation", "adaptation_of"]
 
 _NOT_OF_THE_PATH: Final = (LossReason.NO_READER, LossReason.TOO_LARGE)
-
-
-class SendPath(Protocol):
-    """What an adaptation reads of a publisher."""
-
-    @property
-    def path_bytes_s(self) -> float | None:
-        """Return the bytes a second that the path gives the topic; None: not measured."""
-
-    @property
-    def acknowledged(self) -> int:
-        """Return how many messages have left for good: confirmed, or of a best-effort topic sent."""
-
-    @property
-    def losses(self) -> Losses:
-        """Return which messages were given up, and why."""
 
 
 def adaptation_of(rule: Rule) -> Adaptation | None:
@@ -60,13 +44,19 @@ class Adaptation:
         """Return the JPEG quality of the next message, 1 to 100."""
         return self._controller.quality
 
-    def may_send(self, path: SendPath, now_s: float) -> bool:
-        """Return whether a message that comes now may leave."""
-        counts = path.losses.counts
+    def may_send(self, losses: Losses, acknowledged: int, path_bytes_s: float | None, now_s: float) -> bool:
+        """Return whether a message that comes now may leave.
+
+        Args:
+            losses: messages that were given up, and why.
+            acknowledged: messages that have left for good: confirmed, or of a best-effort topic sent.
+            path_bytes_s: bytes a second that the path gives the topic; None: not measured.
+        """
+        counts = losses.counts
         lost = counts.total()
         dropped = lost - self._refused - sum(counts[reason] for reason in _NOT_OF_THE_PATH)
         fresh, self._dropped = dropped - self._dropped, max(dropped, self._dropped)
-        gone = path.acknowledged + lost
+        gone = acknowledged + lost
         while self._on_way and self._on_way[0][0] <= gone:
             _, sent_s = self._on_way.popleft()
             if fresh > 0:
@@ -75,7 +65,7 @@ class Adaptation:
             else:  # it left after the last look: that wait is proven, a longer one is not
                 self._controller.handle_left(max(self._looked_s - sent_s, 0.0), now_s)
         self._looked_s = now_s
-        return self._controller.may_send(now_s, path.path_bytes_s)
+        return self._controller.may_send(now_s, path_bytes_s)
 
     def handle_sent(self, count: int, size_bytes: int, now_s: float) -> None:
         """Count a message that was published; ``count``: as ``Publisher.publish`` returns it."""

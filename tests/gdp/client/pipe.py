@@ -13,7 +13,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
-from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
 from gdp.client.writer_proxy import WriterProxy
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import decode
@@ -38,6 +38,7 @@ def publisher_of(
     incarnation: int = 1,
     secrets: Secrets = SECRETS,
     reliable: bool = True,
+    urgent: bool = False,
     depth: int = 0,
     options: SendOptions = DEFAULT_OPTIONS,
 ) -> Publisher:
@@ -47,9 +48,7 @@ def publisher_of(
         source=source,
         secrets=secrets,
         description=b"what it is",
-        reliable=reliable,
-        depth=depth,
-        options=options,
+        settings=PublisherSettings(reliable=reliable, urgent=urgent, depth=depth, options=options),
     )
     publisher.tree_stands(1500)
     return publisher

@@ -52,7 +52,12 @@ def test_messages_that_wait_together_come_in_order_under_few_numbers(reliable: b
     assert len({header.number for header in data(pipe)}) < len(SMALL) / 10
     if reliable or not loss:
         assert end.messages == SMALL
-        assert pipe.publisher.acknowledged == pipe.publisher.messages == end.writer_proxy.delivered == len(SMALL)
+        assert (
+            pipe.publisher.acknowledgements.acknowledged
+            == pipe.publisher.messages
+            == end.writer_proxy.delivery.delivered
+            == len(SMALL)
+        )
 
 
 def test_a_message_alone_is_sealed_alone_and_at_once() -> None:
@@ -93,7 +98,7 @@ def test_a_latched_topic_has_no_bundles_so_that_late_joiners_get_so_many_message
 
 def test_without_space_for_bundles_each_message_has_its_own_seal() -> None:
     pipe, (end,) = live(publisher_of())
-    pipe.publisher.bundle_bytes = 0
+    pipe.publisher.queue.bundle_bytes = 0
     publish(pipe.publisher, SMALL[:100])
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert end.numbers == list(range(1, 101))
@@ -108,19 +113,19 @@ def test_what_waits_for_its_seal_is_not_for_a_reader_that_comes_later() -> None:
     publish(pipe.publisher, SMALL[10:20])
     pipe.run(2.0)
     assert (end.messages, late.messages) == (SMALL[:20], SMALL[10:20])
-    assert late.writer_proxy.lost == 0
+    assert late.writer_proxy.losses.total == 0
 
 
 def test_what_publish_returns_is_confirmed_when_so_many_are() -> None:
     pipe, _ = live(publisher_of())
     numbers = [pipe.publisher.publish(message) for message in SMALL[:30]]
     pipe.run(0.001)
-    assert pipe.publisher.acknowledged == 0
+    assert pipe.publisher.acknowledgements.acknowledged == 0
     assert not pipe.publisher.is_acknowledged()
     numbers += [pipe.publisher.publish(message) for message in SMALL[:30]]
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert numbers == list(range(1, 61))
-    assert pipe.publisher.acknowledged == 60
+    assert pipe.publisher.acknowledgements.acknowledged == 60
 
 
 def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -> None:
@@ -131,7 +136,7 @@ def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -
     publish(pipe.publisher, SMALL[3:6])
     assert pipe.run(1.0, pipe.publisher.is_acknowledged)
     assert end.messages == SMALL[:6]
-    assert pipe.publisher.acknowledged == pipe.publisher.messages == 6
+    assert pipe.publisher.acknowledgements.acknowledged == pipe.publisher.messages == 6
 
 
 @pytest.mark.parametrize("reliable", [True, False])
@@ -166,8 +171,9 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
     pipe.run(1.0)
     assert [each for each in end.messages if len(each) < 20_000] == SMALL
     assert end.messages == other.messages
-    assert publisher.acknowledged == publisher.messages == len(end.messages)
-    assert end.writer_proxy.lost == 0 or not reliable  # numbers that were sealed but never sent look like a loss
+    assert publisher.acknowledgements.acknowledged == publisher.messages == len(end.messages)
+    # numbers that were sealed but never sent look like a loss
+    assert end.writer_proxy.losses.total == 0 or not reliable
 
 
 @pytest.mark.parametrize("body", [b"", pack([b"x"]) + b"y", pack([b"x" * 9])[:-1]], ids=["empty", "trailing", "cut"])
@@ -200,13 +206,13 @@ def test_a_bundle_that_is_lost_counts_as_a_loss() -> None:
     publish(pipe.publisher, [b"here"] * 5)
     pipe.run(0.1)
     assert end.messages == [b"here"] * 5
-    assert 1 <= end.writer_proxy.lost <= 5
+    assert 1 <= end.writer_proxy.losses.total <= 5
 
 
 def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_its_own_first_message() -> None:
     source = source_of(Name(b"p" * 32), 1, WRITER)
     publisher = Publisher(
-        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", reliable=True, past=SequenceState(1_000, 50)
+        topic=TOPIC, source=source, secrets=SECRETS, description=b"again", past=SequenceState(1_000, 50)
     )
     publisher.tree_stands(1_500)
     pipe, (end,) = live(publisher)
@@ -214,7 +220,7 @@ def test_a_publisher_that_goes_on_where_another_ended_bundles_and_counts_from_it
     assert pipe.run(1.0, publisher.is_acknowledged)
     assert end.messages == SMALL[:300]
     assert min(end.numbers) == 1_000
-    assert publisher.acknowledged == 300
+    assert publisher.acknowledgements.acknowledged == 300
 
 
 def test_a_topic_that_becomes_latched_bundles_no_more_and_one_that_is_no_longer_does_again() -> None:
@@ -226,4 +232,4 @@ def test_a_topic_that_becomes_latched_bundles_no_more_and_one_that_is_no_longer_
         assert pipe.run(1.0, pipe.publisher.is_acknowledged)
         assert any(header.flags & Flag.BUNDLE for header in data(pipe)) == (depth == 0)
     assert end.messages == SMALL[:300]
-    assert pipe.publisher.acknowledged == 300
+    assert pipe.publisher.acknowledgements.acknowledged == 300

@@ -107,7 +107,7 @@ def test_absurd_numbers_before_the_first_status_do_not_stop_a_writer_proxy() -> 
     pipe.run(1.0)
     pipe.publish([b"one", b"two"])
     assert pipe.run(2.0, lambda: end.messages == [b"one", b"two"])
-    assert end.writer_proxy.lost == 0
+    assert end.writer_proxy.losses.total == 0
 
 
 def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> None:
@@ -147,7 +147,7 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
     assert [each.number for each in end.writer_proxy.poll_delivered()][:3] == [2, 3, 4]
-    assert end.writer_proxy.lost == 1
+    assert end.writer_proxy.losses.total == 1
 
 
 def test_a_status_of_giant_numbers_costs_a_report_of_the_usual_size() -> None:

@@ -78,7 +78,7 @@ def test_images_of_600_fragments_arrive_over_a_lossy_link(loss: float) -> None:
     pipe.run(1.0)
     assert len(end.delivered) >= 0.95 * 60
     assert got(end) == sorted(set(got(end)))
-    assert pipe.publisher.repairs < 2 * 60 * 600 * loss
+    assert pipe.publisher.protection.repairs < 2 * 60 * 600 * loss
 
 
 def test_without_repairs_almost_no_image_arrives_and_none_is_sent_again() -> None:
@@ -87,7 +87,7 @@ def test_without_repairs_almost_no_image_arrives_and_none_is_sent_again() -> Non
     stream(pipe, 20)
     pipe.run(1.0)
     assert len(end.delivered) <= 2
-    assert pipe.publisher.repairs == 0
+    assert pipe.publisher.protection.repairs == 0
 
 
 @pytest.mark.parametrize("size", [100, 2_500], ids=["one fragment", "two fragments"])
@@ -103,7 +103,7 @@ def test_small_messages_never_wait_and_are_never_requested(size: int) -> None:
             pipe.run(0.05 - (pipe.now_s - published_s))
     assert 50 < len(end.delivered) < 90
     assert latest_s < ONE_WAY_S + 1e-6
-    assert pipe.publisher.repairs == len(pipe.publisher._late) == 0
+    assert pipe.publisher.protection.repairs == len(pipe.publisher.protection.late) == 0
     assert requests(pipe) == 0
 
 
@@ -111,7 +111,7 @@ def test_a_link_without_loss_causes_no_request() -> None:
     pipe, end = joined()
     stream(pipe, 10)
     assert pipe.run(1.0, lambda: len(end.delivered) == 10)
-    assert pipe.publisher.repairs == 0
+    assert pipe.publisher.protection.repairs == 0
     assert requests(pipe) == 0
 
 
@@ -138,7 +138,7 @@ def test_a_later_message_waits_no_longer_than_the_hold_time() -> None:
     assert got(end) == []
     pipe.run(0.01)
     assert got(end) == [1]
-    assert end.writer_proxy.lost == 1
+    assert end.writer_proxy.losses.total == 1
 
 
 def test_a_small_message_behind_a_large_one_keeps_the_order() -> None:
@@ -199,7 +199,7 @@ def test_more_gaps_than_a_report_names_are_repaired_in_one_round_trip_and_a_few_
     lose(pipe, end, *((1, part) for part in range(1, 600, 4)))
     pipe.publish([body(0, IMAGE_BYTES)])
     assert pipe.run(3 * ONE_WAY_S + 0.03, lambda: len(end.delivered) == 1)
-    assert pipe.publisher.repairs == 150
+    assert pipe.publisher.protection.repairs == 150
 
 
 def test_no_fragment_is_sent_twice_in_a_round_trip_however_many_readers_lack_it() -> None:
@@ -210,7 +210,7 @@ def test_no_fragment_is_sent_twice_in_a_round_trip_however_many_readers_lack_it(
         lose(pipe, end, (1, 3), (1, 5))
     pipe.publish([body(0, SCAN_BYTES)])
     assert pipe.run(0.3, lambda: len(first.delivered) == len(second.delivered) == 1)
-    assert pipe.publisher.repairs == 2
+    assert pipe.publisher.protection.repairs == 2
 
 
 def test_a_dead_reader_costs_nothing() -> None:
@@ -224,7 +224,7 @@ def test_a_dead_reader_costs_nothing() -> None:
         assert pipe.run(0.1, partial(has_more, live, before))
         assert pipe.now_s - published_s < ONE_WAY_S + 1e-6
     pipe.run(2.0)
-    assert pipe.publisher.repairs == len(pipe.publisher._late) == 0
+    assert pipe.publisher.protection.repairs == len(pipe.publisher.protection.late) == 0
 
 
 def has_more(end: End, than: int) -> bool:
@@ -243,7 +243,7 @@ def test_replayed_frames_start_no_request_and_no_wait() -> None:
         end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
     pipe.run(0.5)
     assert requests(pipe) == before > 0
-    assert pipe.publisher.repairs == 5
+    assert pipe.publisher.protection.repairs == 5
     assert end.budget.held_bytes == 0
 
 
@@ -263,7 +263,7 @@ def test_a_message_that_takes_a_second_to_send_is_repaired_meanwhile() -> None:
     pipe.publish([body(0, IMAGE_BYTES)])
     assert not pipe.run(1.0, lambda: len(end.delivered) == 1)
     assert pipe.run(0.2, lambda: len(end.delivered) == 1)
-    assert pipe.publisher.repairs == 3
+    assert pipe.publisher.protection.repairs == 3
 
 
 def test_repairs_leave_before_new_frames() -> None:
@@ -300,5 +300,5 @@ def test_what_arrives_is_whole_in_order_and_once_and_the_rest_is_counted(
     pipe.run(3.0)
     assert got(end) == sorted(set(got(end)))
     assert all(message == published[number] for number, message in zip(got(end), end.messages, strict=True))
-    assert len(end.delivered) + end.writer_proxy.lost == 40
+    assert len(end.delivered) + end.writer_proxy.losses.total == 40
     assert end.budget.held_bytes == 0

@@ -106,7 +106,7 @@ def test_a_dropped_message_is_never_sealed(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(Sealed, "_seal_until", record)
     pipe.publisher.publish(LARGE, pipe.now_s)
     pipe.now_s += 1.0
-    assert pipe.publisher._queue.drop_expired(pipe.now_s)
+    assert pipe.publisher.queue.drop_expired(pipe.now_s)
     assert (ends, pipe.publisher.drops[DropReason.LIFESPAN]) == ([], 1)
 
 
@@ -121,7 +121,7 @@ def test_readers_learn_how_many_messages_were_too_late(message: bytes) -> None:
     pipe.run(2.0)
     assert (len(end.delivered), end.writer_proxy.losses.counts) == (2, {LossReason.LIFESPAN: 5})
     assert (pipe.publisher.messages, pipe.publisher.losses.counts) == (7, {LossReason.LIFESPAN: 5})
-    assert (pipe.publisher.drops[DropReason.LIFESPAN], pipe.publisher.acknowledged) == (5, 2)
+    assert (pipe.publisher.drops[DropReason.LIFESPAN], pipe.publisher.acknowledgements.acknowledged) == (5, 2)
 
 
 def test_small_messages_without_a_deadline_give_way_to_newer_ones() -> None:

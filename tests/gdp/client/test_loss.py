@@ -49,7 +49,7 @@ def assert_complete(pipe: Pipe, end: End) -> None:
     lost = [each for span in end.writer_proxy.losses.ranges for each in range(span.first, span.last + 1)]
     assert numbers == sorted(set(numbers))
     assert sorted(numbers + lost) == list(range(numbers[0], pipe.publisher.messages + 1))
-    assert end.writer_proxy.lost == len(lost)
+    assert end.writer_proxy.losses.total == len(lost)
 
 
 @pytest.mark.parametrize("away_s", [3.0, 10.0, 30.0])
@@ -63,9 +63,9 @@ def test_a_reader_that_was_away_within_the_grace_time_loses_nothing(away_s: floa
     stream(pipe, 2.0)
     assert pipe.run(5.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, end)
-    assert (end.writer_proxy.lost, pipe.publisher.losses.total) == (0, 0)
+    assert (end.writer_proxy.losses.total, pipe.publisher.losses.total) == (0, 0)
     assert got(end) == list(range(pipe.publisher.messages))
-    assert pipe.publisher.acknowledged == pipe.publisher.messages
+    assert pipe.publisher.acknowledgements.acknowledged == pipe.publisher.messages
 
 
 def test_a_reader_that_was_away_for_longer_learns_exactly_what_it_lost_and_why() -> None:
@@ -83,7 +83,7 @@ def test_a_reader_that_was_away_for_longer_learns_exactly_what_it_lost_and_why()
     assert (first, last) == (21, published)
     assert {each.reason for each in end.writer_proxy.losses.ranges} == {LossReason.GIVEN_UP, LossReason.NO_READER}
     assert pipe.publisher.losses.counts.keys() == {LossReason.GIVEN_UP, LossReason.NO_READER}
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost
+    assert pipe.publisher.messages - pipe.publisher.acknowledgements.acknowledged == end.writer_proxy.losses.total
 
 
 def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_returns() -> None:
@@ -98,7 +98,7 @@ def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_retur
     silence(moves, is_silent=False)
     assert pipe.run(10.0, lambda: len(moves.delivered) == 60)
     assert_complete(pipe, moves)
-    assert moves.writer_proxy.lost == 0
+    assert moves.writer_proxy.losses.total == 0
 
 
 def has_more_than(end: End, count: int) -> bool:
@@ -119,7 +119,7 @@ def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
     moves.loss = 0.0
     assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, moves)
-    assert moves.writer_proxy.lost == 0
+    assert moves.writer_proxy.losses.total == 0
 
 
 def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named() -> None:
@@ -137,7 +137,7 @@ def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named()
     assert pipe.run(20.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, end)
     assert list(end.writer_proxy.losses.ranges) == [LostRange(11, 10 + gone, LossReason.WINDOW_OVERFLOW)]
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == gone
+    assert pipe.publisher.messages - pipe.publisher.acknowledgements.acknowledged == gone
 
 
 def test_a_reader_that_was_killed_is_given_up_after_the_grace_time_and_counted() -> None:
@@ -150,7 +150,7 @@ def test_a_reader_that_was_killed_is_given_up_after_the_grace_time_and_counted()
     assert pipe.publisher.losses.total == 0
     pipe.run(READER_LEASE_S + 1.0)
     assert list(pipe.publisher.losses.ranges) == [LostRange(11, 30, LossReason.GIVEN_UP)]
-    assert pipe.publisher.acknowledged == 10
+    assert pipe.publisher.acknowledgements.acknowledged == 10
 
 
 def test_a_reader_that_starts_again_counts_what_came_between_its_lives() -> None:
@@ -178,7 +178,7 @@ def test_a_reader_that_said_goodbye_has_lost_nothing_when_it_comes_again() -> No
     second = pipe.join(b"a", incarnation=8)
     pipe.run(1.0)
     stream(pipe, 1.0)
-    assert second.writer_proxy.lost == 0
+    assert second.writer_proxy.losses.total == 0
     assert len(second.delivered) == 10
 
 
@@ -188,7 +188,7 @@ def test_the_first_contact_with_a_publisher_that_has_published_for_long_is_no_lo
     (end,) = live(pipe, b"a")
     stream(pipe, 1.0)
     pipe.run(2.0)
-    assert end.writer_proxy.lost == 0
+    assert end.writer_proxy.losses.total == 0
     assert sequences(end) == list(range(51, 61))
     assert pipe.publisher.losses.counts == {LossReason.NO_READER: 50}
 
@@ -205,8 +205,8 @@ def test_best_effort_and_reliable_gaps_are_counted_in_messages(burst: int, *, re
         pipe.run(0.01)
     end.loss = 0.0
     assert_complete(pipe, end)
-    assert len(end.delivered) + end.writer_proxy.lost == 100 * burst
-    assert (end.writer_proxy.lost == 0) == reliable
+    assert len(end.delivered) + end.writer_proxy.losses.total == 100 * burst
+    assert (end.writer_proxy.losses.total == 0) == reliable
     assert end.writer_proxy.losses.counts.keys() <= {LossReason.GAP}
 
 
@@ -231,7 +231,7 @@ def test_what_a_publisher_passes_over_is_lost_for_its_reason() -> None:
     pipe.run(3.0)
     wanted = [LostRange(11, 11, LossReason.TOO_LARGE), LostRange(22, 22, LossReason.WINDOW_OVERFLOW)]
     assert list(end.writer_proxy.losses.ranges) == wanted
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == 2
+    assert pipe.publisher.messages - pipe.publisher.acknowledgements.acknowledged == 2
 
 
 def test_a_suspended_reader_is_counted_once_however_often_it_falls_silent() -> None:
@@ -245,7 +245,7 @@ def test_a_suspended_reader_is_counted_once_however_often_it_falls_silent() -> N
         pipe.run(3.0)
         stream(pipe, 5.0, every_s=1.0)
     assert_complete(pipe, end)
-    assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost > 100
+    assert pipe.publisher.messages - pipe.publisher.acknowledgements.acknowledged == end.writer_proxy.losses.total > 100
 
 
 OUTAGES = st.lists(
@@ -282,7 +282,7 @@ def test_through_any_outages_published_is_delivered_or_lost(
     pipe.run(20.0)
     for end in (one, other):
         assert_complete(pipe, end)
-    assert other.writer_proxy.lost == 0
+    assert other.writer_proxy.losses.total == 0
 
 
 def best_effort_without_a_whole_message() -> tuple[Pipe, End]:
@@ -297,14 +297,15 @@ def best_effort_without_a_whole_message() -> tuple[Pipe, End]:
 def test_a_reader_that_gets_no_message_whole_learns_while_they_flow_that_they_are_lost() -> None:
     pipe, end = best_effort_without_a_whole_message()
     assert pipe.publisher.messages == 150
-    assert end.writer_proxy.lost > 60
+    assert end.writer_proxy.losses.total > 60
     assert end.writer_proxy.losses.counts.keys() == {LossReason.GAP}
 
 
 def test_the_publisher_learns_what_a_best_effort_reader_lost() -> None:
     pipe, end = best_effort_without_a_whole_message()
-    assert pipe.run(3.0, pipe.publisher.is_reported)
-    assert (pipe.publisher.sent, pipe.publisher.reader_lost, end.writer_proxy.lost) == (150, 150, 150)
+    confirmed = pipe.publisher.acknowledgements
+    assert pipe.run(3.0, confirmed.is_reported)
+    assert (confirmed.sent, confirmed.reader_lost, end.writer_proxy.losses.total) == (150, 150, 150)
 
 
 def test_what_waits_on_a_best_effort_topic_has_not_been_sent() -> None:
@@ -312,9 +313,10 @@ def test_what_waits_on_a_best_effort_topic_has_not_been_sent() -> None:
     live(pipe, b"a")
     for _ in range(3):
         pipe.publisher.publish(bytes(4_000), pipe.now_s)
-    before = pipe.publisher.sent, pipe.publisher.acknowledged, pipe.publisher.is_reported()
+    confirmed = pipe.publisher.acknowledgements
+    before = confirmed.sent, confirmed.acknowledged, confirmed.is_reported()
     pipe.run(0.1)
-    assert (before, pipe.publisher.sent) == ((0, 0, False), 3)
+    assert (before, pipe.publisher.acknowledgements.sent) == ((0, 0, False), 3)
 
 
 @pytest.mark.parametrize("reliable", [True, False])
@@ -327,8 +329,8 @@ def test_a_reader_counts_what_is_lost_from_when_its_publisher_knows_it(*, reliab
     end.deaf = False
     stream(pipe, 2.0)
     pipe.run(5.0)
-    assert len(got(end)) + end.writer_proxy.lost == pipe.publisher.messages == 40
-    assert end.writer_proxy.lost in ((0,) if reliable else (20, 21))
+    assert len(got(end)) + end.writer_proxy.losses.total == pipe.publisher.messages == 40
+    assert end.writer_proxy.losses.total in ((0,) if reliable else (20, 21))
 
 
 def test_a_reader_that_is_killed_again_before_it_began_counts_what_it_lacks_since_it_last_did() -> None:

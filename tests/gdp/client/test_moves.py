@@ -46,7 +46,7 @@ def test_what_is_under_way_when_the_path_narrows_arrives_once_and_in_order() -> 
     narrow(pipe, one)
     assert pipe.run(5, pipe.publisher.is_acknowledged)
     assert one.messages == other.messages == sent
-    assert one.writer_proxy.lost == other.writer_proxy.lost == 0
+    assert one.writer_proxy.losses.total == other.writer_proxy.losses.total == 0
 
 
 def test_numbers_still_rise() -> None:
@@ -93,7 +93,7 @@ def test_confirmed_messages_are_counted_and_not_their_numbers() -> None:
         pipe.run(0.003)
         narrow(pipe, one)
         assert pipe.run(5, pipe.publisher.is_acknowledged)
-    assert pipe.publisher.acknowledged == pipe.publisher.messages == len(one.messages) == 30
+    assert pipe.publisher.acknowledgements.acknowledged == pipe.publisher.messages == len(one.messages) == 30
 
 
 def test_a_late_joiner_gets_latched_messages_in_the_new_size_and_no_reader_gets_them_again() -> None:

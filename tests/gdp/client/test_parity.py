@@ -27,8 +27,8 @@ def warmed(loss: float = 0.02) -> Pipe:
     for _ in range(60):
         pipe.publish([rng.randbytes(SIZE)])
         pipe.run(0.1)
-    assert pipe.publisher.parity.sent
-    assert end.writer_proxy.recovered
+    assert pipe.publisher.protection.parity.sent
+    assert end.writer_proxy.recovery.recovered
     return pipe
 
 
@@ -67,13 +67,13 @@ def test_parity_forged_by_another_reader_delivers_nothing_wrong_and_holds_up_no_
 def test_a_replay_of_all_frames_delivers_nothing_again_and_holds_no_memory() -> None:
     pipe = warmed()
     end = next(iter(pipe.ends.values()))
-    delivered, recovered = len(end.delivered), end.writer_proxy.recovered
+    delivered, recovered = len(end.delivered), end.writer_proxy.recovery.recovered
     old = [frame for frame in pipe.seen if decode(frame).kind in (Kind.DATA, Kind.PARITY)]
     unused = end.writer_proxy.drops[DropReason.UNUSED_PARITY]
     for frame in old:
         end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
     pipe.run(2.0)
-    assert (len(end.delivered), end.writer_proxy.recovered) == (delivered, recovered)
+    assert (len(end.delivered), end.writer_proxy.recovery.recovered) == (delivered, recovered)
     assert end.writer_proxy.drops[DropReason.UNUSED_PARITY] > unused
     assert end.budget.held_bytes == 0
 

@@ -31,7 +31,7 @@ def test_a_reliable_topic_arrives_complete_and_in_order_whatever_is_lost(loss: f
     pipe.publish(MESSAGES)
     assert pipe.run(120.0, pipe.publisher.is_acknowledged)
     assert end.messages == MESSAGES
-    assert end.writer_proxy.lost == 0
+    assert end.writer_proxy.losses.total == 0
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -64,8 +64,8 @@ def test_a_best_effort_topic_never_waits_for_what_is_lost() -> None:
         pipe.run(0.01)
         assert len(end.delivered) - before == (at % 10 != 3)
     assert end.numbers == sorted(end.numbers)
-    assert end.writer_proxy.lost == 10
-    assert pipe.publisher.repairs == 0
+    assert end.writer_proxy.losses.total == 10
+    assert pipe.publisher.protection.repairs == 0
 
 
 def test_without_a_reader_nothing_is_sealed_and_the_loss_is_counted() -> None:
@@ -86,7 +86,7 @@ def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages(reliable: bool)
     pipe.run(2.0)
     assert early.messages == MESSAGES[:20]
     assert late.messages == MESSAGES[17:20]
-    assert late.writer_proxy.lost == 0
+    assert late.writer_proxy.losses.total == 0
 
 
 def test_the_first_reader_of_a_latched_topic_gets_the_last_messages_from_before_it_came() -> None:
@@ -153,7 +153,7 @@ def test_a_reader_that_was_cut_off_for_longer_than_its_lease_goes_on_where_the_p
     pipe.publish([b"after %d" % at for at in range(50)])
     assert pipe.run(30.0, lambda: len(live.delivered) == 71 and cut.messages[-1] == b"after 49")
     assert [each for each in cut.messages if each.startswith(b"after")] == [b"after %d" % at for at in range(50)]
-    assert cut.writer_proxy.lost == 71 - len(cut.delivered)
+    assert cut.writer_proxy.losses.total == 71 - len(cut.delivered)
 
 
 def test_a_reader_that_starts_again_is_welcome_and_its_old_notes_are_not() -> None:
@@ -225,7 +225,7 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe = Pipe(publisher_of(secrets=SECRETS))
     end = pipe.join(b"a", secrets=SECRETS)
     pipe.run(1.0)
-    end.writer_proxy._secrets = reader_has
+    end.writer_proxy.renew(reader_has)
     pipe.publish([b"old key"])
     pipe.run(1.0)
     assert end.messages == [b"old key"]

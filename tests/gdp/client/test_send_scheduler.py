@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from gdp.client.governing_paths import GoverningPaths
 from gdp.client.publisher import Publisher
+from gdp.client.reader_path import ReaderPaths
+from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.send_options import PRIORITIES, Priority, SendOptions, is_urgent
 from gdp.client.send_scheduler import SendScheduler
+from gdp.client.sent_frames import SentFrames
 from gdp.frame.codec import decode
 from gdp.names import Name
 from tests.gdp.client.pipe import Pipe, publisher_of
@@ -18,18 +22,12 @@ def read_by_one() -> Publisher:
     return publisher
 
 
-class Flood(Publisher):
-    """A publisher that always has frames, on a path that permits some bytes of all publishers together."""
+class ThinPath(GoverningPaths):
+    """Path that permits some bytes of all publishers together."""
 
-    def __init__(
-        self, path: list[int], *, weight: int = 1, waiting: int = 1 << 30, priority: Priority = "normal"
-    ) -> None:
-        self.path = path
-        self.options = SendOptions(weight=weight, priority=priority)
-        self.is_urgent = is_urgent(priority)
-        self.waiting = waiting
-        self.frames_out = 0
-        self.has_more = True
+    def __init__(self, left: list[int]) -> None:
+        self.left = left
+        self.share = 1.0
         self.awaited: frozenset[bytes] = frozenset()
 
     def is_limited(self, now_s: float) -> bool:
@@ -38,32 +36,48 @@ class Flood(Publisher):
     def awaited_readers(self) -> frozenset[bytes]:
         return self.awaited
 
-    def has_any(self, readers: frozenset[bytes]) -> bool:
-        return True
-
-    @property
-    def mtu(self) -> int:
-        return 1_500
-
     def allowance(self, now_s: float) -> int:
-        return self.path[0]
+        return self.left[0]
 
     def next_send_s(self, now_s: float) -> float | None:
         return 5.0
 
+    def note_idle(self) -> None:
+        pass
+
+
+class Everyone(ReaderProxies):
+    """Readers on every node."""
+
+    def __init__(self) -> None:
+        pass
+
+    def __contains__(self, name: bytes) -> bool:
+        return True
+
+
+class Flood(Publisher):
+    """A publisher that always has frames."""
+
+    def __init__(
+        self, path: list[int], *, weight: int = 1, waiting: int = 1 << 30, priority: Priority = "normal"
+    ) -> None:
+        self.governing_paths: ThinPath = ThinPath(path)
+        self.matched = Everyone()
+        self.sent_frames, self.queue = SentFrames(ReaderPaths()), publisher_of().queue
+        self.options = SendOptions(weight=weight, priority=priority)
+        self.is_urgent = is_urgent(priority)
+        self.waiting = waiting
+        self.frames_out = 0
+        self.has_more = True
+
     def poll_frames(self, now_s: float, limit_bytes: int = 1 << 30) -> list[bytes]:
         count = min(-(-limit_bytes // 1_500), self.waiting)
-        self.path[0] -= count * 1_500
+        self.governing_paths.left[0] -= count * 1_500
         self.frames_out += count
         self.waiting -= count
         self.has_more = self.waiting > 0
         return [bytes(1_500)] * count
-
-    def count_sent(self) -> None:
-        pass  # these paths take what the test says
-
-    def note_idle(self) -> None:
-        pass
 
 
 def scheduled(*floods: Flood) -> SendScheduler:
@@ -168,7 +182,7 @@ def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:
 
 def test_paths_are_reserved_for_a_publisher_to_several_readers_for_a_quarter_of_a_second_and_then_not_as_long() -> None:
     waits, other = Flood([0]), Flood([1 << 20])
-    waits.awaited = frozenset((b"a", b"b"))
+    waits.governing_paths.awaited = frozenset((b"a", b"b"))
     turns = scheduled(waits, other)
     sent = []
     for step in range(20):
@@ -176,9 +190,9 @@ def test_paths_are_reserved_for_a_publisher_to_several_readers_for_a_quarter_of_
         before = other.frames_out
         turns.poll_turn(0.05 * step)
         sent.append(other.frames_out > before)
-        other.path[0] = 1 << 20
+        other.governing_paths.left[0] = 1 << 20
     assert sent == [*[False] * 5, *[True] * 5, *[False] * 5, *[True] * 5]
-    waits.path[0] = 1 << 20
+    waits.governing_paths.left[0] = 1 << 20
     turns.resume()
     turns.poll_turn(1.0)
     assert waits.frames_out > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.send_options import SendOptions
+from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.sequence_numbers import SequenceRegistry, SequenceState
 from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, private_incarnation, private_name
 from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
@@ -27,7 +27,6 @@ def streams_of(sequence_registry: SequenceRegistry | None = None) -> UnicastStre
         secrets=SECRETS,
         sequence_registry=SequenceRegistry() if sequence_registry is None else sequence_registry,
         published=lambda _: None,
-        urgent=False,
     )
 
 
@@ -43,8 +42,7 @@ def test_the_stream_to_each_reader_has_the_options_of_its_service() -> None:
         secrets=SECRETS,
         sequence_registry=SequenceRegistry(),
         published=lambda _: None,
-        urgent=False,
-        options=options,
+        settings=PublisherSettings(options=options),
     )
     assert streams.stream(client(1), 1500, 0.0).options == options
 

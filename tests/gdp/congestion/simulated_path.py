@@ -21,6 +21,7 @@ from thin_link.channel import Channel, ConstantRate, Loss
 
 from gdp.congestion.controller import PathController
 from gdp.congestion.cubic import Cubic
+from gdp.congestion.delivery_rate import DeliveryRate, Flight
 
 MTU = 1_500
 _SILENCE_S = 1.0
@@ -31,11 +32,11 @@ class Sender(Protocol):
 
     def next_send_s(self, size: int) -> float | None: ...
 
-    def sent(self, number: int, size: int, now_s: float) -> None: ...
+    def sent(self, size: int, now_s: float) -> Flight: ...
 
-    def acknowledged(self, numbers: list[int], now_s: float) -> None: ...
+    def acknowledged(self, flights: list[Flight], now_s: float) -> None: ...
 
-    def lost(self, numbers: list[int], now_s: float) -> None: ...
+    def lost(self, flights: list[Flight], now_s: float) -> None: ...
 
 
 class CubicSender:
@@ -44,7 +45,8 @@ class CubicSender:
     def __init__(self) -> None:
         self._cubic: Cubic | None = None
         self._slow_start = 10.0
-        self._sent_s: dict[int, float] = {}
+        self._rate = DeliveryRate()
+        self._under_way: set[Flight] = set()
         self._recovers_until_s = 0.0
         self._rtt_s = 0.1
 
@@ -53,21 +55,25 @@ class CubicSender:
         return self._slow_start if self._cubic is None else self._cubic.window
 
     def next_send_s(self, size: int) -> float | None:
-        return 0.0 if len(self._sent_s) < self.window else None
+        return 0.0 if len(self._under_way) < self.window else None
 
-    def sent(self, number: int, size: int, now_s: float) -> None:
-        self._sent_s[number] = now_s
+    def sent(self, size: int, now_s: float) -> Flight:
+        flight = self._rate.sent(size, now_s, 0)
+        self._under_way.add(flight)
+        return flight
 
-    def acknowledged(self, numbers: list[int], now_s: float) -> None:
-        for number in numbers:
-            self._rtt_s = now_s - self._sent_s.pop(number, now_s - self._rtt_s)
+    def acknowledged(self, flights: list[Flight], now_s: float) -> None:
+        for flight in self._under_way.intersection(flights):
+            self._rtt_s = now_s - flight.sent_s
+        self._under_way.difference_update(flights)
         if self._cubic is None:
-            self._slow_start += len(numbers)
+            self._slow_start += len(flights)
         else:
-            self._cubic.acknowledged(len(numbers), now_s, self._rtt_s)
+            self._cubic.acknowledged(len(flights), now_s, self._rtt_s)
 
-    def lost(self, numbers: list[int], now_s: float) -> None:
-        latest_s = max((self._sent_s.pop(number, 0.0) for number in numbers), default=0.0)
+    def lost(self, flights: list[Flight], now_s: float) -> None:
+        latest_s = max((flight.sent_s for flight in self._under_way.intersection(flights)), default=0.0)
+        self._under_way.difference_update(flights)
         if latest_s <= self._recovers_until_s:
             return
         self._recovers_until_s = now_s
@@ -86,13 +92,20 @@ class Flow:
     offered_bytes_s: float = float("inf")
     ack_every_s: float = 0.0
     delivered: list[float] = field(default_factory=list)
-    number: count[int] = field(default_factory=count)
-    outstanding: deque[int] = field(default_factory=deque)
-    waiting_acks: list[int] = field(default_factory=list)
+    outstanding: deque[Flight] = field(default_factory=deque)
+    waiting_acks: list[Flight] = field(default_factory=list)
     ack_at_s: float = -1.0
     heard_s: float = 0.0
     sent_bytes: int = 0
     wakes_s: float = -1.0
+
+    def overtaken_by(self, flights: list[Flight]) -> list[Flight]:
+        """Remove what left up to the last of these flights; return what of it is not among them."""
+        overtaken: list[Flight] = []
+        if flights[-1] in self.outstanding:
+            while (flight := self.outstanding.popleft()) is not flights[-1]:
+                overtaken.append(flight)
+        return [flight for flight in overtaken if flight not in flights]
 
     def share(self, begin_s: float, end_s: float, bits_s: float) -> float:
         """Return its delivered bytes in a span, of those that the path could carry."""
@@ -169,11 +182,10 @@ class SimulatedPath:
             self._put(flow)
 
     def _put(self, flow: Flow) -> None:
-        number = next(flow.number)
         if not flow.outstanding:
             flow.heard_s = self.now_s
-        flow.sender.sent(number, MTU, self.now_s)
-        flow.outstanding.append(number)
+        flight = flow.sender.sent(MTU, self.now_s)
+        flow.outstanding.append(flight)
         flow.sent_bytes += MTU
         due_ns = self._channel.offer(round(self.now_s * 1e9), MTU)
         if due_ns is None:
@@ -181,11 +193,11 @@ class SimulatedPath:
         leaves_s = due_ns / 1e9
         self.queue_s.append((self.now_s, leaves_s - self.now_s - MTU * 8 / self.bits_s))
         arrives_s = leaves_s + self.rtt_s / 2
-        self.at(arrives_s, lambda: self._arrive(flow, number))
+        self.at(arrives_s, lambda: self._arrive(flow, flight))
 
-    def _arrive(self, flow: Flow, number: int) -> None:
+    def _arrive(self, flow: Flow, flight: Flight) -> None:
         flow.delivered.append(self.now_s)
-        flow.waiting_acks.append(number)
+        flow.waiting_acks.append(flight)
         if flow.ack_at_s < self.now_s:
             flow.ack_at_s = self.now_s + flow.ack_every_s
             self.at(flow.ack_at_s, lambda: self._acknowledge(flow))
@@ -193,18 +205,14 @@ class SimulatedPath:
             self.at(self.now_s, lambda: self._acknowledge(flow))
 
     def _acknowledge(self, flow: Flow) -> None:
-        numbers, flow.waiting_acks = flow.waiting_acks, []
-        if numbers:
-            self.at(self.now_s + self.rtt_s / 2, lambda: self._hear(flow, numbers))
+        flights, flow.waiting_acks = flow.waiting_acks, []
+        if flights:
+            self.at(self.now_s + self.rtt_s / 2, lambda: self._hear(flow, flights))
 
-    def _hear(self, flow: Flow, numbers: list[int]) -> None:
+    def _hear(self, flow: Flow, flights: list[Flight]) -> None:
         flow.heard_s = self.now_s
-        newest, confirmed, lost = max(numbers), set(numbers), []
-        while flow.outstanding and flow.outstanding[0] <= newest:
-            number = flow.outstanding.popleft()
-            if number not in confirmed:
-                lost.append(number)
-        flow.sender.acknowledged(numbers, self.now_s)
+        lost = flow.overtaken_by(flights)
+        flow.sender.acknowledged(flights, self.now_s)
         if lost:
             flow.sender.lost(lost, self.now_s)
         self._send(flow)

@@ -18,8 +18,10 @@ from thin_link.channel import Channel, Loss, Rate
 from gdp.client.identities import WriterIdentity
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.client.send_options import PublisherSettings
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
+from gdp.congestion.delivery_rate import Flight
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Kind
@@ -154,8 +156,8 @@ class SimulatedRobot:
         name, key = Name(stream.name.encode().ljust(32, b".")), SigningKey.generate()
         source: WriterIdentity = source_of(Name(b"robot".ljust(32, b".")), 1, key)
         publisher = Publisher(
-            topic=name, source=source, secrets=_SECRETS, description=b"", reliable=stream.is_reliable,
-            urgent=stream.is_urgent, reader_paths=self._paths,
+            topic=name, source=source, secrets=_SECRETS, description=b"", reader_paths=self._paths,
+            settings=PublisherSettings(reliable=stream.is_reliable, urgent=stream.is_urgent),
         )  # fmt: skip
         publisher.tree_stands(MTU)
         publisher.published = self._turns.add
@@ -311,24 +313,19 @@ class SimulatedRobot:
             if next_s > self.now_s:
                 self.at(next_s, lambda: self._flow_sends(flow))
                 return
-            number = next(flow.number)
-            flow.sender.sent(number, MTU, self.now_s)
-            flow.outstanding.append(number)
+            flight = flow.sender.sent(MTU, self.now_s)
+            flow.outstanding.append(flight)
             due_ns = self._offer(MTU)
             if due_ns is not None:
-                self.at(due_ns / 1e9, lambda number=number: self._flow_arrives(flow, number))  # type: ignore[misc]
+                self.at(due_ns / 1e9, lambda flight=flight: self._flow_arrives(flow, flight))  # type: ignore[misc]
 
-    def _flow_arrives(self, flow: Flow, number: int) -> None:
+    def _flow_arrives(self, flow: Flow, flight: Flight) -> None:
         flow.delivered.append(self.now_s)
-        self.at(self.now_s + self.rtt_s / 2, lambda: self._flow_hears(flow, number))
+        self.at(self.now_s + self.rtt_s / 2, lambda: self._flow_hears(flow, flight))
 
-    def _flow_hears(self, flow: Flow, number: int) -> None:
-        lost = []
-        while flow.outstanding and flow.outstanding[0] <= number:
-            first = flow.outstanding.popleft()
-            if first != number:
-                lost.append(first)
-        flow.sender.acknowledged([number], self.now_s)
+    def _flow_hears(self, flow: Flow, flight: Flight) -> None:
+        lost = flow.overtaken_by([flight])
+        flow.sender.acknowledged([flight], self.now_s)
         if lost:
             flow.sender.lost(lost, self.now_s)
         self._flow_sends(flow)

@@ -123,8 +123,7 @@ def test_without_a_round_trip_a_confirmation_makes_the_window_no_larger() -> Non
     controller.timed_out(1.0)
     before = controller.window
     for number in range(100):
-        controller.sent(number, MTU, 1.0 + number)
-        controller.acknowledged([number], 1.1 + number, held_s=None)
+        controller.acknowledged([controller.sent(MTU, 1.0 + number)], 1.1 + number, held_s=None)
     assert (controller.window, controller.inflight) == (before, 0)
 
 
@@ -229,9 +228,8 @@ def test_the_queue_is_short_again_within_ten_seconds_after_a_cubic_flow_has_ende
 
 def test_frames_leave_at_the_pace_and_not_in_a_burst() -> None:
     controller = PathController(MTU)
-    controller.sent(1, MTU, 0.0)
-    controller.acknowledged([1], 0.06)
-    controller.sent(2, MTU, 0.06)
+    controller.acknowledged([controller.sent(MTU, 0.0)], 0.06)
+    controller.sent(MTU, 0.06)
     assert controller.next_send_s(MTU) == pytest.approx(0.06 + MTU / controller.pacing_bytes_s)
     assert controller.pacing_bytes_s == pytest.approx(2.89 * controller.window / 0.06)
 
@@ -239,11 +237,11 @@ def test_frames_leave_at_the_pace_and_not_in_a_burst() -> None:
 def test_the_window_is_never_under_two_frames_and_always_lets_one_frame_out() -> None:
     controller = PathController(MTU)
     for number in range(200):
-        controller.sent(number, MTU, number * 0.01)
+        flight = controller.sent(MTU, number * 0.01)
         if number % 2:
-            controller.lost([number], number * 0.01 + 0.005)
+            controller.lost([flight], number * 0.01 + 0.005)
         else:
-            controller.acknowledged([number], number * 0.01 + 0.009)
+            controller.acknowledged([flight], number * 0.01 + 0.009)
     assert controller.window >= 2 * MTU
     assert controller.inflight == 0
     assert controller.next_send_s(MTU) is not None
@@ -256,21 +254,22 @@ def test_a_larger_mtu_keeps_two_of_its_frames() -> None:
     assert controller.window == 18_000
 
 
-def test_unknown_and_repeated_numbers_change_nothing() -> None:
+def test_a_flight_that_is_confirmed_again_or_was_given_up_changes_nothing() -> None:
     controller = PathController(MTU)
-    controller.sent(1, MTU, 0.0)
-    controller.acknowledged([1], 0.05)
+    given_up = controller.sent(MTU, 0.0)
+    controller.timed_out(0.0)
+    flight = controller.sent(MTU, 0.0)
+    controller.acknowledged([flight], 0.05)
     before = (controller.window, controller.inflight, controller.base_rtt_s)
-    controller.acknowledged([1, 99], 9.0)
-    controller.lost([1, 99], 9.0)
+    controller.acknowledged([flight, given_up], 9.0)
+    controller.lost([flight, given_up], 9.0)
     assert (controller.window, controller.inflight, controller.base_rtt_s) == before
 
 
 def test_another_path_forgets_its_measurements_and_keeps_what_is_under_way() -> None:
     controller = PathController(MTU)
-    for number in range(5):
-        controller.sent(number, MTU, 0.0)
-    controller.acknowledged([0, 1], 0.05)
+    flights = [controller.sent(MTU, 0.0) for _ in range(5)]
+    controller.acknowledged(flights[:2], 0.05)
     controller.path_changed(0.06)
     assert controller.state is State.STARTUP
     assert controller.inflight == 3 * MTU

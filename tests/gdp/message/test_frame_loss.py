@@ -6,11 +6,17 @@ from random import Random
 
 import pytest
 
+from gdp.frame.codec import Header, encode
+from gdp.frame.kinds import Kind
 from gdp.message.acknack import FRAMES_MASK
 from gdp.message.frame_loss import FrameLoss
 
 READER, OTHER = b"r" * 32, b"o" * 32
 BOTH = {READER, OTHER}
+
+
+def frames(*numbers: int) -> list[bytes]:
+    return [encode(Header(Kind.DATA, 0, 8, 1, 0, number, 0, 1, 1, READER, READER)) for number in numbers]
 
 
 def measured(
@@ -19,7 +25,7 @@ def measured(
     """Return the estimate after messages of one frame, each sent ``sends`` times, with a report every 50."""
     rng, made = Random(1), FrameLoss()
     for number in range(1, count + 1):
-        made.handle_sent([number] * sends)
+        made.handle_sent(frames(number) * sends)
         received += sum(rng.random() >= loss for _ in range(sends))
         if number % 50 == 0:
             made.handle_report(READER, number + 1, 0, received & FRAMES_MASK)
@@ -43,9 +49,9 @@ def test_a_count_that_wraps_is_followed() -> None:
 
 def test_a_count_that_begins_again_is_no_loss() -> None:
     made = measured(0.0)
-    made.handle_sent(range(5_001, 5_101))
+    made.handle_sent(frames(*range(5_001, 5_101)))
     made.handle_report(READER, 5_101, 0, 3)
-    made.handle_sent(range(5_101, 5_301))
+    made.handle_sent(frames(*range(5_101, 5_301)))
     made.handle_report(READER, 5_301, 0, 203)
     assert made.loss(BOTH, 0.0) == 0.0
 
@@ -62,6 +68,6 @@ def test_the_reader_with_the_highest_loss_decides_while_it_is_a_reader() -> None
 
 def test_a_count_above_what_was_sent_is_no_loss() -> None:
     made = measured(0.0)
-    made.handle_sent(range(5_001, 5_501))
+    made.handle_sent(frames(*range(5_001, 5_501)))
     made.handle_report(READER, 5_501, 0, 9_000)
     assert made.loss(BOTH, 0.0) == 0.0

@@ -101,7 +101,7 @@ def test_a_part_that_arrived_while_its_second_repair_waited_is_not_sent_again() 
 def test_a_part_that_a_suspended_reader_lacks_is_sent_though_the_others_have_it() -> None:
     window = window_of(2, 20, (A, B))
     window.frames_to_send(0.0)
-    window.suspend(B)
+    window.readers.suspend(B)
     window.handle_acknack(A, has(3, 0), 0.1)
     put(window, 3, message(3, 20))
     window.frames_to_send(0.1)
@@ -289,12 +289,12 @@ def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has
         now_s += lag_s / 4
     behind_s = 10.0 + lag_s / 2  # when A confirmed the third
     assert window.slow_readers(behind_s + lag_s - 0.01) == []
-    due_s = window.next_slow_reader()
+    due_s = window.readers.next_slow()
     assert due_s is not None
     assert due_s == pytest.approx(behind_s + lag_s, abs=0.01)
     assert window.slow_readers(due_s) == [B]
     window.drop_reader(B)
-    assert window.next_slow_reader() is None
+    assert window.readers.next_slow() is None
     assert window.is_acknowledged()
 
 
@@ -306,7 +306,7 @@ def test_a_reader_that_lagged_behind_a_removed_one_is_not_slow() -> None:
     window.frames_to_send(0.0)
     window.handle_acknack(A, has(2), 0.1)
     window.drop_reader(A)
-    assert window.next_slow_reader() is None
+    assert window.readers.next_slow() is None
     assert window.slow_readers(2.0) == []
     assert window.slow_readers(READER_LEASE_S + 0.2) == [B]
 

@@ -226,7 +226,7 @@ def test_a_call_to_the_only_server_has_no_signature_where_both_ends_say_session(
         respond(replicas, server, "edge", b"y")
     assert replicas.run(2.0, lambda: all(each.is_done for each in calls))
     requests = [each for each in edge.member.writer_proxies() if each.topic != topic.name]
-    assert [each.delivered for each in requests] == [2]
+    assert [each.delivery.delivered for each in requests] == [2]
 
 
 def test_an_impossible_kind_of_signature_is_refused(replicas: Simulated) -> None:

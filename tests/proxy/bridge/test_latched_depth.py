@@ -60,7 +60,7 @@ def test_a_depth_that_is_found_holds_for_its_publisher_only(sites: Sites) -> Non
     sites.run(1)
     sites.every(0.01, 5, lambda number: talker.publish(string(str(number))))
     sites.run(5)
-    assert robot.stream._queue.depth == 1
+    assert robot.stream.queue.depth == 1
     talker.close()
     other = node(robot, 10)
     sites.run(1)
@@ -79,7 +79,7 @@ def test_a_publisher_that_is_never_quiet_is_not_probed(sites: Sites) -> None:
     sites.every(0.1, 100, lambda number: talker.publish(string(str(number))))
     sites.run(9)
     assert len(robot.graph.subscriptions("/map", STRING)) == 1
-    assert robot.stream._queue.depth == DEPTH_MAX
+    assert robot.stream.queue.depth == DEPTH_MAX
 
 
 def test_a_rule_says_how_much_is_kept(sites: Sites) -> None:

@@ -191,7 +191,12 @@ class Stage:
         member = machine.member
 
         def holders(name: Name, _now_s: float) -> set[Name]:
-            return {reader for each in member.publishers() if each.topic == name for reader in each.reader_names()}
+            return {
+                reader
+                for each in member.publishers()
+                if each.topic == name
+                for reader in map(Name, each.matched.names())
+            }
 
         answer_state(member.diagnostics, member.attachment._policy, gather, holders)
 

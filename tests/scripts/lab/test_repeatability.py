@@ -21,7 +21,7 @@ def tap(at_s, a, b, frame):
 
 made.flow.world.network.taps.append(tap)
 made.stream(10, 0.1, 40_000)
-assert made.flow.publisher.repairs
+assert made.flow.publisher.protection.repairs
 print(seen.hexdigest())
 """
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdp.client.publisher import Publisher
+from gdp.client.governing_paths import GoverningPaths
 from gdp.message.loss import Losses, LossReason, LostRange
 from proxy.bridge.core.adaptation import Adaptation, adaptation_of
 from proxy.reduce.adaptive import AdaptBounds
@@ -46,7 +46,7 @@ def run(
     for number in range(int(30 * seconds)):
         now_s = begin_s + number / 30
         path.acknowledged = max(sent - lag - path.losses.total, path.acknowledged)
-        if adaptation.may_send(path, now_s):
+        if adaptation.may_send(path.losses, path.acknowledged, path.path_bytes_s, now_s):
             sent += 1
             adaptation.handle_sent(sent, size, now_s)
     return sent - before
@@ -108,7 +108,7 @@ def test_the_rate_that_a_publisher_states_decides_about_quality_and_rate(
     wide, traffic.bytes_out = traffic.bytes_out / len(ear.heard), 0
     assert len(ear.heard) == 40
     ear.heard.clear()
-    monkeypatch.setattr(Publisher, "path_bytes_s", property(lambda _: wide * 20 / 4))
+    monkeypatch.setattr(GoverningPaths, "bytes_s", property(lambda _: wide * 20 / 4))
     sites.every(0.05, 100, lambda _: talker.publish(raw))
     sites.run(6)
     assert traffic.bytes_out < 6 * wide * 20 / 4
