@@ -122,7 +122,7 @@ class Delivery:
         self._gap_at = 0  # ... and the number that is missing
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
 
-    def begin(
+    def begin_stream(
         self, status: Heartbeat, start: StreamStart, before: Ended, *, is_latched: bool, is_restarted: bool
     ) -> None:
         """Begin at the publisher's start, and count what came between that and the last message read before."""

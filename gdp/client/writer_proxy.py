@@ -391,7 +391,9 @@ class WriterProxy:
             if start is None or start.incarnation != self._reader.incarnation:
                 return
             is_latched = bool(reassembled.flags & _LATCHED)
-            self.delivery.begin(status, start, self._before, is_latched=is_latched, is_restarted=self._is_restarted)
+            self.delivery.begin_stream(
+                status, start, self._before, is_latched=is_latched, is_restarted=self._is_restarted
+            )
             self.state = WriterProxyState.LIVE
         if status.description and reassembled.number > self._described:
             self.description, self._described = status.description, reassembled.number
