@@ -35,6 +35,7 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
 )
 from gdp.names import NAME_BYTES, Name
+from gdp.requests import Backoff, Requests
 from gdp.rib.watches import Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
@@ -42,7 +43,8 @@ from gdp.trust.domain import Policy
 
 __all__ = ["RibEndpoints"]
 
-_REPEAT_S: Final = (0.3, 0.8)  # after a change was sent to its watchers
+_CHANGES: Final = Backoff(0.3, 0.6)
+_CHANGE_TRIES: Final = 3  # nothing acknowledges a change
 _WATCH_S: Final = 30.0  # a switch that requests a record also gets changes for so long
 _LEASE_LEFT_S: Final = 1.0  # a lease that is about to end is not passed on
 
@@ -89,7 +91,7 @@ class RibEndpoints:
         self._watches = Watches(watches)
         self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
         self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
-        self._repeats = DueQueue[tuple[Name, int, float]]()  # of which switch, of which record, how long after it
+        self._changes = Requests[Name]()  # that watchers are told, by switch
         self._out: list[_Outgoing] = []
 
     def __len__(self) -> int:
@@ -163,10 +165,16 @@ class RibEndpoints:
             self.records.remove(record.name)
         else:
             self.records.put(record.name, record.sequence)
-        self._tell(kept, now.mono_s)
-        for after_s in _REPEAT_S:
-            self._repeats.put((record.name, record.sequence, after_s), now.mono_s + after_s)
+        self._changes.start(record.name, now.mono_s)
+        self._send_change(kept, now.mono_s)
         return kept
+
+    def _send_change(self, kept: _Kept, now_s: float) -> None:
+        name = kept.record.name
+        self._tell(kept, now_s)
+        self._changes.sent(name, now_s, _CHANGES)
+        if self._changes.tries(name) >= _CHANGE_TRIES:
+            self._changes.cancel(name)
 
     def _check(self, kept: _Kept, now: Timestamps) -> None:
         self._policy.check_member(kept.member, now.unix_s)
@@ -213,14 +221,16 @@ class RibEndpoints:
         for name in self._ends.poll_due(now.mono_s):
             self._drop(name)
         self._watches.expire(now.mono_s)
-        for name, sequence, _ in self._repeats.poll_due(now.mono_s):
+        for name in self._changes.poll_due(now.mono_s):
             known = self._kept.get(name)
-            if known is not None and known.record.sequence == sequence and self._is_valid(known, now):
-                self._tell(known, now.mono_s)
+            if known is not None and self._is_valid(known, now):
+                self._send_change(known, now.mono_s)
+            else:
+                self._changes.cancel(name)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._repeats.next_due(), self._ends.next_due()]
+        times = [self._changes.next_due(), self._ends.next_due()]
         return min((each for each in times if each is not None), default=None)
 
     def poll_statements(self) -> list[_Outgoing]:

@@ -8,25 +8,27 @@ The RIB also sends new records of the wanted switches when they come; queries ar
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, record_in
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
+from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of, rank_in
 from gdp.limits import ENDPOINT_LEASE_S
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 
 __all__ = ["EndpointExchange", "Refusal"]
 
 _RENEW_S: Final = ENDPOINT_LEASE_S / 3
-_AGAIN_S: Final = (0.3, 0.6, 1.2, 2.4, 4.8)  # until a response comes; the last one from then on
+_REPEATS: Final = Backoff(0.3, 4.8)
+_RECORD, _QUERY = StatementType.ENDPOINTS, StatementType.SYNC  # what is sent
 _QUERY_S: Final = 5.0
 
 
@@ -35,24 +37,6 @@ class Refusal(NamedTuple):
 
     reason: DropReason
     kept_sequence: int
-
-
-@dataclass(slots=True)
-class _Schedule:
-    """When a statement is due, until it is answered; infinity: never."""
-
-    due_s: float = float("inf")
-    tries: int = 0
-
-    def sent(self, now_s: float) -> None:
-        self.due_s = now_s + _AGAIN_S[min(self.tries, len(_AGAIN_S) - 1)]
-        self.tries += 1
-
-    def restart(self, now_s: float) -> None:
-        self.due_s, self.tries = now_s, 0
-
-    def answered(self, again_s: float) -> None:
-        self.due_s, self.tries = again_s, 0
 
 
 class EndpointExchange:
@@ -68,8 +52,7 @@ class EndpointExchange:
         self._policy = policy
         self._wanted: dict[Name, None] = {}
         self._known: dict[Name, tuple[EndpointRecord, Membership]] = {}
-        self._publication = _Schedule()
-        self._query = _Schedule()
+        self._requests = Requests[StatementType]()
         self.own: EndpointRecord | None = None
         self.refusal: Refusal | None = None
 
@@ -82,34 +65,34 @@ class EndpointExchange:
         if self.own is not None and record.sequence <= self.own.sequence:
             raise StatementError(DropReason.STALE, "own endpoint record")
         self.own, self.refusal = record, None
-        self._publication.restart(float("-inf"))
+        self._requests.start(_RECORD, float("-inf"))
 
     def want(self, names: Iterable[Name], now_s: float) -> None:
         """Learn the records of these switches, the first ``ENDPOINT_NAMES_MAX``, and of no others."""
         wanted = dict.fromkeys(list(names)[:ENDPOINT_NAMES_MAX])
         if wanted.keys() - self._wanted.keys():
-            self._query.restart(now_s)
+            self._requests.start(_QUERY, now_s)
         self._wanted = wanted
         if not wanted:
-            self._query = _Schedule()
+            self._requests.cancel(_QUERY)
         for name in self._known.keys() - wanted.keys():
             del self._known[name]
 
     def rib_changed(self, now_s: float) -> None:
         """Publish and query again: another RIB is used, or it was restarted."""
         if self.own is not None:
-            self._publication.restart(now_s)
+            self._requests.start(_RECORD, now_s)
         if self._wanted:
-            self._query.restart(now_s)
+            self._requests.start(_QUERY, now_s)
 
     def statements_to_send(self, now_s: float) -> list[bytes]:
         """Return the statements that are due at the RIB."""
         wires = []
-        if self.own is not None and self._publication.due_s <= now_s:
-            self._publication.sent(now_s)
-            wires.append(self.own.wire)
-        if self._query.due_s <= now_s:
-            self._query.sent(now_s)
+        for what in self._requests.poll_due(now_s):
+            self._requests.sent(what, now_s, _REPEATS)
+            if what is _RECORD and self.own is not None:
+                wires.append(self.own.wire)
+                continue
             lines = {name: line_of(name, record.sequence) for name, (record, _) in self._known.items()}
             query = SyncMessage(of=ENDPOINTS, lacking=tuple((name, lines.get(name, b"")) for name in self._wanted))
             wires.append(query.to_wire(self._identity.name, self._identity.key, self._identity.membership))
@@ -117,8 +100,7 @@ class EndpointExchange:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next statement, or None."""
-        due_s = min(self._publication.due_s, self._query.due_s)
-        return None if due_s == float("inf") else due_s
+        return self._requests.next_due()
 
     def receive(self, response: SyncMessage, now: Timestamps) -> None:
         """Process a response of the RIB in use.
@@ -131,15 +113,14 @@ class EndpointExchange:
             kept_sequence = next((rank_in(line) for name, line in response.lacking if name == own.name), 0)
             if response.refused is not None:
                 self.refusal = Refusal(response.refused, kept_sequence)
-                self._publication.answered(now.mono_s + _QUERY_S)
+                self._requests.answered(_RECORD, now.mono_s + _QUERY_S)
             elif kept_sequence == own.sequence:
                 self.refusal = None
-                if self._publication.tries:
-                    self._publication.answered(now.mono_s + _RENEW_S)
-            elif not self._publication.tries:
-                self._publication.restart(now.mono_s)  # the RIB has lost it
-        if self._wanted and self._query.tries:
-            self._query.answered(now.mono_s + _QUERY_S)
+                self._requests.answered(_RECORD, now.mono_s + _RENEW_S)
+            elif not self._requests.tries(_RECORD):
+                self._requests.start(_RECORD, now.mono_s)  # the RIB has lost it
+        if self._requests.tries(_QUERY):
+            self._requests.answered(_QUERY, now.mono_s + _QUERY_S)
         refused: StatementError | None = None
         for item in response.items:
             try:

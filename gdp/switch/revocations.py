@@ -20,10 +20,10 @@ from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, parse
-from gdp.due_queue import DueQueue
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
+from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
 from gdp.switch.dependents import AttachedAdvertisement, Dependents, JoinedBranch, KnownLocation
 from gdp.switch.evidence import Evidence
@@ -41,8 +41,7 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["RevocationHandler"]
 
 GRACE_S: Final = 0.5
-_FIRST_S: Final = (0.3, 1.0, 3.0)  # from the first send of a revocation to the RIB to the next ones
-_AGAIN_S: Final = 60.0
+_SUBMITTED: Final = Backoff(0.3, 60.0)  # of a revocation that the operator submitted
 _TICK_S: Final = 0.1
 _PER_TICK: Final = 4
 
@@ -78,7 +77,9 @@ class RevocationHandler:
         self._held = held
         self._sync = sync
         self._outbox = outbox
-        self._handed_in = _SubmittedRevocations()
+        self._handed_in: dict[bytes, bytes] = {}  # statements of owners that the operator submitted, by fingerprint
+        self._requests = Requests[bytes]()  # to the RIB, by fingerprint
+        self._next_send_s = float("-inf")
         self._sent_to: Name | None = None  # the RIB that received the operator's revocations
 
     def receive_revocation(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
@@ -104,26 +105,39 @@ class RevocationHandler:
         revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._held.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
-            self._handed_in.add(statement.fingerprint, statement.wire, now.mono_s)
+            self._handed_in[statement.fingerprint] = statement.wire
+            if statement.fingerprint not in self._requests:
+                self._requests.start(statement.fingerprint, now.mono_s)
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
     def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
-        """Return the revocations of the operator that are due at this RIB; expired ones are removed."""
+        """Return the few revocations of the operator that are due at this RIB; expired ones are removed.
+
+        A RIB keeps one only while a name that it concerns is stored or watched there, and acknowledges none. So each is
+        sent again and again: a later user of the name receives it.
+        """
         if rib != self._sent_to:
             self._sent_to = rib
-            self._handed_in.say_again(now_s)
+            self._requests.start_all(now_s)
+        if now_s < self._next_send_s:
+            return []
         wires = []
-        for fingerprint, wire in self._handed_in.poll_due(now_s):
-            revocation = Revocation.read(parse(wire))
+        for fingerprint in self._requests.poll_due(now_s, _PER_TICK):
+            self._next_send_s = now_s + _TICK_S
+            wire = self._handed_in[fingerprint]
+            revocation = Revocation.from_fields(parse(wire).fields)
             if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
+                self._requests.sent(fingerprint, now_s, _SUBMITTED)
                 wires.append(wire)
             else:
-                self._handed_in.remove(fingerprint)
+                self._requests.cancel(fingerprint)
+                del self._handed_in[fingerprint]
         return wires
 
     def next_due_for_rib(self) -> float | None:
         """Return the monotonic second at which the next revocation is due at the RIB, or None."""
-        return self._handed_in.next_due()
+        due_s = self._requests.next_due()
+        return None if due_s is None else max(due_s, self._next_send_s)
 
     def _spread(
         self, revocation: Revocation, statement: Statement, origin: Neighbour | None, now: Timestamps
@@ -187,53 +201,3 @@ class RevocationHandler:
         except StatementError:
             return False
         return True
-
-
-class _SubmittedRevocations:
-    """Revocations of owners that the operator submitted, by fingerprint, and when each is due at the RIB.
-
-    A RIB keeps one only while a name that it concerns is stored or watched there, and acknowledges none. So each is
-    sent four times at first, then once every ``_AGAIN_S``: a later user of the name receives it.
-    """
-
-    def __init__(self) -> None:
-        self._wires: dict[bytes, bytes] = {}
-        self._times: dict[bytes, int] = {}  # how often it was sent
-        self._due = DueQueue[bytes]()
-        self._tick_at_s = float("-inf")
-
-    def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
-        """Add a statement to send from now on."""
-        if fingerprint not in self._wires:
-            self._times[fingerprint] = 0
-            self._due.put(fingerprint, now_s)
-        self._wires[fingerprint] = wire
-
-    def remove(self, fingerprint: bytes) -> None:
-        """Stop sending a statement: it has expired."""
-        self._wires.pop(fingerprint, None)
-        self._due.discard(fingerprint)
-
-    def say_again(self, now_s: float) -> None:
-        """Send every statement again: there is another RIB."""
-        for fingerprint in self._wires:
-            self._times[fingerprint] = 0
-            self._due.put(fingerprint, now_s)
-
-    def poll_due(self, now_s: float) -> list[tuple[bytes, bytes]]:
-        """Return the few statements to send now, each with its fingerprint."""
-        if now_s < self._tick_at_s:
-            return []
-        due = self._due.poll_due(now_s, _PER_TICK)
-        for fingerprint in due:
-            times = self._times[fingerprint]
-            self._due.put(fingerprint, now_s + (_FIRST_S[times] if times < len(_FIRST_S) else _AGAIN_S))
-            self._times[fingerprint] += 1
-        if due:
-            self._tick_at_s = now_s + _TICK_S
-        return [(fingerprint, self._wires[fingerprint]) for fingerprint in due]
-
-    def next_due(self) -> float | None:
-        """Return the monotonic second of the next statement, or None."""
-        due_s = self._due.next_due()
-        return None if due_s is None else max(due_s, self._tick_at_s)
