@@ -20,7 +20,7 @@ from gdp.due_queue import DueQueue
 
 __all__ = ["Backoff", "Requests"]
 
-_EXPONENT_MAX: Final = 32  # 2**32 times the first pause is above every bound
+_GROWING_MAX: Final = 64  # 2**63 times the first pause is above every bound
 
 K = TypeVar("K")
 
@@ -33,15 +33,19 @@ class Backoff:
         first_s: after the first try.
         most_s: bound of a pause.
         equal: how many pauses have one length, before the next ones are twice as long.
+        growing: pauses below the bound; the later ones have that length.
     """
 
     first_s: float
     most_s: float
     equal: int = 1
+    growing: int = _GROWING_MAX
 
     def pause_s(self, tries: int) -> float:
         """Return the seconds to wait after so many tries; 0 counts as 1."""
-        return min(self.first_s * 2.0 ** min(max(tries - 1, 0) // self.equal, _EXPONENT_MAX), self.most_s)
+        if tries > self.growing:
+            return self.most_s
+        return min(self.first_s * 2.0 ** (max(tries - 1, 0) // self.equal), self.most_s)
 
     def random_pause_s(self, tries: int, chance: float) -> float:
         """Return the pause of one of many clients, which do not come back together.
@@ -91,9 +95,9 @@ class Requests(Generic[K]):
         state = self._states.get(key)
         return state is not None and not state.is_answered
 
-    def due_s(self, key: K) -> float:
-        """Return the monotonic second at which a request is due; infinity: never."""
-        return self._due.due_s(key)
+    def due_s(self, key: K, otherwise_s: float = float("inf")) -> float:
+        """Return the monotonic second at which a request is due, or ``otherwise_s`` if it never is."""
+        return self._due.due_s(key) if key in self._due else otherwise_s
 
     def start(self, key: K, at_s: float) -> None:
         """Have a request due at a second, as one that was neither tried nor answered; infinity: it is known only."""

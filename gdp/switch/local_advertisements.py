@@ -81,7 +81,7 @@ class LocalAdvertisements:
         key, relay_at_s = (advertisement.name, advertisement.node), now_s
         before = self.get(advertisement.name, advertisement.node)
         if before is not None and before.is_slow and not before.is_settled and (before.port, before.mac) == (port, mac):
-            relay_at_s, attachment.is_slow = max(self._relays.due_s(key), now_s), True
+            relay_at_s, attachment.is_slow = max(self._relays.due_s(key, now_s), now_s), True
         self._by_name.setdefault(advertisement.name, {})[advertisement.node] = attachment
         self._relays.start(key, relay_at_s)
         self._ends.put(key, attachment.expires_s)

@@ -28,6 +28,7 @@ __all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX",
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
 _QUERIES: Final = Backoff(RETRY_S, 2.0, equal=TRIES_MAX)
+_RENEWALS: Final = 3  # repeated soon; on a link whose queue is full, more would keep it full
 QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
 BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
 USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
@@ -55,8 +56,8 @@ class NameQueries:
     def __init__(self, watch_s: float = ADVERTISEMENT_LEASE_S) -> None:
         self.watch_s = watch_s
         self._use_watch_s = 2 * watch_s
-        self._watch_renewals = Backoff(RETRY_S, watch_s / 4)
-        self._use_renewals = Backoff(RETRY_S, watch_s / 2)
+        self._watch_renewals = Backoff(RETRY_S, watch_s / 4, growing=_RENEWALS)
+        self._use_renewals = Backoff(RETRY_S, watch_s / 2, growing=_RENEWALS)
         self._queries: dict[Name, _Query] = {}
         self._requests = Requests[Name]()
         self._window = QueryWindow()

@@ -29,6 +29,10 @@ def test_the_first_pauses_may_be_equal() -> None:
     assert [Backoff(1.0, 9.0, equal=3).pause_s(tries) for tries in range(1, 8)] == [1, 1, 1, 2, 2, 2, 4]
 
 
+def test_pauses_may_grow_a_few_times_only() -> None:
+    assert [Backoff(1.0, 9.0, growing=2).pause_s(tries) for tries in range(1, 5)] == [1, 2, 9, 9]
+
+
 @given(st.integers(0, 2**40), st.floats(0, 1, exclude_max=True))
 def test_a_random_pause_is_between_half_of_the_pause_and_all_of_it(tries: int, chance: float) -> None:
     assert PAUSES.pause_s(tries) / 2 <= PAUSES.random_pause_s(tries, chance) <= PAUSES.pause_s(tries)

@@ -318,7 +318,7 @@ def test_a_statement_with_a_switch_twice_in_its_route_is_malformed() -> None:
         )  # fmt: skip
         identity = at.world.identities["s2"]
         statement = parse(join.to_wire(identity.name, identity.key))
-        with pytest.raises(StatementError, match=r"route|list"):
+        with pytest.raises(StatementError, match=r"route|'r'"):
             Join.from_fields(statement.fields)
 
 
