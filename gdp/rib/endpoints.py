@@ -91,7 +91,7 @@ class RibEndpoints:
         self._watches = Watches(watches)
         self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
         self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
-        self._changes = Requests[Name]()  # that watchers are told, by switch
+        self._changes = Requests[Name]()  # for watchers, by switch
         self._out: list[_Outgoing] = []
 
     def __len__(self) -> int:

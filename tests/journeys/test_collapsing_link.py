@@ -119,9 +119,7 @@ def test_a_link_that_collapses_stays_up_carries_what_is_urgent_and_recovers(kbit
 
 
 @pytest.mark.nightly
-@pytest.mark.xfail(
-    reason="a third fill the FIFO again from 10 s on, for some 7 s; the cause is not known"
-)
+@pytest.mark.xfail(reason="a third fill the FIFO again from 10 s on, for some 7 s; the cause is not known")
 @pytest.mark.parametrize("before_s", [1.7, 2.0, 2.1, 2.3, 2.6])
 def test_no_new_queue_forms_on_a_link_that_collapsed(before_s: float) -> None:
     collapse = Collapse()
