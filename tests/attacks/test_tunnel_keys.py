@@ -36,7 +36,7 @@ class Border:
         device.peers.return_value = {}
         runtime, switch = MagicMock(), MagicMock()
         runtime.add_port.side_effect = itertools.count()
-        switch.hello_protocol.neighbour.side_effect = lambda _, name: name if name in self.up else None
+        switch.hello_protocol.neighbours.get.side_effect = lambda _, name: name if name in self.up else None
         identity = MagicMock()
         identity.name = A
         self.tunnels = Tunnels(identity=identity, switch=switch, runtime=runtime, underlays=(device,))
