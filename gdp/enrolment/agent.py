@@ -22,9 +22,9 @@ from typing import Final
 from gdp.config.config import SwitchConfig
 from gdp.config.relay_config import RelayConfig
 from gdp.control.endpoint_record import EndpointRecord
-from gdp.crypto.certificates import Membership, Root, Unverified
-from gdp.crypto.fields import Fields
+from gdp.crypto.certificates import Membership, Unverified
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import FLAG, OCTETS, Keyed
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.domain_client import ReceivedMail, delete_mail, fetch_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
@@ -55,8 +55,14 @@ from gdp.stores.keyring import (
 )
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment_wire import INSTANCE_BYTES, MEMBERS_MAX, EnrolmentError, UnreachableError
-from gdp.trust.join_token import SERVERS_MAX
+from gdp.trust.enrolment_wire import (
+    INSTANCE_BYTES,
+    MEMBERS,
+    DomainNews,
+    EnrolmentError,
+    InstallRequest,
+    UnreachableError,
+)
 
 __all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]
 
@@ -68,7 +74,6 @@ _BACKOFF: Final = Backoff(1.0, 60.0)
 _REFUSED_S: Final = 300.0  # after a refusal, which rarely changes by itself
 _RENEW_SHARE: Final = 2 / 3
 _RELOAD_S: Final = 5.0
-_BORDERS_MAX: Final = 16
 
 MailHandler = Callable[[MemberFiles, ReceivedMail], None]
 
@@ -137,11 +142,11 @@ class Agent:
                 while not self._ended.is_set():
                     self._renew(channel)
                     request = {"op": "poll", "digest": digest, "wait_s": self._poll_s if digest else 0.0}
-                    news = channel.request(request, timeout_s=self._poll_s + _RELOAD_S)
-                    if news.bytes_("digest") != digest:
-                        self._take_news(news)
-                        digest = news.bytes_("digest")
-                    if news.flag("mail"):
+                    answer = channel.request(request, timeout_s=self._poll_s + _RELOAD_S)
+                    if (current := Keyed("digest", OCTETS).read(answer)) != digest:
+                        self._take_news(DomainNews.from_fields(answer))
+                        digest = current
+                    if Keyed("mail", FLAG).read(answer):
                         self._take_mail(channel)
                     self._succeeded(channel)
             except RemoteError as error:
@@ -155,8 +160,8 @@ class Agent:
         if switch.member.not_after_unix_s < self._clock():
             return  # after the renewal
         record = own_record(switch, _uplinks(self._files.directory), ())
-        cards = [read_public(each / CARD) for each in self._files.nodes]
-        channel.request({"op": "install", "cards": cards, "record": record.wire})
+        cards = tuple(read_public(each / CARD) for each in self._files.nodes)
+        channel.request({"op": "install", **InstallRequest(cards, record.wire).to_fields()})
 
     def _renew(self, channel: Channel) -> None:
         """Renew the memberships that have little left; the nodes keep their keys and names."""
@@ -166,7 +171,7 @@ class Agent:
         certificates = [_certificate(each).wire for each in due]
         answer = channel.request({"op": "renew", "certificates": certificates})
         changed = False
-        for node, certificate in zip(due, answer.byte_strings("members", MEMBERS_MAX), strict=True):
+        for node, certificate in zip(due, MEMBERS.read(answer), strict=True):
             if certificate != _certificate(node).wire:
                 member = Membership.from_wire(certificate, channel.root, self._clock())
                 save_identity(node, load_node_keys(node).admitted(member, channel.root), force=True)
@@ -176,9 +181,8 @@ class Agent:
         if changed:
             self._announce(channel)
 
-    def _take_news(self, news: Fields) -> None:
-        root = Root.from_wire(news.bytes_("root"))
-        known = load_root(self._files.domain.root)
+    def _take_news(self, news: DomainNews) -> None:
+        root, known = news.root, load_root(self._files.domain.root)
         roots, present = [each.wire for each in root.lineage], [each.wire for each in known.lineage]
         if len(roots) > len(present) and roots[: len(present)] == present:
             for node in self._files.nodes:
@@ -187,8 +191,7 @@ class Agent:
         if self._files.is_border:
             return  # its folder of peers is the enrolment server's
         policy = Policy(root, [])
-        wires = news.byte_strings("borders", _BORDERS_MAX)
-        borders = [EndpointRecord.verified(each, policy, self._clock())[0] for each in wires]
+        borders = [EndpointRecord.verified(each, policy, self._clock())[0] for each in news.borders]
         peers = self._files.config.peers
         files = {record_file_name(each.name): public(each.wire) for each in borders}
         changed = {name: file for name, file in files.items() if not _holds(peers / name, file.data)}
@@ -196,7 +199,7 @@ class Agent:
         for path in peers.glob(f"*{RECORD_SUFFIX}"):
             if borders and path.name not in files:
                 path.unlink(missing_ok=True)
-        self._follow_relays({each.name: news.texts("relays", SERVERS_MAX) for each in borders})
+        self._follow_relays({each.name: news.relays for each in borders})
 
     def _follow_relays(self, relays: Mapping[Name, Sequence[str]]) -> None:
         """Dial the relays where they are now: the relay ends, and whatever runs it starts it again."""

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Root
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import FLAG, Keyed, text
 from gdp.crypto.server_certificate import channel_binding, verify_server_certificate
 from gdp.errors import StatementError
 from gdp.host_port import split_host_port
@@ -25,9 +25,12 @@ from gdp.relay.client_hello import ENROLMENT_ALPN
 from gdp.trust.enrolment_wire import (
     CLOCKS_APART_MAX_S,
     LENGTH_BYTES,
-    NONCE_BYTES,
     RESPONSE_MAX_BYTES,
+    TEXT,
     EnrolmentError,
+    Greeting,
+    MemberProof,
+    Message,
     Refusal,
     UnreachableError,
     encode_message,
@@ -86,7 +89,7 @@ class Channel:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def request(self, fields: Mapping[str, object], *, timeout_s: float = CONNECT_S) -> Fields:
+    def request(self, fields: Mapping[str, object], *, timeout_s: float = CONNECT_S) -> Message:
         """Send a request and return the response.
 
         Raises:
@@ -98,15 +101,15 @@ class Channel:
             self._peer.settimeout(timeout_s)
             self._peer.sendall(encode_message(fields))
             response = _receive(self._peer, end_s, RESPONSE_MAX_BYTES)
-            if response.flag("ok"):
+            if Keyed("ok", FLAG).read(response):
                 return response
-            code, text = response.text("code", 64), response.text("error")
+            code, words = Keyed("code", text(64)).read(response), Keyed("error", TEXT).read(response)
         except OSError as error:
             raise UnreachableError(f"{self.server}: the connection broke: {_reason(error)}") from error
         except StatementError as error:
             raise UnreachableError(f"{self.server}: a response that cannot be read: {error}") from error
         known = {each.value: each for each in Refusal}
-        raise EnrolmentError(known.get(code), f"{self.server}: {text}")
+        raise EnrolmentError(known.get(code), f"{self.server}: {words}")
 
     def identify(self, identity: Identity, instance: bytes) -> None:
         """Prove to be a member; later requests are this member's.
@@ -118,7 +121,7 @@ class Channel:
             EnrolmentError: NO_MEMBER or TWO_MACHINES, or as ``request``.
         """
         proof = prove_member(identity.key, self.binding, self.nonce, instance)
-        self.request({"op": "member", "certificate": identity.membership, "signature": proof, "instance": instance})
+        self.request({"op": "member", **MemberProof(identity.membership, proof, instance).to_fields()})
 
 
 def connect_any(servers: Sequence[str], fingerprint: bytes, *, timeout_s: float = CONNECT_S) -> Channel:
@@ -155,7 +158,7 @@ def connect(
         try:
             plain = stack.enter_context(_connected(server, timeout_s))
             peer = stack.enter_context(client_context().wrap_socket(plain))
-            greeting = _receive(peer, end_s, _GREETING_MAX_BYTES)
+            greeting = Greeting.from_fields(_receive(peer, end_s, _GREETING_MAX_BYTES))
         except ssl.SSLError as error:
             raise UnreachableError(f"{server}: no TLS 1.3 of an enrolment server: {_reason(error)}") from error
         except OSError as error:
@@ -177,20 +180,16 @@ def _connected(server: str, timeout_s: float) -> socket.socket:
 
 
 def _verified(
-    peer: ssl.SSLSocket, certificate: bytes, greeting: Fields, fingerprint: bytes, server: str, unix_s: float
+    peer: ssl.SSLSocket, certificate: bytes, greeting: Greeting, fingerprint: bytes, server: str, unix_s: float
 ) -> Channel:
-    try:
-        root = Root.from_wire(greeting.bytes_("root"))
-        nonce, now = greeting.bytes_("nonce", NONCE_BYTES), greeting.uint("now")
-    except StatementError as error:
-        raise EnrolmentError(None, f"{server}: no enrolment server answers there: {error}") from error
+    root = greeting.root
     if fingerprint_of(root) != fingerprint:
         raise EnrolmentError(
             None,
             f"{server}: this server belongs to another domain ({root.label!r}): the token is for another domain, or"
             " somebody stands between this machine and the server; nothing was sent",
         )
-    apart_s = unix_s - now
+    apart_s = unix_s - greeting.unix_s
     if abs(apart_s) > CLOCKS_APART_MAX_S:
         amount = f"{abs(apart_s) / _HOUR_S:.1f} hours {'ahead of' if apart_s > 0 else 'behind'}"
         raise EnrolmentError(None, f"this machine's clock is {amount} the server's: set the clock, then try again")
@@ -202,10 +201,10 @@ def _verified(
             f"{server}: the server shows the domain's root, but not its key ({error}): somebody stands between this"
             " machine and the server; nothing was sent",
         ) from error
-    return Channel(peer, root, binding=channel_binding(certificate), nonce=nonce, server=server)
+    return Channel(peer, root, binding=channel_binding(certificate), nonce=greeting.nonce, server=server)
 
 
-def _receive(peer: ssl.SSLSocket, end_s: float, maximum: int) -> Fields:
+def _receive(peer: ssl.SSLSocket, end_s: float, maximum: int) -> Message:
     size = message_bytes(_exactly(peer, LENGTH_BYTES, end_s), maximum)
     return read_message(_exactly(peer, size, end_s))
 

@@ -19,10 +19,9 @@ from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Membership, Root, Unverified
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import node_metadata
 from gdp.crypto.kem import KemPublicKey
-from gdp.crypto.keys import SIGNATURE_BYTES
+from gdp.crypto.schema import OCTETS, Keyed, inner, many, octets, text, uint
 from gdp.crypto.statements import parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.x509_profile import SubjectInfo, read_request
@@ -40,13 +39,22 @@ from gdp.token_bucket import TokenBuckets
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment_wire import (
-    INSTANCE_BYTES,
+    DELEGATIONS,
+    MEMBERS,
     MEMBERS_MAX,
     NONCE_BYTES,
+    PAGE,
     RESPONSE_MAX_BYTES,
     VERSION,
     Application,
+    DomainNews,
     EnrolmentError,
+    Greeting,
+    InstallRequest,
+    ListedMachine,
+    ListedMail,
+    MemberProof,
+    Message,
     Refusal,
     read_message,
     verify_member_proof,
@@ -56,11 +64,10 @@ from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["OPENED_MAX", "PAGE", "EnrolmentDesk", "MemberConnection", "refusal_of"]
+__all__ = ["OPENED_MAX", "EnrolmentDesk", "MemberConnection", "refusal_of"]
 
 log = logging.getLogger(__name__)
 
-PAGE: Final = 64  # machines or mails in one response
 OPENED_MAX: Final = 64  # requests per token, an hour, whose keys are verified; a machine needs one, or a few
 _HOUR_S: Final = 3_600.0
 _PROOF_BYTES: Final = 32
@@ -123,9 +130,9 @@ class EnrolmentDesk:
 
     def greeting(self, nonce: bytes, unix_s: float) -> dict[str, object]:
         """Return the server's first message."""
-        return {"v": VERSION, "root": self.root.to_pem(), "nonce": nonce, "now": int(unix_s)}
+        return Greeting(VERSION, self.root, nonce, int(unix_s)).to_fields()
 
-    def join(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Fields:
+    def join(self, fields: Message, binding: bytes, nonce: bytes, unix_s: float) -> Message:
         """Return the response to a request to join.
 
         Raises:
@@ -147,7 +154,7 @@ class EnrolmentDesk:
                 error.about = token.label
             raise
 
-    def _admitted(self, token: TokenRow, fields: Fields, unix_s: float) -> Fields:
+    def _admitted(self, token: TokenRow, fields: Message, unix_s: float) -> Message:
         role, plan = JoinRole(token.role), token.plan
         if role.is_of_cluster and plan is None:
             raise EnrolmentError(Refusal.USED, "the launcher of this machine has withdrawn its token")
@@ -168,10 +175,10 @@ class EnrolmentDesk:
             return read_message(token.answer)
         days = self._days(None if plan is None else plan.until_unix_s, unix_s)
         members = [admit(self._config.domain, each.request, days=days, unix_s=unix_s) for each in applications]
-        issued = {"members": [each.wire for each in members]}
+        issued: dict[str, object] = {MEMBERS.key: [each.wire for each in members]}
         if plan is not None:
-            issued["delegations"] = self._delegations(plan, _Node(members[-1].subject, applications[-1].kem), unix_s)
-        answer = encode({"ok": True, **issued, "label": label, **self.news(unix_s)})
+            issued[DELEGATIONS.key] = self._delegations(plan, _Node(members[-1].subject, applications[-1].kem), unix_s)
+        answer = encode({"ok": True, **issued, "label": label, **self.news(unix_s).to_fields()})
         if len(answer) > RESPONSE_MAX_BYTES:
             raise LocalError(f"{label}: a response of {len(answer)} bytes; at most {RESPONSE_MAX_BYTES} are allowed")
         self._registry.complete_token(token.id, machine, members, answer)
@@ -200,15 +207,12 @@ class EnrolmentDesk:
         first = f"; enrolled first is {nodes[-1].name.to_text()[:16]}" if nodes else ""
         return f"{_KNOWN}: the token was used again with another key{first}"
 
-    def news(self, unix_s: float) -> dict[str, object]:
-        """Return what every member follows: the root, roots of other domains, borders, the owner's key."""
-        return {
-            "root": self.root.to_pem(),
-            "trusts": [read_public(each) for each in self._config.trusts],
-            "borders": [each.wire for each in self.borders(unix_s)],
-            "relays": list(self._config.relays),
-            "owner": read_public(self._config.owner / OWNER_PUBLIC),
-        }
+    def news(self, unix_s: float) -> DomainNews:
+        """Return what every member follows."""
+        trusts = tuple(read_public(each) for each in self._config.trusts)
+        borders = tuple(each.wire for each in self.borders(unix_s))
+        owner = read_public(self._config.owner / OWNER_PUBLIC)
+        return DomainNews(self.root, trusts, borders, tuple(self._config.relays), owner)
 
     def borders(self, unix_s: float) -> list[EndpointRecord]:
         """Return the border's endpoint record, which it signs itself; none: machines have links of their own."""
@@ -222,25 +226,25 @@ class EnrolmentDesk:
             self._border, self._border_certificate = own_record(identity, 1, candidates), certificate
         return [self._border]
 
-    def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> MemberConnection:
+    def identify(self, fields: Message, binding: bytes, nonce: bytes, unix_s: float) -> MemberConnection:
         """Return the session of a member that proves its key; its membership may have expired, to be renewed.
 
         Raises:
             EnrolmentError: NO_MEMBER.
             StatementError: malformed, or the proof is wrong.
         """
-        stranger = Unverified.from_wire(fields.bytes_("certificate"))
-        instance = fields.bytes_("instance", INSTANCE_BYTES)
+        proof = MemberProof.from_fields(fields)
+        stranger = Unverified.from_wire(proof.certificate)
         machine = self._registry.machine_of(stranger.subject.name)
         if machine is None or machine.removed_unix_s is not None:
             self.refused("no member", stranger.subject.name)
             gone = "was removed from" if machine is not None else "is no member of"
             raise EnrolmentError(Refusal.NO_MEMBER, f"this machine {gone} the domain; join again with a new token")
         stranger.verify(self.root, min(unix_s, stranger.validity.not_after_unix_s))
-        verify_member_proof(stranger.key, fields.bytes_("signature", SIGNATURE_BYTES), binding, nonce, instance)
-        return MemberConnection(stranger.subject.name, machine.id, instance)
+        verify_member_proof(stranger.key, proof.signature, binding, nonce, proof.instance)
+        return MemberConnection(stranger.subject.name, machine.id, proof.instance)
 
-    def install(self, session: MemberConnection, fields: Fields, unix_s: float) -> None:
+    def install(self, session: MemberConnection, fields: Message, unix_s: float) -> None:
         """Store a machine's node descriptors, and open the border for its switch.
 
         Raises:
@@ -249,11 +253,11 @@ class EnrolmentDesk:
         """
         machine = self._member(session.machine)
         nodes = {each.name for each in machine.nodes}
-        root = self.root
-        cards = [NodeDescriptor.from_wire(each) for each in fields.byte_strings("cards", MEMBERS_MAX)]
+        root, asked = self.root, InstallRequest.from_fields(fields)
+        cards = [NodeDescriptor.from_wire(each) for each in asked.cards]
         for each in cards:
             each.member_of(root, unix_s)
-        record, _ = EndpointRecord.verified(fields.bytes_("record"), Policy(root, []), unix_s)
+        record, _ = EndpointRecord.verified(asked.record, Policy(root, []), unix_s)
         if not {record.name, *(each.name for each in cards)} <= nodes:
             raise EnrolmentError(Refusal.WRONG_NODES, "descriptors or an endpoint record of another machine's nodes")
         if record.candidates:  # else a member could aim the border's packets at any address
@@ -272,7 +276,7 @@ class EnrolmentDesk:
                 (peers / file).unlink(missing_ok=True)
                 raise
 
-    def renew(self, session: MemberConnection, fields: Fields, unix_s: float) -> dict[str, object]:
+    def renew(self, session: MemberConnection, fields: Message, unix_s: float) -> dict[str, object]:
         """Return new memberships of a machine's nodes; one that can gain little is returned as it is.
 
         Raises:
@@ -283,7 +287,7 @@ class EnrolmentDesk:
         machine = self._member(session.machine)
         nodes, end_s = {each.name: each for each in machine.nodes}, machine.end_unix_s
         wires, new = list[bytes](), list[Membership]()
-        for wire in fields.byte_strings("certificates", MEMBERS_MAX):
+        for wire in Keyed("certificates", MEMBERS.form).read(fields):
             stranger = Unverified.from_wire(wire)
             known = nodes.get(stranger.subject.name)
             if known is None:
@@ -297,25 +301,19 @@ class EnrolmentDesk:
             new.append(renew(self._config.domain, wire, days=self._days(end_s, unix_s), unix_s=unix_s))
             wires.append(new[-1].wire)
         self._registry.renewed(new)
-        return {"ok": True, "members": wires}
+        return {"ok": True, MEMBERS.key: wires}
 
-    def nodes(self, session: MemberConnection, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
+    def nodes(self, session: MemberConnection, fields: Message, is_online: Callable[[int], bool]) -> dict[str, object]:
         """Return one page of the directory of machines."""
         self._member(session.machine)
-        machines = self._registry.machines(after=fields.text("after", 64), limit=PAGE)
-        listed = [
-            {
-                "label": each.label,
-                "role": each.role,
-                "cards": [node.card for node in each.nodes if node.card is not None],
-                "online": is_online(each.id),
-                "seen": int(each.seen_unix_s),
-            }
-            for each in machines
-        ]
+        listed = list[object]()
+        for each in self._registry.machines(after=Keyed("after", text(64)).read(fields), limit=PAGE):
+            cards = tuple(node.card for node in each.nodes if node.card is not None)
+            machine = ListedMachine(each.label, each.role, cards, is_online(each.id), int(each.seen_unix_s))
+            listed.append(machine.to_fields())
         return {"ok": True, "nodes": listed}
 
-    def send(self, session: MemberConnection, fields: Fields, unix_s: float) -> Name:
+    def send(self, session: MemberConnection, fields: Message, unix_s: float) -> Name:
         """Store a mail and return its recipient.
 
         Raises:
@@ -323,19 +321,19 @@ class EnrolmentDesk:
             StatementError: malformed, not by this member, or EXPIRED: under a membership that its recipient refuses.
         """
         self._member(session.machine)
-        mail = Mail.from_wire(fields.bytes_("mail"))
+        mail = Mail.from_wire(Keyed("mail", OCTETS).read(fields))
         if mail.sender.subject.name != session.name:
             raise EnrolmentError(Refusal.WRONG_PROOF, "a mail by another sender")
         mail.sender.validity.check(unix_s, "the membership in a mail")
         self._registry.add_mail(mail.to, session.name, mail.wire)
         return mail.to
 
-    def mail_page(self, session: MemberConnection, fields: Fields) -> dict[str, object]:
+    def mail_page(self, session: MemberConnection, fields: Message) -> dict[str, object]:
         """Return a page of the member's mail; what it fetched before is deleted."""
         self._member(session.machine)
-        since = fields.uint("since", (1 << 63) - 1)
+        since = Keyed("since", uint((1 << 63) - 1)).read(fields)
         mail = self._registry.mail_of(session.name, since, PAGE)
-        return {"ok": True, "mail": [{"n": each.id, "m": each.wire} for each in mail]}
+        return {"ok": True, "mail": [ListedMail(each.id, each.wire).to_fields() for each in mail]}
 
     def status(self, session: MemberConnection, unix_s: float) -> tuple[dict[str, object], bytes]:
         """Return what a poll answers, and a digest by which the member knows it again.
@@ -345,7 +343,7 @@ class EnrolmentDesk:
         """
         self._member(session.machine)
         self._registry.saw(session.machine, unix_s)
-        news = self.news(unix_s)
+        news = self.news(unix_s).to_fields()
         digest = hashlib.sha256(encode(news)).digest()
         return {"ok": True, **news, "digest": digest, "mail": self._registry.has_mail(session.name)}, digest
 
@@ -362,12 +360,12 @@ class EnrolmentDesk:
         """Write the pending lines of the audit log. Raises ``LocalError``: it cannot be written."""
         self._audit.write(self._trail, time.monotonic(), time.time())
 
-    def _proven_token(self, fields: Fields, binding: bytes, nonce: bytes) -> TokenRow:
-        token = self._registry.find_token(fields.bytes_("id", JOIN_ID_BYTES))
+    def _proven_token(self, fields: Message, binding: bytes, nonce: bytes) -> TokenRow:
+        token = self._registry.find_token(Keyed("id", octets(JOIN_ID_BYTES)).read(fields))
         if token is None:
             raise EnrolmentError(Refusal.UNKNOWN_TOKEN, "this domain did not make the token, or it ended long ago")
         untagged = encode({key: value for key, value in fields.items() if key != "mac"})
-        proof = fields.bytes_("mac", _PROOF_BYTES)
+        proof = Keyed("mac", octets(_PROOF_BYTES)).read(fields)
         if len(nonce) != NONCE_BYTES or not hmac.compare_digest(join_proof(token.mac, binding, nonce, untagged), proof):
             raise EnrolmentError(Refusal.WRONG_PROOF, "the request is not by the holder of the token")
         return token
@@ -423,9 +421,11 @@ class EnrolmentDesk:
         return machine
 
 
-def _applications(fields: Fields, role: JoinRole, identifier: bytes) -> tuple[list[Application], list[SubjectInfo]]:
+def _applications(
+    fields: Message, role: JoinRole, identifier: bytes
+) -> tuple[Sequence[Application], list[SubjectInfo]]:
     """Return the applications and their subjects: exactly the nodes of the role, each with a valid key proof."""
-    applications = [Application.from_fields(each) for each in fields.maps("nodes", MEMBERS_MAX)]
+    applications = Keyed("nodes", many(inner(Application), MEMBERS_MAX)).read(fields)
     holders = [read_request(each.request) for each in applications]
     wanted = [(node_role.value, holders[0].label if holders else "") for _, node_role in role.nodes]
     if [(each.unit, each.label) for each in holders] != wanted:

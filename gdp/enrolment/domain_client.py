@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
+from gdp.crypto.schema import Keyed, inner, many
 from gdp.crypto.statements import parse
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.member_files import MemberFiles
@@ -36,7 +36,7 @@ from gdp.nodes.membership import load_policy
 from gdp.stores.files import NewFile, private, read_private, write_all
 from gdp.stores.keyring import load_identity
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment_wire import INSTANCE_BYTES
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, PAGE, ListedMachine, ListedMail
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 
@@ -44,8 +44,8 @@ __all__ = ["DomainClient", "Machine", "ReceivedMail", "delete_mail", "fetch_mail
 
 log = logging.getLogger(__name__)
 
-MACHINES_PAGE: Final = 64
-MAIL_PAGE: Final = 64
+_MACHINES: Final = Keyed("nodes", many(inner(ListedMachine), PAGE))
+_MAILS: Final = Keyed("mail", many(inner(ListedMail), PAGE))
 INBOX_MAX: Final = 4_096  # files; more mail waits at the server
 _MAIL: Final = re.compile(r"([0-9]{16})\.mail")
 
@@ -142,7 +142,7 @@ class DomainClient:
         """
         found: list[Machine] = []
         after = ""
-        while page := self._channel.request({"op": "nodes", "after": after}).maps("nodes", MACHINES_PAGE):
+        while page := _MACHINES.read(self._channel.request({"op": "nodes", "after": after})):
             found += [self._machine(each) for each in page]
             after = found[-1].label
         return found
@@ -184,18 +184,18 @@ class DomainClient:
         """Delete a mail of the inbox that was handled; no effect if it is gone."""
         delete_mail(self._files.inbox, number)
 
-    def _machine(self, fields: Fields) -> Machine:
-        cards = [NodeDescriptor.from_wire(each) for each in fields.byte_strings("cards", 4)]
+    def _machine(self, listed: ListedMachine) -> Machine:
+        cards = [NodeDescriptor.from_wire(each) for each in listed.cards]
         now = time.time()
         for each in cards:
             self._policy.verify_membership(each.stranger.wire, now)
         return Machine(
-            label=fields.text("label", 64),
-            role=fields.text("role", 16),
+            label=listed.label,
+            role=listed.role,
             switch=next((each for each in cards if each.stranger.role.is_switch), None),
             proxy=next((each for each in cards if not each.stranger.role.is_switch), None),
-            is_online=fields.flag("online"),
-            seen_unix_s=fields.uint("seen"),
+            is_online=listed.is_online,
+            seen_unix_s=listed.seen_unix_s,
         )
 
 
@@ -211,22 +211,21 @@ def fetch_mail(channel: Channel, inbox: Path) -> int:
     """
     held = _held_by_sender(inbox)
     since = fetched = 0
-    while page := channel.request({"op": "receive", "since": since}).maps("mail", MAIL_PAGE):
+    while page := _MAILS.read(channel.request({"op": "receive", "since": since})):
         if held.total() + len(page) > INBOX_MAX:
             raise LocalError(f"{inbox}: holds {INBOX_MAX} mails; delete those that were handled")
         files = dict[str, NewFile]()
         for each in page:
-            wire = each.bytes_("m")
-            sender = _sender_of(wire)
+            sender = _sender_of(each.mail)
             if held[sender] >= INBOX_MAX // 4:
                 log.warning(
                     "mail dropped sender=%s reason=it has %d mails here already", sender.hex()[:6], held[sender]
                 )
                 continue
             held[sender] += 1
-            files[_mail_path(inbox, each.uint("n")).name] = private(wire)
+            files[_mail_path(inbox, each.number).name] = private(each.mail)
         write_all(inbox, files, force=True)
-        since = max(each.uint("n") for each in page)
+        since = max(each.number for each in page)
         fetched += len(files)
     return fetched
 

@@ -18,7 +18,6 @@ from typing import Final
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Role, Root
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import PublicKey
 from gdp.enrolment.channel import Channel, connect_any
@@ -33,22 +32,23 @@ from gdp.stores.keyring import CARD, OWNER_PUBLIC, REQUEST, load_node_keys
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment_wire import (
-    DELEGATIONS_MAX,
+    DELEGATIONS,
     INSTANCE_BYTES,
-    MEMBERS_MAX,
+    MEMBERS,
+    DomainNews,
     EnrolmentError,
+    InstallRequest,
+    Message,
     UnreachableError,
     apply,
 )
-from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
+from gdp.trust.join_token import JoinToken, join_id, join_key, join_proof
 
 __all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
 
 log = logging.getLogger(__name__)
 
 _UNUSED: Final = "the token was not used"
-_TRUSTS_MAX: Final = 64
-_BORDERS_MAX: Final = 16
 _RETRY_S: Final = 30.0  # after a connection
 _PAUSE_MIN_S: Final = 0.2
 _PAUSE_MAX_S: Final = 5.0
@@ -117,8 +117,8 @@ def join_domain(
         request = replace(request, token=prefer_server(request.token, server))
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
-        cards = [read_public(draft / folder / CARD) for folder, _ in members]
-        _announce(request, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
+        cards = tuple(read_public(draft / folder / CARD) for folder, _ in members)
+        _announce(request, identities[-1], InstallRequest(cards, record.wire), wait)
         publish_draft(draft, request.directory)
     return Joined(
         root=root,
@@ -131,13 +131,13 @@ def join_domain(
     )
 
 
-def _ask(request: JoinRequest, nodes: Sequence[NodeKeys], wait: Callable[[float], None]) -> tuple[Fields, Root, str]:
+def _ask(request: JoinRequest, nodes: Sequence[NodeKeys], wait: Callable[[float], None]) -> tuple[Message, Root, str]:
     """Return the response of the domain, its root, and the server that answered."""
     token, identifier = request.token, join_id(request.token.secret)
     applications = [apply(identifier, each.key, each.request(), each.kem.public).to_fields() for each in nodes]
     untagged = {"op": "join", "id": identifier, "nodes": applications}
 
-    def send(channel: Channel) -> Fields:
+    def send(channel: Channel) -> Message:
         proof = join_proof(join_key(token.secret), channel.binding, channel.nonce, encode(untagged))
         return channel.request({**untagged, "mac": proof})
 
@@ -158,19 +158,17 @@ def _node_keys(request: JoinRequest, draft: Path, folder: str, role: Role) -> No
     return load_node_keys(draft / folder)
 
 
-def _announce(
-    request: JoinRequest, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]
-) -> None:
-    def send(channel: Channel) -> Fields:
+def _announce(request: JoinRequest, identity: Identity, asked: InstallRequest, wait: Callable[[float], None]) -> None:
+    def send(channel: Channel) -> Message:
         channel.identify(identity, secrets.token_bytes(INSTANCE_BYTES))
-        return channel.request(fields)
+        return channel.request({"op": "install", **asked.to_fields()})
 
     _repeated(request, send, wait)
 
 
 def _repeated(
-    request: JoinRequest, send: Callable[[Channel], Fields], wait: Callable[[float], None]
-) -> tuple[Fields, Root, str]:
+    request: JoinRequest, send: Callable[[Channel], Message], wait: Callable[[float], None]
+) -> tuple[Message, Root, str]:
     """Send a request until a response comes."""
     token, patience_s = request.token, request.patience_s
     begun_s, pause_s = time.monotonic(), _PAUSE_MIN_S
@@ -191,23 +189,20 @@ def _install(
     draft: Path,
     request: JoinRequest,
     nodes: Sequence[tuple[str, NodeKeys]],
-    fields: Fields,
+    fields: Message,
     root: Root,
     unix_s: float,
 ) -> tuple[tuple[Identity, ...], tuple[EndpointRecord, ...]]:
     """Write everything that the response holds, verified, into the draft."""
     try:
-        certificates = fields.byte_strings("members", MEMBERS_MAX)
-        owner = PublicKey.from_pem(fields.bytes_("owner"))
-        trusts = [Root.from_wire(each) for each in fields.byte_strings("trusts", _TRUSTS_MAX)]
+        certificates, news = MEMBERS.read(fields), DomainNews.from_fields(fields)
+        owner = PublicKey.from_pem(news.owner)
+        trusts = [Root.from_wire(each) for each in news.trusts]
         policy = Policy(root, [])
-        wires = fields.byte_strings("borders", _BORDERS_MAX)
-        relays = fields.texts("relays", SERVERS_MAX)
-        for each in relays:
+        for each in news.relays:
             split_host_port(each)
-        borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
-        of_cluster = request.token.role.is_of_cluster
-        granted = fields.byte_strings("delegations", DELEGATIONS_MAX) if of_cluster else []
+        borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in news.borders)
+        granted = DELEGATIONS.read(fields) if request.token.role.is_of_cluster else ()
         if len(certificates) != len(nodes):
             raise LocalError("another number of memberships")
         identities = tuple(
@@ -228,7 +223,7 @@ def _install(
         servers=request.token.servers,
         listen=request.listen,
         uplinks=request.uplinks,
-        relays={each.name: relays for each in borders},
+        relays={each.name: news.relays for each in borders},
         has_proxy=any(role is Role.PROXY for _, role in request.token.role.nodes),
     )
     write_configuration(draft, plan, sorted(files))

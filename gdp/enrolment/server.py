@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeVar
 
-from gdp.crypto.fields import Fields
+from gdp.crypto.schema import OCTETS, Keyed, number, text
 from gdp.enrolment.desk import EnrolmentDesk, MemberConnection, refusal_of
 from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
@@ -38,6 +38,7 @@ from gdp.trust.enrolment_wire import (
     REQUEST_MAX_BYTES,
     STRANGER_MAX_BYTES,
     EnrolmentError,
+    Message,
     Refusal,
     encode_message,
     message_bytes,
@@ -278,8 +279,8 @@ class EnrolmentServer:
         with _cut_after(writer, _REQUEST_S):
             await writer.drain()
 
-    async def _response(self, connection: _Connection, fields: Fields, binding: bytes) -> Mapping[str, object]:
-        operation, now, desk = fields.text("op", 16), time.time(), self._desk
+    async def _response(self, connection: _Connection, fields: Message, binding: bytes) -> Mapping[str, object]:
+        operation, now, desk = Keyed("op", text(16)).read(fields), time.time(), self._desk
         session = connection.session
         if operation == "join" and session is None:
             return await self._work(desk.join, fields, binding, connection.nonce, now)
@@ -325,11 +326,11 @@ class EnrolmentServer:
         current = next(reversed(self._polling[machine]), None) if machine in self._polling else None
         return any(each.session is not None and each.session.instance == current for each in connections)
 
-    async def _poll(self, connection: _Connection, session: MemberConnection, fields: Fields) -> Mapping[str, object]:
+    async def _poll(self, connection: _Connection, session: MemberConnection, fields: Message) -> Mapping[str, object]:
         """Answer once something differs from what the member knows, or after the time that it asks for."""
         await self._refuse_double(connection, session)
-        known = fields.bytes_("digest")
-        end_s = time.monotonic() + fields.number("wait_s", 0, POLL_MAX_S)
+        known = Keyed("digest", OCTETS).read(fields)
+        end_s = time.monotonic() + Keyed("wait_s", number(0, POLL_MAX_S)).read(fields)
         event, events = asyncio.Event(), self._news[bytes(session.name)]
         events.add(event)
         try:

@@ -21,29 +21,42 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Annotated, Final, TypeAlias
 
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.cbor import Value, decode, encode
-from gdp.crypto.fields import Fields
-from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
+from gdp.crypto.certificates import Root
+from gdp.crypto.kem import KEM_PUBLIC, KemPublicKey
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
+from gdp.crypto.schema import CERT, FLAG, OCTETS, STATEMENT, FieldSet, Keyed, many, mapped, octets, text, uint
 from gdp.errors import DropReason, LocalError, StatementError
+from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = [
     "CLOCKS_APART_MAX_S",
+    "DELEGATIONS",
     "DELEGATIONS_MAX",
     "INSTANCE_BYTES",
     "LENGTH_BYTES",
+    "MEMBERS",
     "MEMBERS_MAX",
     "NONCE_BYTES",
+    "PAGE",
     "REQUEST_MAX_BYTES",
     "RESPONSE_MAX_BYTES",
     "STRANGER_MAX_BYTES",
+    "TEXT",
     "Application",
+    "DomainNews",
     "EnrolmentError",
+    "Greeting",
+    "InstallRequest",
+    "ListedMachine",
+    "ListedMail",
+    "MemberProof",
+    "Message",
     "Refusal",
     "UnreachableError",
     "apply",
@@ -54,6 +67,8 @@ __all__ = [
     "verify_member_proof",
 ]
 
+Message: TypeAlias = "Mapping[str, Value]"  # as it was received
+
 VERSION: Final = 1
 LENGTH_BYTES: Final = 4
 NONCE_BYTES: Final = 32
@@ -63,8 +78,15 @@ REQUEST_MAX_BYTES: Final = 64 << 10
 RESPONSE_MAX_BYTES: Final = 4 << 20
 MEMBERS_MAX: Final = 4  # nodes of one machine
 DELEGATIONS_MAX: Final = 480  # of one machine
+PAGE: Final = 64  # machines or mails in one response
+_TRUSTS_MAX: Final = 64
+_BORDERS_MAX: Final = 16
 _DERIVED_BYTES: Final = 16
 CLOCKS_APART_MAX_S: Final = 600.0  # below the tolerance of certificates' validity
+TEXT: Final = text(4_096)
+MEMBERS: Final = Keyed("members", many(CERT, MEMBERS_MAX, is_cut=False))
+DELEGATIONS: Final = Keyed("delegations", many(OCTETS, DELEGATIONS_MAX, is_cut=False))
+_ROOT: Final = mapped(OCTETS, Root.from_wire, Root.to_pem)
 
 
 class Refusal(str, Enum):
@@ -105,7 +127,17 @@ class UnreachableError(EnrolmentError):
 
 
 @dataclass(frozen=True, slots=True)
-class Application:
+class Greeting(FieldSet):
+    """The server's first message; ``nonce``: for the proofs of this connection."""
+
+    version: Annotated[int, Keyed("v", uint())]
+    root: Annotated[Root, Keyed("root", _ROOT)]
+    nonce: Annotated[bytes, Keyed("nonce", octets(NONCE_BYTES))]
+    unix_s: Annotated[int, Keyed("now", uint())]
+
+
+@dataclass(frozen=True, slots=True)
+class Application(FieldSet):
     """A machine's application for the membership of one node.
 
     Args:
@@ -114,23 +146,67 @@ class Application:
         proof: that the node's key signs this, with this token.
     """
 
-    request: bytes
-    kem: KemPublicKey
-    proof: bytes
-
-    @classmethod
-    def from_fields(cls, fields: Fields) -> Application:
-        """Read an application; a malformed one raises ``StatementError``."""
-        kem = KemPublicKey(fields.bytes_("kem", KEM_PUBLIC_BYTES))
-        return cls(fields.bytes_("request"), kem, fields.bytes_("proof", SIGNATURE_BYTES))
-
-    def to_fields(self) -> dict[str, Value]:
-        """Return the map that ``from_fields`` reads."""
-        return {"request": self.request, "kem": self.kem.wire, "proof": self.proof}
+    request: Annotated[bytes, Keyed("request", OCTETS)]
+    kem: Annotated[KemPublicKey, Keyed("kem", KEM_PUBLIC)]
+    proof: Annotated[bytes, Keyed("proof", octets(SIGNATURE_BYTES))]
 
     def verify(self, key: PublicKey, identifier: bytes) -> None:
         """Return if the key signed this with the token of this id. Raises ``StatementError``: BAD_SIGNATURE."""
         key.verify(self.proof, _application_proof(identifier, self.request, self.kem))
+
+
+@dataclass(frozen=True, slots=True)
+class DomainNews(FieldSet):
+    """What every member follows.
+
+    Args:
+        trusts: roots of other domains, PEM.
+        borders: endpoint records.
+        relays: ``host:port`` of the borders' relays.
+        owner: public key, PEM.
+    """
+
+    root: Annotated[Root, Keyed("root", _ROOT)]
+    trusts: Annotated[tuple[bytes, ...], Keyed("trusts", many(OCTETS, _TRUSTS_MAX, is_cut=False))]
+    borders: Annotated[tuple[bytes, ...], Keyed("borders", many(STATEMENT, _BORDERS_MAX, is_cut=False))]
+    relays: Annotated[tuple[str, ...], Keyed("relays", many(TEXT, SERVERS_MAX, is_cut=False))]
+    owner: Annotated[bytes, Keyed("owner", OCTETS)]
+
+
+@dataclass(frozen=True, slots=True)
+class MemberProof(FieldSet):
+    """Proof that a connection's client is a member; ``instance``: random for each start of its program."""
+
+    certificate: Annotated[bytes, Keyed("certificate", CERT)]
+    signature: Annotated[bytes, Keyed("signature", octets(SIGNATURE_BYTES))]
+    instance: Annotated[bytes, Keyed("instance", octets(INSTANCE_BYTES))]
+
+
+@dataclass(frozen=True, slots=True)
+class InstallRequest(FieldSet):
+    """Node descriptors of a machine, and the endpoint record of its switch."""
+
+    cards: Annotated[tuple[bytes, ...], Keyed("cards", many(OCTETS, MEMBERS_MAX, is_cut=False))]
+    record: Annotated[bytes, Keyed("record", STATEMENT)]
+
+
+@dataclass(frozen=True, slots=True)
+class ListedMachine(FieldSet):
+    """Machine in the domain's directory; ``seen_unix_s``: when its agent was last connected, 0: never."""
+
+    label: Annotated[str, Keyed("label", text(64))]
+    role: Annotated[str, Keyed("role", text(16))]
+    cards: Annotated[tuple[bytes, ...], Keyed("cards", many(OCTETS, MEMBERS_MAX, is_cut=False))]
+    is_online: Annotated[bool, Keyed("online", FLAG)]
+    seen_unix_s: Annotated[int, Keyed("seen", uint())]
+
+
+@dataclass(frozen=True, slots=True)
+class ListedMail(FieldSet):
+    """Mail that waits for a member, under a number that rises."""
+
+    number: Annotated[int, Keyed("n", uint())]
+    mail: Annotated[bytes, Keyed("m", STATEMENT)]
 
 
 def apply(identifier: bytes, key: SigningKey, request: bytes, kem: KemPublicKey) -> Application:
@@ -156,12 +232,12 @@ def message_bytes(head: bytes, maximum: int) -> int:
     return size
 
 
-def read_message(body: bytes) -> Fields:
+def read_message(body: bytes) -> Message:
     """Return the map of a message. Raises ``StatementError``: MALFORMED."""
     value = decode(body, RESPONSE_MAX_BYTES)
     if not isinstance(value, dict):
         raise StatementError(DropReason.MALFORMED, "a map is expected")
-    return Fields(value)
+    return value
 
 
 def prove_member(key: SigningKey, binding: bytes, nonce: bytes, instance: bytes) -> bytes:

@@ -68,13 +68,10 @@ DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTP
 
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
-_OF_TOPICS: Final = ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
-_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication", "readiness", "sign")
-_OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
-_FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
-    "topic": (*_OF_CALLS, *_OF_SERVICES),
-    "service": _OF_TOPICS,
-    "action": (*_OF_TOPICS, *_OF_SERVICES),
+_OF_KINDS: Final = {  # keys that only the rules of these kinds have
+    "topics": ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS),
+    "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
+    "services": ("stop", "at_once", "state", "state_node"),
 }
 
 
@@ -143,6 +140,17 @@ def _prefix(text: str | None) -> str | None:
     return text
 
 
+def _local_name(example: str) -> AfterValidator:
+    """Return the validator of a full name on this machine, or none."""
+
+    def checked(text: str | None) -> str | None:
+        if text is not None and not is_name(text):
+            raise ValueError(f"expected a full ROS name, such as {example}")
+        return text
+
+    return AfterValidator(checked)
+
+
 def _name_pattern(text: str) -> str:
     if not is_name(text) and not is_pattern(text):
         raise ValueError("expected a full ROS name, such as /camera/image, or a pattern: /camera/* or /camera/**")
@@ -155,6 +163,7 @@ NamePattern = Annotated[
     Field(json_schema_extra={"pattern": f"^{PATTERN_FORM}$", "maxLength": NAME_MAX_CHARS}),
 ]
 NamePatterns = tuple[NamePattern, ...]
+_NAME: Final = Field(json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS})
 NamePrefix = Annotated[
     str | None,
     AfterValidator(_prefix),
@@ -168,7 +177,8 @@ CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
 
 def _by_kind(kind: Kind) -> JsonValue:
     """Return the JSON schema of the rules of one kind; a rule without ``kind`` is about a topic."""
-    then: JsonDict = {"type": {"pattern": f"^(?:|{TYPE_FORMS[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
+    foreign = [key for kinds, keys in _OF_KINDS.items() if kind not in kinds for key in keys]
+    then: JsonDict = {"type": {"pattern": f"^(?:|{TYPE_FORMS[kind][0]})$"}, **dict.fromkeys(foreign, False)}
     condition: JsonDict = {"properties": {"kind": {"const": kind}}, "required": [] if kind == "topic" else ["kind"]}
     return {"if": condition, "then": {"properties": then}}
 
@@ -200,10 +210,8 @@ class Rule(Section):
         alias="type",
         description="As ROS 2 writes it, for ROS 1 too. Empty: of graph, recording or delegation.",
     )
-    remap: str | None = Field(
-        default=None,
-        description="Its name on this machine; not with a pattern.",
-        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    remap: Annotated[str | None, _local_name("/camera/image"), _NAME] = Field(
+        default=None, description="Its name on this machine; not with a pattern."
     )
     prefix: NamePrefix = Field(
         default=None, description="Namespace in front of `name` on the overlay. Empty: none. `null`: the file's."
@@ -280,10 +288,9 @@ class Rule(Section):
         default_factory=Spread, description="Imported calls: which of several servers get a request."
     )
     readiness: Readiness | None = Field(default=None, description="Exposed calls: probe of the local server.")
-    stop: str | None = Field(
+    stop: Annotated[str | None, _local_name("/plan/stop"), _NAME] = Field(
         default=None,
         description="Exposed services, `at_once: 1`: local std_srvs/srv/Trigger to call when no client waits.",
-        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     at_once: int | None = Field(
         default=None, ge=1, le=AT_ONCE_MAX, description="Exposed services: requests that the server has at a time."
@@ -291,10 +298,8 @@ class Rule(Section):
     state: Literal["none", "ordered"] = Field(
         default="none", description="Services, both sides: every server gets all requests in one order."
     )
-    state_node: str | None = Field(
-        default=None,
-        description="Then: local node whose byte array parameter `state` it is.",
-        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    state_node: Annotated[str | None, _local_name("/plan/stop"), _NAME] = Field(
+        default=None, description="Then: local node whose byte array parameter `state` it is."
     )
     priority: Priority = Field(default="normal", description="Rank on a full path.")
     paths: Literal[1, 2, "spread"] = Field(
@@ -478,20 +483,17 @@ class Rule(Section):
     @field_validator("remap")
     @classmethod
     def _remap(cls, text: str | None, info: ValidationInfo) -> str | None:
-        if text is not None and not is_name(text):
-            raise ValueError("expected a full ROS name, such as /camera/image")
         if text is not None and is_pattern(info.data.get("name", "")):
             raise ValueError("a pattern cannot be remapped; write a rule for each name")
         return text
 
-    @field_validator("wants_reliable", "wants_latched", *_OF_TOPICS[2:], *_OF_CALLS, *_OF_SERVICES)
+    @field_validator("*")
     @classmethod
     def _is_of_kind(cls, value: object, info: ValidationInfo) -> object:
-        name = str(info.field_name)
-        of_services = "services" if name in _OF_SERVICES else "topics"
-        kinds = "services and actions" if name in _OF_CALLS else of_services
-        if str(info.data.get("kind", kinds)) not in kinds:
-            raise ValueError(f"only {kinds} have this")
+        field = str(info.field_name)
+        for kinds, keys in _OF_KINDS.items():
+            if (cls.model_fields[field].alias or field) in keys and info.data.get("kind", kinds) not in kinds:
+                raise ValueError(f"only {kinds} have this")
         return value
 
     @field_validator("history")
@@ -516,10 +518,3 @@ class Rule(Section):
         if info.data.get("image", "jpeg") != "jpeg":
             raise ValueError("this needs 'image: jpeg'")
         return value
-
-    @field_validator("stop", "state_node")
-    @classmethod
-    def _local_name(cls, text: str | None) -> str | None:
-        if text is not None and not is_name(text):
-            raise ValueError("expected a full ROS name, such as /plan/stop")
-        return text

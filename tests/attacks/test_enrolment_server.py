@@ -7,6 +7,7 @@ import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,6 @@ from gdp.control.endpoint_record import Candidate, CandidateType
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.cbor import Value, encode
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import parse
 from gdp.enrolment import desk as desk_module
@@ -28,7 +28,7 @@ from gdp.errors import StoreError
 from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment_wire import EnrolmentError, Refusal, apply, prove_member
+from gdp.trust.enrolment_wire import MEMBERS, EnrolmentError, Message, Refusal, apply, prove_member
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
@@ -76,30 +76,30 @@ class Machine:
     def with_token(cls, token: JoinToken, label: str) -> Machine:
         return cls(token, label, [NodeKeys.generate(role, label) for _, role in token.role.nodes])
 
-    def ask(self, desk: EnrolmentDesk) -> Fields:
+    def ask(self, desk: EnrolmentDesk) -> Message:
         made = [apply(join_id(self.token.secret), each.key, each.request(), each.kem.public) for each in self.keys]
-        nodes: list[Value] = [each.to_fields() for each in made]
+        nodes: list[Any] = [each.to_fields() for each in made]
         untagged: dict[str, Value] = {"op": "join", "id": join_id(self.token.secret), "nodes": nodes}
         proof = join_proof(join_key(self.token.secret), BINDING, NONCE, encode(untagged))
-        return desk.join(Fields({**untagged, "mac": proof}), BINDING, NONCE, NOW)
+        return desk.join({**untagged, "mac": proof}, BINDING, NONCE, NOW)
 
-    def take(self, answer: Fields, files: DomainFiles) -> None:
+    def take(self, answer: Message, files: DomainFiles) -> None:
         root = load_domain(files.config.domain).root
-        members = [Membership.from_wire(each, root, NOW) for each in answer.byte_strings("members", 4)]
+        members = [Membership.from_wire(each, root, NOW) for each in MEMBERS.read(answer)]
         self.identities = [key.admitted(each, root) for key, each in zip(self.keys, members, strict=True)]
 
     def session(self, desk: EnrolmentDesk, unix_s: float = NOW, *, node: int = -1) -> MemberConnection:
         identity = self.identities[node]
         proof = prove_member(identity.key, BINDING, NONCE, INSTANCE)
-        fields = {"certificate": identity.membership, "signature": proof, "instance": INSTANCE}
-        return desk.identify(Fields(fields), BINDING, NONCE, unix_s)
+        fields: Message = {"certificate": identity.membership, "signature": proof, "instance": INSTANCE}
+        return desk.identify(fields, BINDING, NONCE, unix_s)
 
-    def renewal(self) -> Fields:
+    def renewal(self) -> Message:
         certificates: list[Value] = [each.membership for each in self.identities]
-        return Fields({"certificates": certificates})
+        return {"certificates": certificates}
 
-    def record(self, candidates: Sequence[Candidate] = ()) -> Fields:
-        return Fields({"cards": list[Value](), "record": own_record(self.identities[0], 1, candidates).wire})
+    def record(self, candidates: Sequence[Candidate] = ()) -> Message:
+        return {"cards": list[Value](), "record": own_record(self.identities[0], 1, candidates).wire}
 
 
 @pytest.fixture
@@ -287,7 +287,7 @@ def test_a81_one_members_mail_leaves_space_in_a_mailbox_for_others(server: Serve
         wire = Mail.make(machine.identities[node], to, "delegation", bytes(12 << 10), NOW)
         session = machine.session(server.desk, node=node)
         for _ in range(count):
-            server.desk.send(session, Fields({"mail": wire}), NOW)
+            server.desk.send(session, {"mail": wire}, NOW)
 
     for node in (0, 1):  # as its switch, and as its proxy
         with pytest.raises(EnrolmentError) as refusal:

@@ -29,7 +29,6 @@ from fog.site import Site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.kem import KemPrivateKey
 from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
@@ -40,7 +39,16 @@ from gdp.enrolment.registry import Registry
 from gdp.management.control_socket import connect_control
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.keyring import load_domain, load_owner
-from gdp.trust.enrolment_wire import STRANGER_MAX_BYTES, EnrolmentError, Refusal, apply, encode_message
+from gdp.trust.enrolment_wire import (
+    DELEGATIONS,
+    MEMBERS,
+    STRANGER_MAX_BYTES,
+    EnrolmentError,
+    Message,
+    Refusal,
+    apply,
+    encode_message,
+)
 from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, join_id
 from tests.fog.bootstrap.desk import BINDING, CLUSTER, NONCE, Desk, Machine, desk_of, made_desk, memberships
 from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
@@ -236,7 +244,7 @@ def test_a52_the_machine_itself_goes_on_where_its_launcher_was_killed(
     with Registry(desk.files.config.state) as registry:
         answer = machine.ask(EnrolmentDesk(desk.files, registry))
         assert len(memberships(desk, answer)) == 2
-        assert len(answer.byte_strings("delegations", 4)) == 2
+        assert len(DELEGATIONS.read(answer)) == 2
 
 
 def test_a52_a_token_is_good_for_minutes(desk: Desk) -> None:
@@ -371,7 +379,7 @@ def test_a52_an_observer_who_replays_a_request_learns_nothing_and_changes_nothin
         b"c-m7",
         *(each.key.public.compressed for each in machine.keys),
     ]
-    for secret in [*secrets_, *answer.byte_strings("members", 4), *answer.byte_strings("delegations", 4)]:
+    for secret in [*secrets_, *MEMBERS.read(answer), *DELEGATIONS.read(answer)]:
         assert all(secret not in seen for seen in (tap.sent[0], tap.received[0], replayed))
     assert misused(desk) == []
 
@@ -388,9 +396,9 @@ def test_a52_a_request_is_good_for_its_connection_and_its_token_alone(desk: Desk
     machine, other = Machine(desk.token()), Machine(desk.token("m8"), "c-m8")
     request = machine.request()
     moved = [
-        (Fields({**request, "id": other.identifier}), BINDING, NONCE),
-        (Fields(request), bytes([1]) * 32, NONCE),
-        (Fields(request), BINDING, bytes([1]) * 32),
+        ({**request, "id": other.identifier}, BINDING, NONCE),
+        (request, bytes([1]) * 32, NONCE),
+        (request, BINDING, bytes([1]) * 32),
     ]
     for each in moved:
         with pytest.raises(EnrolmentError, match="not by the holder of the token"):
@@ -424,9 +432,9 @@ def test_a52_an_answer_of_a_wrong_form_is_refused(desk: Desk, tmp_path: Path, mo
     install(tmp_path / "home", desk.boot())
     right = EnrolmentDesk.join
 
-    def wrong(self: EnrolmentDesk, *args: object) -> Fields:
+    def wrong(self: EnrolmentDesk, *args: object) -> Message:
         answer = right(self, *args)  # type: ignore[arg-type]
-        return Fields({**answer, "delegations": [b"none"]})
+        return {**answer, "delegations": [b"none"]}
 
     monkeypatch.setattr(EnrolmentDesk, "join", wrong)
     with desk.listening(), pytest.raises(EnrolmentError, match="the server's response is not valid"):
@@ -467,9 +475,9 @@ def test_a52_a_wrong_token_draws_neither_decapsulation_nor_signature(desk: Desk,
         wrong = bytearray(mac)
         wrong[-1 - index % 32] ^= 1 + index // 32
         with pytest.raises(EnrolmentError):
-            desk.desk.join(Fields({**request, "mac": bytes(wrong)}), BINDING, NONCE, time.time())
+            desk.desk.join({**request, "mac": bytes(wrong)}, BINDING, NONCE, time.time())
     with pytest.raises(EnrolmentError):
-        desk.desk.join(Fields(guessed), BINDING, NONCE, time.time())
+        desk.desk.join(guessed, BINDING, NONCE, time.time())
     assert dear == []
     assert machine.ask(desk.desk)
 
@@ -515,7 +523,7 @@ def test_a52_a_connection_ends_at_what_is_wrong(desk: Desk, payload: bytes, ends
             assert time.monotonic() - begun_s < 5.0
             stream.close()
         with connect(token.servers[0], token.root) as channel:
-            assert channel.request(Machine(token).request(None, channel.binding, channel.nonce)).flag("ok")
+            assert channel.request(Machine(token).request(None, channel.binding, channel.nonce))["ok"] is True
 
 
 def test_a52_silent_connections_keep_no_machine_out(desk: Desk, tmp_path: Path) -> None:

@@ -11,13 +11,13 @@ import pytest
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.cbor import Value
 from gdp.crypto.certificates import Role
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
 from gdp.enrolment import domain_client
 from gdp.enrolment.channel import Channel
 from gdp.enrolment.domain_client import fetch_mail, read_inbox
 from gdp.sharing import state as state_module
 from gdp.trust.domain import Policy
+from gdp.trust.enrolment_wire import Message
 from gdp.trust.mail import Mail
 from tests.gdp.relay.ends import NOW, domain, member
 from tests.gdp.sharing.machines import STRING, Site
@@ -29,13 +29,13 @@ class Server:
     def __init__(self, wires: Sequence[bytes]) -> None:
         self._mail: list[tuple[int, bytes]] = list(enumerate(wires, 1))
 
-    def request(self, fields: Mapping[str, object]) -> Fields:
+    def request(self, fields: Mapping[str, object]) -> Message:
         since = cast(int, fields["since"])
         page: list[Value] = []
         for number, wire in self._mail:
             if since < number <= since + 4:
                 page.append({"n": number, "m": wire})
-        return Fields({"ok": True, "mail": page})
+        return {"ok": True, "mail": page}
 
 
 @pytest.fixture

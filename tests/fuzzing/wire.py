@@ -20,7 +20,7 @@ from gdp.crypto.envelope import Opener
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
 from gdp.crypto.keys import PublicKey
-from gdp.crypto.schema import Spread
+from gdp.crypto.schema import Keyed, Spread, inner, many
 from gdp.crypto.statements import parse
 from gdp.crypto.subject import NAMED_SUBJECT
 from gdp.crypto.validity import VALIDITY
@@ -184,7 +184,7 @@ DECODERS: Final = (
     ),
     Decoder(
         "join-request",
-        lambda data: [Application.from_fields(each) for each in read_message(data).maps("nodes", 4)],
+        lambda data: Keyed("nodes", many(inner(Application), 4)).read(read_message(data)),
         (cbor.encode({"op": "join", "nodes": [_APPLICATION.to_fields()]}),),
         (StatementError,),
         is_cbor=True,

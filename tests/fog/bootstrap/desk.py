@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fog.bootstrap.bundles import machine_boot, machine_label
 from fog.bootstrap.domain_members import DomainMembers
@@ -20,14 +21,13 @@ from fog.machine import MachineBundle
 from fog.site import Site, open_site
 from gdp.crypto.cbor import Value, encode
 from gdp.crypto.certificates import Membership
-from gdp.crypto.fields import Fields
 from gdp.crypto.identity import NodeKeys
 from gdp.enrolment.desk import EnrolmentDesk
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server import bind_unix, serve_domain_in_thread
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment_wire import Application, apply
+from gdp.trust.enrolment_wire import MEMBERS, Application, Message, apply
 from gdp.trust.join_token import JoinToken, join_id, join_key, join_proof
 
 PLAN = ExportedInterface("service", "/plan", "nav_msgs/srv/GetPlan", {"timeout_s": 9.0}, {"encoding": "cbor"})
@@ -106,22 +106,21 @@ class Machine:
     def request(
         self, applications: Sequence[Application] | None = None, binding: bytes = BINDING, nonce: bytes = NONCE
     ) -> dict[str, Value]:
-        nodes: list[Value] = [each.to_fields() for each in applications or self.applications()]
+        nodes: list[Any] = [each.to_fields() for each in applications or self.applications()]
         untagged: dict[str, Value] = {"op": "join", "id": self.identifier, "nodes": nodes}
         return {**untagged, "mac": join_proof(join_key(self.token.secret), binding, nonce, encode(untagged))}
 
     def ask(
         self, desk: EnrolmentDesk, applications: Sequence[Application] | None = None, *, at_s: float | None = None
-    ) -> Fields:
+    ) -> Message:
         """Return the response of a desk; a refusal raises ``EnrolmentError``."""
-        fields = Fields(self.request(applications))
-        return desk.join(fields, BINDING, NONCE, time.time() if at_s is None else at_s)
+        return desk.join(self.request(applications), BINDING, NONCE, time.time() if at_s is None else at_s)
 
 
-def memberships(desk: Desk, answer: Fields) -> list[Membership]:
+def memberships(desk: Desk, answer: Message) -> list[Membership]:
     """Return the memberships in a response, which are verified."""
     root = load_domain(desk.authority.domain).root
-    return [Membership.from_wire(each, root, time.time()) for each in answer.byte_strings("members", 4)]
+    return [Membership.from_wire(each, root, time.time()) for each in MEMBERS.read(answer)]
 
 
 @contextmanager

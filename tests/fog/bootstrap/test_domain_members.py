@@ -14,7 +14,7 @@ from gdp.enrolment.channel import connect
 from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.stores.keyring import DELEGATIONS
-from gdp.trust.enrolment_wire import EnrolmentError
+from gdp.trust.enrolment_wire import MEMBERS, EnrolmentError
 from gdp.trust.join_token import JoinToken, fingerprint_of
 from gdp.trust.right import Right
 from tests.fog.bootstrap.desk import MAP, PLAN
@@ -73,7 +73,7 @@ def test_nothing_of_a_machine_lasts_longer_than_planned(lab: Lab, members: Domai
     with connect(f"127.0.0.1:{lab.port}", fingerprint_of(machine.root)) as channel:
         channel.identify(machine.identities[-1], bytes(16))
         answer = channel.request({"op": "renew", "certificates": certificates})
-    assert answer.byte_strings("members", 4) == certificates
+    assert MEMBERS.read(answer) == (*certificates,)
 
 
 def test_a_removed_machine_is_revoked_and_its_endpoint_record_is_gone(lab: Lab, members: DomainMembers) -> None:

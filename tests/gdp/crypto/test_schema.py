@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import pytest
 
-from gdp.crypto.fields import Fields
 from gdp.crypto.schema import (
     FLAG,
     MAP,
@@ -175,7 +174,7 @@ def test_a_refusal_of_a_later_version_is_a_refusal() -> None:
 def test_a_field_may_be_absent_left_out_or_given() -> None:
     body = Outer(Inner(3))
     assert body.to_fields() == {"i": {"s": 3}, "w": "none"}
-    assert Outer.from_fields(Fields({"i": {"s": 3}, "later": 1}), here=7) == Outer(Inner(3), here=7)
+    assert Outer.from_fields({"i": {"s": 3}, "later": 1}, here=7) == Outer(Inner(3), here=7)
     assert Outer(Inner(3), extra=b"x").to_fields()["x"] == b"x"
 
 
@@ -190,5 +189,5 @@ def test_a_field_may_be_absent_left_out_or_given() -> None:
 )
 def test_a_body_that_does_not_fit_is_refused_with_its_reason(items: dict[str, Any], reason: DropReason) -> None:
     with pytest.raises(StatementError) as caught:
-        Outer.from_fields(Fields(items))
+        Outer.from_fields(items)
     assert caught.value.reason is reason

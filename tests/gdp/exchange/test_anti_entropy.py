@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.crypto.cbor import decode, encode
-from gdp.crypto.fields import Fields
 from gdp.exchange import anti_entropy
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
 from gdp.exchange.sync_message import SyncMessage
@@ -95,7 +94,7 @@ class Network:
     def send(self, sender: str, receiver: str, message: SyncMessage) -> None:
         """Send a message as it travels; it must read back as it was."""
         wire = encode(message.to_fields())
-        read = SyncMessage.from_fields(Fields(decode(wire)))  # type: ignore[arg-type]
+        read = SyncMessage.from_fields(decode(wire))  # type: ignore[arg-type]
         assert read == message
         self.sent[sender, receiver] = self.sent.get((sender, receiver), 0) + len(wire)
         if frozenset((sender, receiver)) not in self.parted and not self.loses():
