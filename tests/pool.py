@@ -33,6 +33,7 @@ _EXCESS: Final = 1.5  # times its budget that a folder may take
 _LEAST_S: Final = 20.0  # folders below this are too small to judge
 _PROPERTY: Final = "seconds"  # of a report: wall clock, processor
 _FILES_SHOWN: Final = 12
+_UNKNOWN: Final = (10.0, 10.0)  # of a file that was not measured yet: it does not begin last
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -74,7 +75,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Put the longest files first, where several workers share them."""
     if hasattr(config, "workerinput"):
         known = _known()
-        items.sort(key=lambda item: -known.get(_file_of(item.nodeid), (0.0, 0.0))[0])
+        items.sort(key=lambda item: -known.get(_file_of(item.nodeid), _UNKNOWN)[0])
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Files:
