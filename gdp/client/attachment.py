@@ -115,7 +115,7 @@ class Attachment:
         self._moved_s = float("-inf")
         self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
         self._sync = RevocationSync(
-            identity, policy.revoked, self.hello_protocol, self._say_revoked, settings.first_sequence
+            identity, policy.revoked, self.hello_protocol.neighbours, self._say_revoked, settings.first_sequence
         )
         self._now = Timestamps(0.0, 0.0)
         self._out: list[OutgoingFrames] = []

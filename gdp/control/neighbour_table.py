@@ -48,6 +48,36 @@ class NeighbourTable:
         """Return every neighbour that is up."""
         return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]
 
+    def cheapest(self, name: Name) -> Neighbour | None:
+        """Return the neighbour of this name over the cheapest link, or None."""
+        found = [n for port in self.ports if (n := self.get(port, name)) is not None]
+        return min(found, key=lambda n: (n.cost, n.port), default=None)
+
+    def over_link(self, name: Name, key: int) -> Neighbour | None:
+        """Return the neighbour of this name over the link with this key (``link_key``), or None."""
+        for index, port in self.ports.items():
+            found = self.get(index, name)
+            if found is not None and port.link_key(found) == key:
+                return found
+        return None
+
+    def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
+        """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
+        neighbour = self.get(port, name)
+        return None if neighbour is None else (self.ports[port].nonce, neighbour.echo)
+
+    def loss_between(self, port: int, name: Name) -> float:
+        """Return the larger loss of keepalives to and from a neighbour, 0 to 1; 0 also if it is not up."""
+        neighbour = self.get(port, name)
+        session = None if neighbour is None else neighbour.keepalives
+        return 0.0 if session is None else max(session.quality.loss_in, session.quality.loss_out)
+
+    def rtt_to(self, name: Name) -> float:
+        """Return the smoothed round trip of the link to a neighbour in seconds; 0: not measured, or it is not up."""
+        neighbour = self.cheapest(name)
+        session = None if neighbour is None else neighbour.keepalives
+        return 0.0 if session is None else session.quality.rtt.srtt_s or 0.0
+
     def observed_at(self, index: int, name: Name) -> Endpoint | None:
         """Return the endpoint that this end reports to a neighbour on a tunnel's port, or None."""
         port = self.ports.get(index)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.control.neighbour import Neighbour
-from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.neighbour_table import NeighbourTable
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
@@ -43,11 +43,11 @@ class RevocationSync:
     """
 
     def __init__(
-        self, identity: Identity, revoked: Revocations, hello_protocol: HelloProtocol, say: Say, first_sequence: int
+        self, identity: Identity, revoked: Revocations, neighbours: NeighbourTable, say: Say, first_sequence: int
     ) -> None:
         self._identity = identity
         self._revoked = revoked
-        self._hello_protocol = hello_protocol
+        self._table = neighbours
         self._say = say
         self._sequence = first_sequence
         self._exchange = AntiEntropy[tuple[int, Name]](revoked.sets, revoked.item_of, _PACE)
@@ -77,7 +77,7 @@ class RevocationSync:
         if key not in self._neighbours or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "about revocations, which the neighbour did not sign")
         message = SyncMessage.from_fields(statement.expect(StatementType.SYNC))
-        session = self._hello_protocol.ports[neighbour.port].echo, neighbour.name
+        session = self._table.ports[neighbour.port].echo, neighbour.name
         if message.session != session[0] or message.sequence <= self._received.get(session, -1):
             raise StatementError(DropReason.REPLAYED, "about revocations")
         if not self._taken.spend(neighbour.name, now.mono_s):

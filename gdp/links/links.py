@@ -97,7 +97,7 @@ class TunnelLinks:
             self._read_records(now)
             self._follow_configured(now)
         for tunnel in self._tunnels.handle_timer(now):
-            self._switch.tunnel_answered(tunnel.peer, now)
+            self._switch.tunnels.answered(tunnel.peer, now)
         if self._config.direct:
             self._own.publish_changes(now)
             self._act(now)
@@ -127,7 +127,7 @@ class TunnelLinks:
             "preshared": found.is_preshared,
             "mtu": found.mtu,
             "up": neighbour is not None,
-            "why": self._switch.tunnel_failure(tunnel.peer) if found.is_direct and neighbour is None else "",
+            "why": self._switch.tunnels.failure(tunnel.peer) if found.is_direct and neighbour is None else "",
         }
 
     # configured peers
@@ -148,7 +148,7 @@ class TunnelLinks:
             except GdpError as error:
                 log.warning("tunnel closed peer=%s reason=%s", peer.member.label, error)
                 del self._configured[path]
-        self._switch.set_tunnel_peers({peer.record.name for peer in self._configured.values()})
+        self._switch.tunnels.set_configured_peers({peer.record.name for peer in self._configured.values()})
 
     def _read_record(self, path: Path, now: Timestamps) -> None:
         try:
@@ -231,7 +231,7 @@ class TunnelLinks:
 
     def _act(self, now: Timestamps) -> None:
         """Do what the switch decided about direct tunnels."""
-        for action in self._switch.poll_tunnel_actions(now):
+        for action in self._switch.tunnels.poll_actions(now):
             if not isinstance(action, Close) and not self._is_served(action.record, now):
                 continue
             match action:
@@ -253,7 +253,7 @@ class TunnelLinks:
                         now_s=now.mono_s,
                         is_direct=True,
                     ):
-                        self._switch.set_tunnel_port(self._tunnels.all[tunnel].port, record.name)
+                        self._switch.tunnels.set_direct_port(self._tunnels.all[tunnel].port, record.name)
 
     def _is_served(self, record: EndpointRecord, now: Timestamps) -> bool:
         try:

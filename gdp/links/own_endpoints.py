@@ -67,7 +67,7 @@ class OwnEndpoints:
             except LocalError as error:
                 log.warning("own addresses not read, the former ones count on reason=%s", error)
         known, candidates = self._published, self._candidates()[:CANDIDATES_MAX]
-        refusal = self._switch.endpoint_refusal
+        refusal = self._switch.tunnels.endpoint_refusal
         sequence = time.time_ns() // 1_000_000
         is_stale = refusal is not None and refusal.reason is DropReason.STALE
         kept_sequence = refusal.kept_sequence if refusal is not None and is_stale else 0
@@ -79,7 +79,7 @@ class OwnEndpoints:
         sequence = max(sequence, kept_sequence + 1)
         record = own_record(self._identity, len(self._tunnels.underlays), candidates, sequence=sequence)
         try:
-            self._switch.publish_endpoints(record)
+            self._switch.tunnels.publish_endpoints(record)
         except StatementError as error:
             log.error("endpoint record not published reason=%s", error)
             return
@@ -96,7 +96,7 @@ class OwnEndpoints:
         uplinks = {found.port: tunnel.uplink for tunnel, found in self._tunnels.all.items()}
         seen = (
             Candidate(uplinks[port], CandidateType.REFLEXIVE, endpoint)
-            for (port, _), endpoint in self._switch.observed_addresses().items()
+            for (port, _), endpoint in self._switch.state.neighbours.observed_addresses().items()
             if port in uplinks
         )
         return listed_candidates(public, seen, self._hosts)

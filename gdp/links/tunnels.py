@@ -262,7 +262,7 @@ class Tunnels:
         """Remove a tunnel with its port; its neighbour is lost at once."""
         found = self._tunnels.pop(tunnel)
         self._runtime.remove_port(found.port)
-        self._switch.set_tunnel_port(found.port, None)
+        self._switch.tunnels.set_direct_port(found.port, None)
         self._closed.append((now_s + _FORGET_S, found.port))
         self._remove(tunnel.uplink, found.ifname, found.key)
         log.info("tunnel removed peer=%s ifname=%s", tunnel.peer.short, found.ifname)

@@ -97,7 +97,7 @@ def switch_snapshot(state: SwitchState) -> dict[str, object]:
         "trees": shown,
         "rib": "" if switch.rib is None else short_id(switch.rib),
         "routes": len(switch.table),
-        "link_states": switch.link_states,
+        "link_states": len(switch.paths.link_states),
         "left_out": len(advertisements) - len(names) + len(trees) - len(shown) + len(up) - len(links),
     }
 
@@ -120,7 +120,7 @@ def _link(row: NeighbourRow, counts: DeviceCounts | None) -> dict[str, object]:
 
 def topology_snapshot(switch: SwitchCore) -> dict[str, object]:
     """Return all switches and links that a switch knows from link states; those of other machines, too."""
-    states = [each for scope in Scope for each in switch.known_link_states(scope)]
+    states = [each for scope in Scope for each in switch.paths.link_states.states(scope)]
     rows = {
         (short_id(each.origin), short_id(each.domain)): [
             [short_id(link.name), short_id(link.domain), link.cost] for link in each.links

@@ -42,7 +42,7 @@ def switch_facts(state: SwitchState, name: Name, now: Timestamps) -> SwitchFacts
         ),
         locations=_locations(state, name, now.mono_s),
         is_negative=cache.is_negative(name, now.mono_s),
-        readers=len(switch.multicast.readers(name)),
+        readers=len(switch.state.readers.of(name)),
         branches=sum(len(tree.branches) for tree in trees),
         is_joined=any(tree.upstream is not None for tree in trees),
         drops={reason.label: count for reason, count in switch.drops().items() if count},

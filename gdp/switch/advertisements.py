@@ -15,27 +15,23 @@ from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
-from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENTS_WINDOW
+from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import Dependents
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.outbox import Outbox
 from gdp.switch.relocation import Relocations
 from gdp.switch.rib_client import RibClient
 from gdp.switch.unicast import Unicast
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.audit import Action
 from gdp.trust.right import HEARS, Right
-from gdp.trust.verifier import AdvertisementVerifier
 from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["AdvertisementHandler"]
@@ -61,44 +57,35 @@ class AdvertisementHandler:
 
     def __init__(
         self,
+        state: ForwardingState,
         *,
-        identity: Identity,
-        verifier: AdvertisementVerifier,
-        attached: LocalAdvertisements,
-        resolver: NameResolver,
         multicast: MulticastTrees,
         unicast: Unicast,
         rib_client: RibClient,
         locations: LocationUpdates,
         relocations: Relocations,
-        held: Dependents,
-        outbox: Outbox,
     ) -> None:
-        self._identity = identity
-        self._verifier = verifier
-        self._audit = verifier.policy.audit
-        self._attached = attached
-        self._resolver = resolver
+        self._state = state
         self._multicast = multicast
         self._unicast = unicast
         self._rib_client = rib_client
         self._locations = locations
         self._relocations = relocations
-        self._held = held
-        self._outbox = outbox
+        self._paces = TokenBuckets(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
         self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the node's nonce
 
     def receive_advertisement(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Handle an advertisement of an attached node; the node receives an AdvertiseAck in either case.
 
         Raises:
-            StatementError: it is not valid, or is not the node's newest.
+            StatementError: it is not valid, or is not the node's newest, or the node sends too many.
         """
+        self._check_pace(neighbour, now.mono_s)
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "an advertisement that its signer did not send")
         try:
-            advertisement = self._verifier.verify_statement(statement, now.unix_s)
-            if advertisement.switch != self._identity.name:
+            advertisement = self._state.verifier.verify_statement(statement, now.unix_s)
+            if advertisement.switch != self._state.me:
                 raise StatementError(DropReason.NOT_FOR_US, "the RtCert names another switch")
         except StatementError as error:
             self._refuse(neighbour, statement, error)
@@ -110,7 +97,7 @@ class AdvertisementHandler:
             self._acknowledge(neighbour, advertisement.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "an advertisement that its signer has renewed")
         if advertisement.right in HEARS:
-            cache = self._resolver.cache
+            cache = self._state.resolver.cache
             try:
                 is_first = self._multicast.add_reader(
                     advertisement, at, cache.of(advertisement.name, now.mono_s), now.mono_s
@@ -118,9 +105,9 @@ class AdvertisementHandler:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._held.record_advertisement(advertisement, at)
+            self._state.dependents.record_advertisement(advertisement, at)
             if is_first:
-                self._resolver.watch(advertisement.name, now.mono_s)
+                self._state.resolver.watch(advertisement.name, now.mono_s)
             for location in cache.of(advertisement.name, now.mono_s):
                 self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         is_alone = (
@@ -129,15 +116,15 @@ class AdvertisementHandler:
         if advertisement.right is Right.READ or is_alone:
             self._acknowledge(neighbour, advertisement.name, None, advertisement.sequence)
         if advertisement.right is not Right.READ:
-            known = self._attached.get(advertisement.name, advertisement.node)
+            known = self._state.attached.get(advertisement.name, advertisement.node)
             try:
-                self._attached.put(advertisement, *at, now.mono_s)
+                self._state.attached.put(advertisement, *at, now.mono_s)
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._held.record_advertisement(advertisement, at)
+            self._state.dependents.record_advertisement(advertisement, at)
             if known is None or (known.port, known.mac) != at:
-                self._audit.record(
+                self._state.policy.audit.record(
                     Action.ACCEPTED, "name", who=advertisement.node.to_text(), about=advertisement.name.to_text()
                 )
                 self._unicast.remove(advertisement.name)
@@ -145,6 +132,11 @@ class AdvertisementHandler:
             self._multicast.publisher_attached(advertisement, now.mono_s)
         self._relocations.arrived(advertisement, now.mono_s)
         self._rib_client.send_due(now.mono_s)
+
+    def _check_pace(self, neighbour: Neighbour, now_s: float) -> None:
+        if not self._paces.spend(neighbour.name, now_s):
+            # No response is sent: that would cost work, too.
+            raise StatementError(DropReason.QUOTA, "advertisements of one neighbour")
 
     def _check_fresh(self, neighbour: Neighbour, advertisement: Advertisement, now_s: float) -> None:
         """Record a verified advertisement; a neighbour that is far behind receives, now and then, by how much.
@@ -176,8 +168,8 @@ class AdvertisementHandler:
 
     def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
         """Return the highest sequence number among an attached node's advertisements of a name here, or -1."""
-        attachment = self._attached.get(name, neighbour.name)
-        reading = self._multicast.advertisement_of(name, (neighbour.port, neighbour.mac))
+        attachment = self._state.attached.get(name, neighbour.name)
+        reading = self._state.readers.advertisement_of(name, (neighbour.port, neighbour.mac))
         known = [reading] if attachment is None else [reading, attachment.advertisement]
         return max((advertisement.sequence for advertisement in known if advertisement is not None), default=-1)
 
@@ -187,21 +179,22 @@ class AdvertisementHandler:
             body = UnverifiedAdvertisement.from_statement(statement)
         except StatementError:
             return  # not even an advertisement: the caller counts it
-        about, reason = body.subject.name.to_text(), error.reason.label
-        self._audit.record(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
+        who, about, reason = neighbour.name.to_text(), body.subject.name.to_text(), error.reason.label
+        self._state.policy.audit.record(Action.REFUSED, "name", who=who, about=about, reason=reason)
         self._acknowledge(neighbour, body.subject.name, error.reason, body.sequence)
 
     def _acknowledge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
         ack = AdvertiseAck(name, neighbour.name, refused, sequence)
-        wire = ack.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._outbox.send_to_neighbour(neighbour, Kind.ADVERTISE_ACK, wire)
+        wire = self._state.signed_wire(ack)
+        self._state.outbox.send_to_neighbour(neighbour, Kind.ADVERTISE_ACK, wire)
 
-    def withdraw(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+    def receive_withdrawal(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Handle a withdrawal.
 
         Raises:
-            StatementError: it is not valid, or is older than the present advertisement.
+            StatementError: it is not valid, or is older than the present advertisement, or the node sends too many.
         """
+        self._check_pace(neighbour, now.mono_s)
         withdrawal = Withdrawal.received(statement, now.unix_s)
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
@@ -210,7 +203,7 @@ class AdvertisementHandler:
         if withdrawal.sequence <= self._sequence_of(name, neighbour):
             raise StatementError(DropReason.STALE, "a withdrawal of what was advertised again")
         if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
-            self._resolver.unwatch(name)
-        if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:
+            self._state.resolver.unwatch(name)
+        if right is not Right.READ and self._state.attached.remove(name, neighbour.name) is not None:
             self._unicast.remove(name)
             self._rib_client.relay(statement.wire, now.mono_s)

@@ -8,8 +8,7 @@ link carries a message twice.
 from __future__ import annotations
 
 from gdp.names import Name
-from gdp.switch.outbox import Outbox
-from gdp.switch.paths import Paths
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.trees import Downstream, Tree
 
 __all__ = ["Backups"]
@@ -18,16 +17,11 @@ __all__ = ["Backups"]
 class Backups:
     """Computes the backup paths of trees.
 
-    Args:
-        me: this switch.
-        own: its domain; a backup never leaves it, because the path choice of other domains is unknown.
+    A backup never leaves the switch's domain, because the path choice of other domains is unknown.
     """
 
-    def __init__(self, me: Name, own: Name, paths: Paths, outbox: Outbox) -> None:
-        self._me = me
-        self._own = own
-        self._paths = paths
-        self._outbox = outbox
+    def __init__(self, state: ForwardingState) -> None:
+        self._state = state
 
     def upstream(self, tree: Tree) -> tuple[Downstream, Name] | None:
         """Return where to request a backup branch: the loop-free alternate towards the publisher, or None.
@@ -36,12 +30,12 @@ class Backups:
         """
         if tree.path == 2:
             return None
-        if tree.is_backup or tree.upstream is None or tree.switch == self._me or tree.guide is not None:
+        if tree.is_backup or tree.upstream is None or tree.switch == self._state.me or tree.guide is not None:
             return None
-        path = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        path = self._state.paths.to_switch(tree.switch, tree.domain, tree.allowed)
         if path is None or path.alternate is None:
             return None
-        neighbour = self._outbox.neighbour(path.alternate)
+        neighbour = self._state.neighbours.cheapest(path.alternate)
         if neighbour is None or (at := (neighbour.port, neighbour.mac)) == tree.upstream or at in tree.branches:
             return None
         return at, neighbour.name
@@ -53,12 +47,13 @@ class Backups:
         Messages that fit that branch must also fit the backup. Of several backups, the one that the nearest switch
         requested is taken.
         """
+        own = self._state.policy.own
         found: dict[Downstream, tuple[int, Downstream]] = {}
         for at, branch in tree.branches.items():
             if branch.backup_for is None or branch.is_active:
                 continue
-            path = self._paths.to_switch(branch.backup_for, self._own, frozenset({self._own}))
-            neighbour = None if path is None else self._outbox.neighbour(path.first)
+            path = self._state.paths.to_switch(branch.backup_for, own, frozenset({own}))
+            neighbour = None if path is None else self._state.neighbours.cheapest(path.first)
             if path is None or neighbour is None:
                 continue
             protected = neighbour.port, neighbour.mac

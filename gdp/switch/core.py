@@ -4,7 +4,7 @@ Sans-I/O; an I/O layer or a simulated network passes in the frames that the data
 
 The path of a punted frame::
 
-    kind >= 0x80    -> reassembled statement -> hello | link state | advertisement, withdrawal | join, leave
+    kind >= 0x80    -> reassembled statement -> hello, or the handler of its kind (``_handlers``)
     addressed to us -> a RIB's response, or an echo
     anything else   -> no entry yet: Unicast finds the path, or buffers the frame and sends a query
 """
@@ -12,23 +12,16 @@ The path of a punted frame::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.channel import Channels, Opened
 from gdp.control.diagnostics import Diagnostics
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
-from gdp.control.hello_port import HelloPort
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
-from gdp.control.link_state import LinkState, Scope
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.neighbour_table import Change
-from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
@@ -37,130 +30,133 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
+from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.switch.advertisements import AdvertisementHandler
-from gdp.switch.dependents import Dependents
 from gdp.switch.diagnostic_answers import DiagnosticAnswers
-from gdp.switch.direct_tunnels import Action, DirectTunnels
-from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
-from gdp.switch.evidence import Evidence
 from gdp.switch.flooding import Flooding
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.join_handler import JoinHandler
 from gdp.switch.location_updates import LocationUpdates
+from gdp.switch.lsdb import LinkStateDatabase
 from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
 from gdp.switch.path_updates import PathUpdates
 from gdp.switch.paths import Paths
-from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.revocations import RevocationHandler
 from gdp.switch.rib_client import RibClient
 from gdp.switch.table import Table
+from gdp.switch.tunnel_planner import TunnelPlanner
 from gdp.switch.unicast import Unicast
-from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
-from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["SwitchCore"]
 
-_REFRESH_TOKENS: Final = 4.0  # of joins: it renews up to 128 of them, and may cost a reply
 _CONTROL: Final = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
+
+StatementHandler = Callable[[Neighbour, Statement, Timestamps], object]
 
 
 class SwitchCore:
-    """Sans-I/O core of one switch."""
+    """Sans-I/O core of one switch.
+
+    Attributes:
+        state: what its parts share.
+        tunnels: plans the direct tunnels.
+    """
 
     def __init__(self, identity: Identity, policy: Policy, table: Table, settings: NodeSettings) -> None:
-        self._identity = identity
-        self._policy = policy
-        self.table = table
-        self._fragmenter = ControlFragmenter(identity.name, settings.incarnation)
-        self._reassembler = ControlReassembler()
+        fragmenter = ControlFragmenter(identity.name, settings.incarnation)
+        link_states = LinkStateDatabase(identity.member.domain)
+        self.paths = Paths(identity.name, identity.member.domain, link_states)
         self.hello_protocol = HelloProtocol(
-            identity, policy, self._fragmenter, settings,
-            digest_for=self._digest_for, incarnation_elsewhere=self._incarnation_elsewhere,
-            is_only_way=self._is_only_way,
-        )  # fmt: skip
-        self._outbox = Outbox(self.hello_protocol, self._fragmenter)
-        self._flooding = Flooding(
-            identity=identity, policy=policy, hello_protocol=self.hello_protocol, send=self._send_link_state,
-            first_sequence=settings.first_sequence, incarnation_id=settings.incarnation_id,
-        )  # fmt: skip
-        self._paths = self._flooding.paths
-        self._verifier = AdvertisementVerifier(policy)
+            identity,
+            policy,
+            fragmenter,
+            settings,
+            digest_for=link_states.digest_for,
+            incarnation_elsewhere=self.paths.incarnation_elsewhere,
+            is_only_way=self.paths.is_only_way,
+        )
+        neighbours = self.hello_protocol.neighbours
+        state = ForwardingState(
+            identity,
+            policy,
+            table=table,
+            paths=self.paths,
+            neighbours=neighbours,
+            outbox=Outbox(neighbours, fragmenter),
+            lease_s=settings.lease_s,
+        )
+        self.state = state
+        self.table = table
+        self.attached = state.attached
+        self.resolver = state.resolver
         self._incarnation = settings.incarnation
-        self.attached = LocalAdvertisements()
-        self.resolver = NameResolver(identity.name, settings.lease_s)
-        self.multicast = MulticastTrees(
-            identity=identity, policy=policy, table=table, paths=self._paths, attached=self.attached,
-            outbox=self._outbox, first_sequence=settings.first_sequence,
-        )  # fmt: skip
-        self.unicast = Unicast(
-            me=identity.name, own_domain=policy.own, transit=policy.transit, table=table, paths=self._paths,
-            resolver=self.resolver, attached=self.attached, outbox=self._outbox,
-        )  # fmt: skip
-        self._evidence = Evidence(policy, self._verifier)
-        self._held = Dependents(self.attached, self.resolver.cache, self.multicast)
-        self._sync = RevocationSync(
-            identity, policy.revoked, self.hello_protocol,
-            lambda neighbour, wire: self._outbox.send_to_neighbour(neighbour, Kind.REVOKED, wire),
-            settings.first_sequence,
-        )  # fmt: skip
+        self._reassembler = ControlReassembler()
+        self._flooding = Flooding(state, self.hello_protocol.conflicts, settings)
+        self.multicast = MulticastTrees(state, settings.first_sequence)
+        self.unicast = Unicast(state)
         self._revoker = RevocationHandler(
-            verifier=self._verifier, hello_protocol=self.hello_protocol, attached=self.attached,
-            multicast=self.multicast, unicast=self.unicast, resolver=self.resolver,
-            evidence=self._evidence, held=self._held, sync=self._sync,
-            outbox=self._outbox,
-        )  # fmt: skip
-        self.relocations = Relocations(identity, policy, self.multicast, self.unicast, self._outbox)
-        self._presence = PresenceAnswers(identity, self.hello_protocol, self.attached, self.unicast, self._outbox)
+            state, self.hello_protocol, self.multicast, self.unicast, settings.first_sequence
+        )
+        self.relocations = Relocations(state, self.multicast, self.unicast)
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
-        self._locations = LocationUpdates(
-            identity=identity, policy=policy, attached=self.attached, resolver=self.resolver, multicast=self.multicast,
-            unicast=self.unicast, relocations=self.relocations, held=self._held, outbox=self._outbox,
-        )  # fmt: skip
-        self._endpoints = EndpointExchange(identity, policy)
-        self._tunnels = DirectTunnels(identity.name)
-        self._tunnel_ports: dict[int, Name] = {}  # ports of direct tunnels
-        self._tunnel_peers: frozenset[Name] = frozenset()  # that the operator configured
-        self.rib_client = RibClient(
-            identity=identity, policy=policy, paths=self._paths, attached=self.attached, resolver=self.resolver,
-            multicast=self.multicast, unicast=self.unicast, relocations=self.relocations, evidence=self._evidence,
-            locations=self._locations, outbox=self._outbox, presence=self._presence, channels=self._channels,
-            endpoints=self._endpoints,
-        )  # fmt: skip
+        self._locations = LocationUpdates(state, self.multicast, self.unicast, self.relocations)
+        self.rib_client = RibClient(state, self._channels, self.unicast, self.relocations, self._locations)
+        self.tunnels = TunnelPlanner(state, self.rib_client.endpoints, self._wake)
         self._path_updates = PathUpdates(
-            me=identity.name, flooding=self._flooding, hello_protocol=self.hello_protocol, multicast=self.multicast,
-            unicast=self.unicast, rib_client=self.rib_client,
-        )  # fmt: skip
-        self._advertisements = AdvertisementHandler(
-            identity=identity, verifier=self._verifier, attached=self.attached, resolver=self.resolver,
-            multicast=self.multicast, unicast=self.unicast, rib_client=self.rib_client, locations=self._locations,
-            relocations=self.relocations, held=self._held, outbox=self._outbox,
-        )  # fmt: skip
+            state,
+            flooding=self._flooding,
+            hello_protocol=self.hello_protocol,
+            multicast=self.multicast,
+            unicast=self.unicast,
+            rib_client=self.rib_client,
+        )
+        self._handlers = self._statement_handlers()
         self.diagnostics = Diagnostics(
-            identity, policy, self._fragmenter, settings.first_sequence,
+            identity,
+            policy,
+            fragmenter,
+            settings.first_sequence,
             lambda frames, to, now: self.unicast.originate(frames, to, identity.name, now.mono_s),
-        )  # fmt: skip
-        self.diagnostic_answers = DiagnosticAnswers(
-            me=identity.name, hello_protocol=self.hello_protocol, table=table, multicast=self.multicast,
-            attached=self.attached, resolver=self.resolver, paths=self._paths, wake=self._wake,
-            verifier=self._verifier, diagnostics=self.diagnostics,
-        )  # fmt: skip
+        )
+        self.diagnostic_answers = DiagnosticAnswers(state, self.diagnostics, self._wake)
         self.boundary = ErrorBoundary()
-        self._join_paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)
-        self._advertisement_paces = TokenBuckets(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
         self._drops: Counter[DropReason] = Counter()
         # when something other than the neighbour discovery is due; None: to be computed
         self._rest_due_s: float | None = None
 
+    def _statement_handlers(self) -> dict[int, StatementHandler]:
+        """Return what handles a neighbour's statement, by the kind of its frames."""
+        advertisements = AdvertisementHandler(
+            self.state,
+            multicast=self.multicast,
+            unicast=self.unicast,
+            rib_client=self.rib_client,
+            locations=self._locations,
+            relocations=self.relocations,
+        )
+        joins = JoinHandler(self.state, self.multicast, self.relocations)
+        return {
+            Kind.LINK_STATE: self._flooding.receive,
+            Kind.ADVERTISE: advertisements.receive_advertisement,
+            Kind.WITHDRAW: advertisements.receive_withdrawal,
+            Kind.JOIN: joins.handle_join,
+            Kind.LEAVE: joins.handle_join,
+            Kind.JOIN_REFRESH: joins.handle_refresh,
+            Kind.REVOKE: self._revoker.receive_revocation,
+            Kind.REVOKED: self._revoker.receive_sync,
+            Kind.REDIRECT: self._locations.receive_redirect,
+            Kind.WHERE: self._locations.answer_query,
+        }
+
     @property
     def name(self) -> Name:
         """Return the switch's name."""
-        return self._identity.name
+        return self.state.me
 
     @property
     def rib(self) -> Name | None:
@@ -168,28 +164,9 @@ class SwitchCore:
         return self.rib_client.rib
 
     @property
-    def paths(self) -> Paths:
-        """Return the paths to the switches that link states name."""
-        return self._paths
-
-    @property
-    def severed(self) -> frozenset[Name]:
-        """Return the switches of the domain that only leaves connect to this one, so that no path leads to them."""
-        return self._paths.severed()
-
-    @property
     def is_displaced(self) -> bool:
         """Return whether an older switch with this identity is alive, so that this one must end."""
         return self._flooding.is_displaced
-
-    @property
-    def link_states(self) -> int:
-        """Return how many link states are known."""
-        return len(self._flooding.link_states)
-
-    def known_link_states(self, scope: Scope) -> list[LinkState]:
-        """Return the newest link state of each switch, in one scope."""
-        return self._flooding.link_states.states(scope)
 
     def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
         """Return the conditions that are missing before this switch can serve; empty when none is.
@@ -204,7 +181,7 @@ class SwitchCore:
             if port.index not in attachments:
                 found = port_waits(port, tuple(Role))
                 waits += (each for each in found if port.index not in refusing or each.reason is WaitReason.LINK_DOWN)
-        if severed := self.severed:
+        if severed := self.paths.severed():
             waits.append(Wait(WaitReason.THROUGH_LEAF, name=min(severed)))
         if self.rib is None:
             waits.append(Wait(WaitReason.NO_RIB))
@@ -258,7 +235,7 @@ class SwitchCore:
                 self._neighbour_changed(change, now.mono_s)
         if has_others:
             self._rest_due_s = None
-            self._presence.answer(now.mono_s)
+            self.rib_client.presence.answer(now.mono_s)
             self.diagnostics.answer_waiting(now)
             self._flooding.tell_of_conflicts(now.mono_s)
             self._path_updates.plan(now.mono_s)
@@ -271,7 +248,7 @@ class SwitchCore:
         for change in lost:
             self._neighbour_changed(change, now_s)
         for hello in self.hello_protocol.hellos_to_send(now_s):
-            self._outbox.put(hello)
+            self.state.outbox.put(hello)
         self.diagnostics.handle_timer(now)
         if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
             return  # most due timers are keepalives
@@ -288,9 +265,9 @@ class SwitchCore:
             self.resolver.unwatch(topic)
         self.relocations.handle_timer(now_s)
         self.rib_client.send_due(now_s)
-        self._sync.handle_timer(now_s)
+        self._revoker.sync.handle_timer(now_s)
         self._tell_rib_of_revocations(now_s)
-        self._presence.answer(now_s)
+        self.rib_client.presence.answer(now_s)
         self.diagnostics.answer_waiting(now)
 
     def get_timer(self) -> float | None:
@@ -310,7 +287,7 @@ class SwitchCore:
             self.resolver.next_expiry(),
             self.relocations.get_timer(),
             self.rib_client.get_timer(),
-            self._sync.get_timer(),
+            self._revoker.sync.get_timer(),
         ]
         if self.rib_client.rib is not None:
             times.append(self._revoker.next_due_for_rib())
@@ -324,10 +301,6 @@ class SwitchCore:
         self.rib_client.send_due(now_s)
         self._rest_due_s = None
 
-    def _is_only_way(self, name: Name) -> bool:
-        """Return whether only our own link leads to a neighbour."""
-        return self._paths.is_only_way(name)
-
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
         self.hello_protocol.liveness.count_arrivals(frames_from)
@@ -339,7 +312,7 @@ class SwitchCore:
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send: none while an older switch has this identity."""
         del now_s  # nothing here is paced
-        return [] if self.is_displaced else self._outbox.poll_frames()
+        return [] if self.is_displaced else self.state.outbox.poll_frames()
 
     def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
@@ -348,28 +321,11 @@ class SwitchCore:
         """Note that a timer outside neighbour discovery has changed."""
         self._rest_due_s = None
 
-    def _unwatch(self, orphaned: Iterable[Name]) -> None:
-        for topic in orphaned:
-            self.resolver.unwatch(topic)
-
-    def _take_revoked(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Take part in the comparison of revocations with a neighbour."""
-        if statement.type is StatementType.REVOKE:
-            self._unwatch(self._revoker.receive_lacking(statement, neighbour, now))
-        else:
-            self._sync.receive(neighbour, statement, now)
-
     def _tell_rib_of_revocations(self, now_s: float) -> None:
         """Send the RIB the revocations that the operator submitted."""
         if self.rib_client.rib is not None:
             for wire in self._revoker.due_for_rib(self.rib_client.rib, now_s):
                 self.rib_client.relay(wire, now_s)
-
-    def _incarnation_elsewhere(self, name: Name) -> bytes | None:
-        return self._paths.incarnation_elsewhere(name)
-
-    def _digest_for(self, port: HelloPort) -> bytes:
-        return self._flooding.digest_for(port)
 
     def revoke(self, wire: bytes, now: Timestamps) -> None:
         """Handle a revocation from this node's operator, and distribute it.
@@ -378,69 +334,8 @@ class SwitchCore:
             StatementError: it is not valid.
         """
         self._rest_due_s = None
-        self._unwatch(self._revoker.hand_in(parse(wire), now))
+        self._revoker.hand_in(parse(wire), now)
         self._tell_rib_of_revocations(now.mono_s)
-
-    # -- direct tunnels
-
-    @property
-    def endpoint_refusal(self) -> Refusal | None:
-        """Return why the RIB refused this switch's endpoint record, or None; STALE: publish with a higher sequence."""
-        return self._endpoints.refusal
-
-    def publish_endpoints(self, record: EndpointRecord) -> None:
-        """Publish this switch's endpoint record to the RIB; from the first one on, it learns those of other switches.
-
-        Raises:
-            StatementError: STALE, its sequence is not higher than that of the one before.
-        """
-        self._endpoints.set_own(record)
-        self._rest_due_s = None
-
-    def set_tunnel_peers(self, names: Collection[Name]) -> None:
-        """Set the switches to which the operator configured a tunnel: no direct tunnel to them is opened."""
-        self._tunnel_peers = frozenset(names)
-
-    def set_tunnel_port(self, index: int, peer: Name | None) -> None:
-        """State that a port is the direct tunnel to a switch; None: it is an ordinary port."""
-        self._tunnel_ports.pop(index, None)
-        if peer is not None:
-            self._tunnel_ports[index] = peer
-
-    def tunnel_answered(self, name: Name, now: Timestamps) -> None:
-        """Record that WireGuard completed a handshake with a peer of ``poll_tunnel_actions``."""
-        self._tunnels.answered(name, now.mono_s)
-
-    def tunnel_failure(self, name: Name) -> str:
-        """Return why the direct tunnel to a peer is not up; empty: it is up, or too young to say."""
-        return self._tunnels.failure(name)
-
-    def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
-        """Return our own endpoints as neighbours over tunnels see them, by port and neighbour."""
-        return self.hello_protocol.neighbours.observed_addresses()
-
-    def poll_tunnel_actions(self, now: Timestamps) -> list[Action]:
-        """Return, once, what to do about direct tunnels; to be called about ten times a second.
-
-        Empty until ``publish_endpoints``.
-        """
-        own = self._endpoints.own
-        if own is None:
-            return []
-        up = self.hello_protocol.neighbours.all_up()
-        linked = {each.name for each in up if each.port not in self._tunnel_ports} | self._tunnel_peers
-        wanted = self._tunnels.peers(self._paths.members(), linked)
-        due_s = self._endpoints.get_timer()
-        self._endpoints.want(wanted, now.mono_s)
-        if self._endpoints.get_timer() != due_s:
-            self._rest_due_s = None
-        return self._tunnels.poll_actions(
-            own=own,
-            records=self._endpoints.records(now),
-            linked=linked,
-            up={each.name for each in up if self._tunnel_ports.get(each.port) == each.name},
-            now_s=now.mono_s,
-        )
 
     # -- frames
 
@@ -469,7 +364,7 @@ class SwitchCore:
             return wire is not None
         neighbour = self._sender(arrival)  # their frames cause no response and no query
         if header.kind == Kind.DIAGNOSTIC_REQUEST and header.hops_left & HOPS_MASK <= 1:
-            if self.multicast.trees.of_topic(Name(header.destination)):
+            if self.state.trees.of_topic(Name(header.destination)):
                 raise FrameError(DropReason.NOT_FOR_US, "a request that a tree has copied")
             self.diagnostics.receive(header, arrival, now, neighbour.name)
         elif header.destination == self.name:
@@ -494,32 +389,10 @@ class SwitchCore:
                 self._flooding.sync(known, now.mono_s)
             return
         neighbour = self._sender(arrival)
-        if kind == Kind.LINK_STATE:
-            if not neighbour.role.is_switch:
-                raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
-            self._flooding.receive(neighbour, statement, now)
-        elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
-            if not self._advertisement_paces.spend(neighbour.name, now.mono_s):
-                # No response is sent: that would cost work, too.
-                raise StatementError(DropReason.QUOTA, "advertisements of one neighbour")
-            take = (
-                self._advertisements.receive_advertisement if kind == Kind.ADVERTISE else self._advertisements.withdraw
-            )
-            take(neighbour, statement, now)
-        elif kind in (Kind.JOIN, Kind.LEAVE):
-            self._take_join(neighbour, statement, now)
-        elif kind == Kind.JOIN_REFRESH:
-            self._take_join_refresh(neighbour, statement, now.mono_s)
-        elif kind == Kind.REVOKE:
-            self._unwatch(self._revoker.receive_revocation(statement, neighbour, now))
-        elif kind == Kind.REVOKED:
-            self._take_revoked(neighbour, statement, now)
-        elif kind == Kind.REDIRECT:
-            self._redirected(statement, now)
-        elif kind == Kind.WHERE:
-            self._locations.answer_query(neighbour, statement, now.mono_s)
-        else:
+        handle = self._handlers.get(kind)
+        if handle is None:
             raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
+        handle(neighbour, statement, now)
 
     def _sender(self, arrival: ReceivedFrame) -> Neighbour:
         """Return the neighbour with the sender's address. Raises ``FrameError``: UNKNOWN_SENDER, it is not up."""
@@ -546,12 +419,11 @@ class SwitchCore:
             with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
                 if header.kind == Kind.RIB_ANSWER and statement.type is StatementType.RELAY:
                     revocation, rib = self.rib_client.revocation_in(statement, now)
-                    self._unwatch(self._revoker.receive_from_rib(revocation, rib, now))
+                    self._revoker.receive_from_rib(revocation, rib, now)
                 elif header.kind == Kind.RIB_ANSWER:
                     self.rib_client.receive(statement, now, is_fresh=opened.is_fresh)
                 else:
-                    location = self._evidence.from_relay(statement, now)
-                    self._locations.receive_relocation(location, statement.wire, now.mono_s)
+                    self._locations.receive_relocation(statement, now)
         elif header.kind == Kind.ECHO_REQUEST:
             back = header._replace(
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
@@ -579,13 +451,13 @@ class SwitchCore:
         """Send the present state to a neighbour that came up, and remove the state of one that is gone."""
         neighbour, before = change
         if neighbour.state is NeighbourState.UP:
-            self._sync.neighbour_up(neighbour, now_s)
+            self._revoker.sync.neighbour_up(neighbour, now_s)
             self.multicast.neighbour_up((neighbour.port, neighbour.mac), now_s)
             self._path_updates.neighbour_came()
             if neighbour.role.is_switch:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
-            self._sync.neighbour_lost(neighbour)
+            self._revoker.sync.neighbour_lost(neighbour)
             if neighbour.role.is_switch:
                 self._flooding.damping.went((neighbour.port, neighbour.name), now_s)
             self.multicast.neighbour_lost((neighbour.port, neighbour.mac), now_s)
@@ -594,49 +466,3 @@ class SwitchCore:
                     self.relocations.departed(attachment.advertisement, now_s)
                     self.attached.remove(attachment.advertisement.name, neighbour.name)
                     self.unicast.remove(attachment.advertisement.name)
-
-    def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
-        self._outbox.send_to_neighbour(neighbour, Kind.LINK_STATE, wire)
-
-    # -- moved nodes
-
-    def _redirected(self, statement: Statement, now: Timestamps) -> None:
-        """Handle a redirect: a neighbour that received our frames for a node reports where that node is now."""
-        if statement.type is StatementType.RELAY:
-            location = self._evidence.from_relay(statement, now)
-        else:
-            location = self.rib_client.verify_answer(statement, now)
-        self._locations.receive_redirect(location, statement.wire, now.mono_s)
-
-    # -- trees
-
-    def _take_join(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        join = Join.from_fields(statement.expect(StatementType.JOIN))
-        if not neighbour.role.is_switch or statement.signer != neighbour.name:
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
-        if not self._join_paces.spend(neighbour.name, now.mono_s):
-            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
-        statement.verify(neighbour.key)
-        self.hello_protocol.ports[neighbour.port].receive_join(join, neighbour)
-        if join.lease_s > 0:
-            advertisement = self._evidence.of_join(join, now)
-            if neighbour.role is Role.LEAF and advertisement.switch != neighbour.name:
-                raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
-            self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), advertisement)
-        if self.multicast.join(join, neighbour, now.mono_s):
-            self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
-
-    def _take_join_refresh(self, neighbour: Neighbour, statement: Statement, now_s: float) -> None:
-        is_reply = statement.type is StatementType.JOIN_UNKNOWN
-        expected = StatementType.JOIN_UNKNOWN if is_reply else StatementType.JOIN_REFRESH
-        refresh = JoinRefresh.from_fields(statement.expect(expected), is_reply=is_reply)
-        if statement.signer != neighbour.name or not (is_reply or neighbour.role.is_switch):
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
-        if not self._join_paces.spend(neighbour.name, now_s, _REFRESH_TOKENS):
-            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
-        statement.verify(neighbour.key)
-        self.hello_protocol.ports[neighbour.port].receive_join(refresh, neighbour)
-        if is_reply:
-            self.multicast.join_unknown(refresh, neighbour, now_s)
-        else:
-            self.multicast.refresh(refresh, neighbour, now_s)

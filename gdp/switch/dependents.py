@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from gdp.names import Name
+from gdp.switch.attached_readers import AttachedReaders
 from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location, NameCache
-from gdp.switch.trees import Downstream
+from gdp.switch.trees import Downstream, Trees
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.evidence_index import Holdings
 
@@ -45,10 +45,11 @@ class JoinedBranch(NamedTuple):
 class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch]):
     """The index of one switch."""
 
-    def __init__(self, attached: LocalAdvertisements, cache: NameCache, multicast: MulticastTrees) -> None:
+    def __init__(self, attached: LocalAdvertisements, cache: NameCache, readers: AttachedReaders, trees: Trees) -> None:
         self._attached = attached
         self._cache = cache
-        self._multicast = multicast
+        self._readers = readers
+        self._trees = trees
         super().__init__(self._has)
 
     def record_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
@@ -66,9 +67,9 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
 
     def _has(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
         if isinstance(holder, AttachedAdvertisement):
-            is_reader = self._multicast.advertisement_of(holder.name, holder.at) is not None
+            is_reader = self._readers.advertisement_of(holder.name, holder.at) is not None
             return is_reader or self._attached.get(holder.name, holder.node) is not None
         if isinstance(holder, KnownLocation):
             return self._cache.get(holder.name, holder.advertiser) is not None
-        tree = self._multicast.trees.get(holder.topic, holder.publisher)
+        tree = self._trees.get(holder.topic, holder.publisher)
         return tree is not None and holder.at in tree.branches

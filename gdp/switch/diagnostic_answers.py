@@ -11,19 +11,13 @@ from typing import Final
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.diagnostics import Diagnostics, Question
 from gdp.control.neighbour import Neighbour
-from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.crypto.schema import NAME_OR_ZERO, Keyed
 from gdp.errors import DropReason, StatementError
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
-from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.paths import Paths
-from gdp.switch.table import Table
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.trust.right import Right
-from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["DiagnosticAnswers"]
 
@@ -42,28 +36,8 @@ class DiagnosticAnswers:
         port_name: returns the device of a port; the I/O layer sets it.
     """
 
-    def __init__(
-        self,
-        *,
-        me: Name,
-        hello_protocol: HelloProtocol,
-        table: Table,
-        multicast: MulticastTrees,
-        attached: LocalAdvertisements,
-        resolver: NameResolver,
-        paths: Paths,
-        wake: Callable[[], None],
-        verifier: AdvertisementVerifier,
-        diagnostics: Diagnostics,
-    ) -> None:
-        self._me = me
-        self._verifier = verifier
-        self._hello_protocol = hello_protocol
-        self._table = table
-        self._multicast = multicast
-        self._attached = attached
-        self._resolver = resolver
-        self._paths = paths
+    def __init__(self, state: ForwardingState, diagnostics: Diagnostics, wake: Callable[[], None]) -> None:
+        self._state = state
         self._wake = wake
         self.port_name: Callable[[int], str] = str
         diagnostics.register("trace", self.trace)
@@ -80,8 +54,9 @@ class DiagnosticAnswers:
         if question.port is not None:
             result["in"] = self._link(question.port, question.mac)
         end = _END.read(question.body) or question.target
-        hops = self._table.entries.get(end + question.asker.name) or self._table.entries.get(end)
-        if end != self._me and hops:
+        entries = self._state.table.entries
+        hops = entries.get(end + question.asker.name) or entries.get(end)
+        if end != self._state.me and hops:
             result["out"] = self._link(hops[0][0], hops[0][1][:_MAC_BYTES])
         try:
             self._check_right(question, now)
@@ -90,7 +65,7 @@ class DiagnosticAnswers:
         wanted = _PUBLISHER.read(question.body)
         result["branches"] = [
             {"p": tree.publisher, **self._link(port, mac)}
-            for tree in self._multicast.trees.of_topic(question.name)
+            for tree in self._state.trees.of_topic(question.name)
             if wanted in (ZERO, tree.publisher) and tree.path == 1
             for (port, mac), branch in sorted(tree.branches.items())
             if branch.is_active and (port, mac) != tree.upstream
@@ -106,23 +81,24 @@ class DiagnosticAnswers:
             raise StatementError(DropReason.NOT_DELEGATED, "no right on the name")
         shown = RightEvidence.from_fields(body)
         shown.subject.expect(name)
-        self._verifier.verify_right(shown.subject, shown.right, shown.chain, asker, now.unix_s)
+        self._state.verifier.verify_right(shown.subject, shown.right, shown.chain, asker, now.unix_s)
 
     def resolve(self, question: Question, now: Timestamps) -> Mapping[str, object] | None:
         """Return who advertises a name, for a node that is attached here; None: the RIB is being queried."""
         if not question.is_neighbour:
             return {"places": []}
+        me, paths = self._state.me, self._state.paths
         locations: dict[Name, Mapping[str, object]] = {
             each.advertisement.node: {
                 "node": each.advertisement.node,
                 "right": each.advertisement.right.value,
-                "switch": self._me,
+                "switch": me,
             }
-            for each in self._attached.named(question.name)
+            for each in self._state.attached.named(question.name)
         }
-        if self._paths.is_switch(question.name) or self._paths.is_rib(question.name) or question.name == self._me:
+        if paths.is_switch(question.name) or paths.is_rib(question.name) or question.name == me:
             locations[question.name] = {"node": question.name, "right": Right.ATTACH.value}  # link states name it
-        found = self._resolver.find(question.name, now.mono_s)
+        found = self._state.resolver.find(question.name, now.mono_s)
         if found is None:
             self._wake()
             if not locations:
@@ -142,7 +118,7 @@ class DiagnosticAnswers:
         link: dict[str, object] = {"port": self.port_name(port)}
         neighbour = self._neighbour(port, mac)
         if neighbour is not None:
-            rtt_s = self._hello_protocol.ports[port].quality_of(neighbour.name).rtt.srtt_s
+            rtt_s = self._state.neighbours.ports[port].quality_of(neighbour.name).rtt.srtt_s
             link |= {"to": neighbour.name, "role": neighbour.role.value, "cost": neighbour.cost}
             if neighbour.member is not None:
                 link["label"] = neighbour.member.label
@@ -151,5 +127,5 @@ class DiagnosticAnswers:
         return link
 
     def _neighbour(self, port: int, mac: bytes) -> Neighbour | None:
-        known = self._hello_protocol.ports.get(port)
+        known = self._state.neighbours.ports.get(port)
         return next((each for each in known.neighbours.values() if each.mac == mac), None) if known else None

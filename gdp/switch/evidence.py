@@ -9,6 +9,7 @@ from __future__ import annotations
 from gdp.control.join import Join
 from gdp.control.query import Response
 from gdp.control.relayed_statement import RelayedStatement
+from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
@@ -40,6 +41,22 @@ class Evidence:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
         return _place(advertisement, response.domain, frozenset(response.transit), response.lease_s, now)
 
+    def from_forwarded_answer(self, statement: Statement, now: Timestamps) -> Location:
+        """Return the location in a response that was forwarded; any RIB of a trusted domain may have issued it.
+
+        Raises:
+            StatementError: it is not valid, or contains no location.
+        """
+        fields = statement.expect(StatementType.ANSWER)
+        member = self._policy.verify_sender(statement, now.unix_s)
+        if not (member.role.is_switch or member.role is Role.RIB):
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
+        statement.verify(member.key)
+        response = Response.from_fields(fields)
+        if not response.advertisement:
+            raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
+        return self.from_answer(response, now)
+
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
         """Return the location that a switch reports of a node that is attached to it."""
         relayed = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
@@ -65,12 +82,10 @@ class Evidence:
             raise StatementError(DropReason.NOT_DELEGATED, "two paths that reader and publisher do not both ask for")
         return reader
 
-    def still_holds(self, location: Location, now: Timestamps) -> bool:
-        """Return whether the proofs of a location are valid; a location without proofs is."""
-        if location.proof is None:
-            return True
+    def still_holds(self, advertisement: Advertisement, now: Timestamps) -> bool:
+        """Return whether the certificates of a verified advertisement are still valid."""
         try:
-            self._verifier.recheck(location.proof, now.unix_s)
+            self._verifier.recheck(advertisement, now.unix_s)
         except StatementError:
             return False
         return True

@@ -10,27 +10,24 @@ databases equal and attracts no traffic. Its own links stay within its domain.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.hello import DIGEST_BYTES, INCARNATION_BYTES
-from gdp.control.hello_port import HelloPort
+from gdp.control.hello import DIGEST_BYTES
+from gdp.control.identity_conflicts import IdentityConflicts
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, LinkStateVersion, Scope
 from gdp.control.neighbour import Neighbour
-from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.damping import Damping
-from gdp.switch.lsdb import LinkStateDatabase
-from gdp.switch.paths import Paths
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.token_bucket import TokenBuckets
-from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["Flooding"]
@@ -46,37 +43,22 @@ _EARLY_S: Final = 10.0  # when a link state of an earlier incarnation comes this
 _SYNC_S: Final = 0.5  # between two sends of everything to one neighbour
 _OUT_OF_STEP_S: Final = 0.2  # digests differ for less time while a flood is under way
 
-SendStatement = Callable[[Neighbour, bytes], None]
-
 
 class Flooding:
     """Originates our link states; receives and forwards those of others.
 
     Args:
-        send: sends a link state to a neighbour.
-        first_sequence: above every sequence number of an earlier incarnation; wall-clock milliseconds suffice.
-        incarnation_id: mark of this incarnation, ``INCARNATION_BYTES``.
+        conflicts: nodes that share an identity with another one.
 
     Attributes:
         is_displaced: an older switch with our identity is alive. This switch then originates nothing more.
     """
 
-    def __init__(
-        self,
-        *,
-        identity: Identity,
-        policy: Policy,
-        hello_protocol: HelloProtocol,
-        send: SendStatement,
-        first_sequence: int,
-        incarnation_id: bytes = bytes(INCARNATION_BYTES),
-    ) -> None:
-        self._identity = identity
-        self._policy = policy
-        self._hello_protocol = hello_protocol
-        self._send = send
-        self._sequence = self._first_sequence = first_sequence
-        self._incarnation_id = incarnation_id
+    def __init__(self, state: ForwardingState, conflicts: IdentityConflicts, settings: NodeSettings) -> None:
+        self._state = state
+        self._conflicts = conflicts
+        self._sequence = self._first_sequence = settings.first_sequence
+        self._incarnation_id = settings.incarnation_id
         self._answers: dict[tuple[bytes, Scope], int] = {}  # by incarnation: how often it exceeded our sequence number
         self.is_displaced = False
         self._conflicts_seen = 0
@@ -84,10 +66,9 @@ class Flooding:
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
-        self._domain = identity.member.domain
-        self._is_leaf = identity.role is Role.LEAF
-        self.link_states = LinkStateDatabase(self._domain)
-        self.paths = Paths(identity.name, self._domain, self.link_states)
+        self._domain = state.identity.member.domain
+        self._is_leaf = state.identity.role is Role.LEAF
+        self.link_states = state.paths.link_states
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self._paces = TokenBuckets(LINK_STATES_PER_S, LINK_STATES_BURST)
@@ -101,20 +82,17 @@ class Flooding:
         """Take over the wall clock, before anything is originated."""
         self._unix_ahead_s = now.unix_s - now.mono_s
 
-    def digest_for(self, port: HelloPort) -> bytes:
-        """Return the digest for a hello on a port: nothing where its switches are of several domains."""
-        domains = {each.domain for each in port.neighbours.values() if each.role.is_switch}
-        return self.link_states.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
-
     def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> bool:
         """Handle a link state that a neighbour passed on; return whether it was news.
 
         Raises:
             StatementError: it is not valid, or does not belong here.
         """
+        if not neighbour.role.is_switch:
+            raise StatementError(DropReason.NOT_DELEGATED, "only switches speak of links")
         fields = statement.fields
         version = LinkStateVersion.from_fields(fields)
-        if statement.signer != self._identity.name:
+        if statement.signer != self._state.me:
             if not self.link_states.is_news(statement.signer, version.scope, version.sequence):
                 return False
             if self.link_states.is_past(statement.signer, version.scope, version.sequence, version.incarnation_id):
@@ -122,7 +100,7 @@ class Flooding:
             if abs(now.unix_s - version.said_unix_s) > LINK_STATE_AGE_MAX_S:
                 raise StatementError(DropReason.STALE, "a link state of another time")
         check_sequence(version.sequence, now.unix_s)
-        member = self._policy.verify_sender(statement, now.unix_s)
+        member = self._state.policy.verify_sender(statement, now.unix_s)
         if not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a link state is signed by a switch")
         is_leaf = member.role is Role.LEAF
@@ -132,7 +110,7 @@ class Flooding:
         if state.scope is Scope.DOMAIN and not self._domain == member.domain == neighbour.domain:
             raise StatementError(DropReason.WRONG_DOMAIN, "a link state that should not have left its domain")
         statement.verify(member.key)
-        if state.origin == self._identity.name:
+        if state.origin == self._state.me:
             self._outdo(state, now.mono_s)
             return False
         if not self._paces.spend(state.origin, now.mono_s):
@@ -150,7 +128,7 @@ class Flooding:
         both.
         """
         try:
-            member = self._policy.verify_membership(rib.membership, unix_s)
+            member = self._state.policy.verify_membership(rib.membership, unix_s)
             rtcert = self._rtcerts.verified(rib.rtcert, member.name, member.key)
             rtcert.validity.check(unix_s, "RtCert")
         except StatementError as error:
@@ -166,7 +144,7 @@ class Flooding:
 
     def tell_of_conflicts(self, now_s: float) -> None:
         """Advertise again which identities this switch refuses, if that changed; cheap otherwise."""
-        if self._conflicts_seen != self._hello_protocol.conflicts.changes:
+        if self._conflicts_seen != self._conflicts.changes:
             self._originate(now_s)
 
     def neighbour_changed(self, now_s: float) -> None:
@@ -180,7 +158,7 @@ class Flooding:
             return
         self._synced_s[key] = now_s
         for wire in self.link_states.shared_with(neighbour.domain):
-            self._send(neighbour, wire)
+            self._state.outbox.send_to_neighbour(neighbour, Kind.LINK_STATE, wire)
 
     def is_in_step(self, neighbour: Neighbour) -> bool:
         """Return whether a neighbour's last hello showed the same link states as ours."""
@@ -213,7 +191,7 @@ class Flooding:
             self.link_states.next_expiry(),
             self._stub_until_s,
             self.damping.next_reuse(),
-            self._hello_protocol.conflicts.next_expiry(),
+            self._conflicts.next_expiry(),
         )
         return min(time for time in times if time is not None)
 
@@ -221,39 +199,36 @@ class Flooding:
         if self.is_displaced:
             self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
             return
-        up = [
-            each
-            for each in self._hello_protocol.neighbours.all_up()
-            if not self._is_leaf or each.domain == self._domain
-        ]
+        up = [each for each in self._state.neighbours.all_up() if not self._is_leaf or each.domain == self._domain]
         switches = [each for each in up if each.role.is_switch]
         links = tuple(
             sorted(
-                Adjacency(n.name, n.domain, self._cost(n), n.mtu, self._hello_protocol.ports[n.port].link_key(n))
+                Adjacency(n.name, n.domain, self._cost(n), n.mtu, self._state.neighbours.ports[n.port].link_key(n))
                 for n in switches
             )
         )
-        self._conflicts_seen = self._hello_protocol.conflicts.changes
+        self._conflicts_seen = self._conflicts.changes
         ribs = {
             AttachedRib(n.name, n.domain, n.nonce, n.incarnation_id, *n.proof)
             for n in up
             if n.role == Role.RIB and n.proof is not None
         }
-        refused = tuple(self._hello_protocol.conflicts.refused(now_s))
+        refused = tuple(self._conflicts.refused(now_s))
         self._say(Scope.DOMAIN, links, (), tuple(sorted(ribs)), (), refused, now_s)
         leaving = tuple(link for link in links if link.domain != self._domain)
         if leaving or Scope.BORDER in self._refresh_at_s or self._had_border_state():
+            paths = self._state.paths
             inside = tuple(
                 Adjacency(border, self._domain, max(distance, 1), 1)
-                for border, distance in self.paths.borders().items()
-                if border != self._identity.name
+                for border, distance in paths.borders().items()
+                if border != self._state.me
             )
-            members = tuple(sorted(self.paths.members()))
-            self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, refused, now_s)
+            members, ribs_inside = tuple(sorted(paths.members())), tuple(sorted(paths.ribs_inside()))
+            self._say(Scope.BORDER, leaving, inside, ribs_inside, members, refused, now_s)
 
     def _had_border_state(self) -> bool:
         """Return whether others may have a border state of ours, perhaps of an earlier incarnation."""
-        return self.link_states.sequence_of(self._identity.name, Scope.BORDER) > 0
+        return self.link_states.sequence_of(self._state.me, Scope.BORDER) > 0
 
     def _say(
         self,
@@ -271,7 +246,7 @@ class Flooding:
         self._said[scope] = said
         self._sequence += 1
         state = LinkState(
-            origin=self._identity.name,
+            origin=self._state.me,
             domain=self._domain,
             scope=scope,
             sequence=self._sequence,
@@ -283,8 +258,8 @@ class Flooding:
             refused=refused,
             said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
             is_leaf=self._is_leaf,
-        ).fitted(self._identity.membership)
-        wire = state.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        ).fitted(self._state.identity.membership)
+        wire = self._state.signed_wire(state)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s[scope] = now_s + LINK_STATE_REFRESH_S
         self._flood(scope, wire)
@@ -300,7 +275,7 @@ class Flooding:
             if key in self._answers or len(self._answers) < _INCARNATIONS_MAX:
                 self._answers[key] = self._answers.get(key, 0) + 1
             if self._answers.get(key, 0) > _ANSWERS:
-                self._hello_protocol.conflicts.record_clash(self._identity.name, now_s, is_proven=True)
+                self._conflicts.record_clash(self._state.me, now_s, is_proven=True)
                 self.is_displaced = self.is_displaced or state.incarnation_id < self._incarnation_id
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
@@ -312,11 +287,11 @@ class Flooding:
             self._originate(now_s)
 
     def _flood(self, scope: Scope, wire: bytes, but: Neighbour | None = None) -> None:
-        for neighbour in self._hello_protocol.neighbours.all_up():
+        for neighbour in self._state.neighbours.all_up():
             is_sender = but is not None and neighbour.port == but.port and neighbour.name == but.name
             is_in_scope = scope is Scope.BORDER or neighbour.domain == self._domain
             if neighbour.role.is_switch and is_in_scope and not is_sender:
-                self._send(neighbour, wire)
+                self._state.outbox.send_to_neighbour(neighbour, Kind.LINK_STATE, wire)
 
     def _cost(self, neighbour: Neighbour) -> int:
         cost = neighbour.cost + (_STUB_COST if self._stub_until_s is not None else 0)

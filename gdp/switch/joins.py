@@ -11,13 +11,12 @@ from typing import Final, NamedTuple
 
 from gdp.control.join import Join, Route
 from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
-from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
-from gdp.switch.outbox import Outbox
-from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey, Trees
+from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey
 
 __all__ = ["JoinSender", "ReceivedJoins"]
 
@@ -46,10 +45,8 @@ class JoinSender:
         sequence: of the last statement of an earlier incarnation, at least.
     """
 
-    def __init__(self, identity: Identity, outbox: Outbox, trees: Trees, sequence: int) -> None:
-        self._identity = identity
-        self._outbox = outbox
-        self._trees = trees
+    def __init__(self, state: ForwardingState, sequence: int) -> None:
+        self._state = state
         self._sequence = sequence
         self._waiting: dict[tuple[Downstream, Name], dict[int, TreeKey]] = {}
         self._refreshed: dict[Downstream, dict[int, TreeKey]] = {}
@@ -71,7 +68,7 @@ class JoinSender:
         self, tree: Tree, at: Downstream, name: Name, mtu: int, backup_for: Name = ZERO, route: Route = ()
     ) -> JoinTerms | None:
         """Return what a join to a neighbour would ask for, or None if that is not up."""
-        sessions = self._outbox.sessions_with(at[0], name)
+        sessions = self._state.neighbours.sessions_with(at[0], name)
         if sessions is None:
             return None
         return JoinTerms(sessions, tree.switch, tree.domain, tree.allowed, mtu, backup_for, route)
@@ -84,10 +81,10 @@ class JoinSender:
         wire = self._wire(tree, terms, JOIN_LEASE_S, evidence)
         tree.sent[at] = SentJoin(self._sequence, name, terms)
         if not tree.unknown:
-            self._outbox.say_at(*at, Kind.JOIN, wire)
+            self._state.outbox.say_at(*at, Kind.JOIN, wire)
             return
         pause_s = _SPACED.pause_s(tree.unknown)
-        frames = self._outbox.frames_of(at[0], Kind.JOIN, wire)
+        frames = self._state.outbox.frames_of(at[0], Kind.JOIN, wire)
         spaced = self._spaced.setdefault(at, deque())
         spaced.extend(_SpacedFrame(tree.identity, self._sequence, frame, pause_s) for frame in frames)
 
@@ -106,7 +103,7 @@ class JoinSender:
         tree.sent.pop(at, None)
         terms = self.terms(tree, at, name, 1)
         if terms is not None:
-            self._outbox.say_at(*at, Kind.LEAVE, self._wire(tree, terms, 0.0, b""))
+            self._state.outbox.say_at(*at, Kind.LEAVE, self._wire(tree, terms, 0.0, b""))
 
     def _send_refreshes(self) -> None:
         waiting, self._waiting = self._waiting, {}
@@ -128,7 +125,7 @@ class JoinSender:
         for number in numbers:
             key = refreshed.pop(number, None)
             if key is not None and self._is_standing(key, at, number):
-                tree = self._trees.get(*key)
+                tree = self._state.trees.get(*key)
                 assert tree is not None
                 found.append(tree)
         return found
@@ -140,7 +137,7 @@ class JoinSender:
         self._free_s.pop(at, None)
 
     def _is_standing(self, key: TreeKey, at: Downstream, number: int) -> bool:
-        tree = self._trees.peek(key)
+        tree = self._state.trees.peek(key)
         join = None if tree is None else tree.sent.get(at)
         return join is not None and join.number == number
 
@@ -149,7 +146,7 @@ class JoinSender:
         while spaced and self._free_s.get(at, 0.0) <= now_s:
             each = spaced.popleft()
             if self._is_standing(each.tree, at, each.number):
-                self._outbox.frames(*at, [each.frame])
+                self._state.outbox.frames(*at, [each.frame])
                 self._free_s[at] = now_s + each.pause_s
         if not spaced:
             del self._spaced[at]
@@ -175,10 +172,10 @@ class JoinSender:
             path=tree.path,
             route=terms.route,
         )
-        return join.to_wire(self._identity.name, self._identity.key)
+        return join.to_wire(self._state.me, self._state.identity.key)
 
     def _say_numbers(self, at: Downstream, name: Name, numbers: tuple[int, ...], *, is_reply: bool) -> None:
-        sessions = self._outbox.sessions_with(at[0], name)
+        sessions = self._state.neighbours.sessions_with(at[0], name)
         if sessions is None:
             return
         own_session, its_echo = sessions
@@ -190,7 +187,8 @@ class JoinSender:
             sequence=self._sequence,
             is_reply=is_reply,
         )
-        self._outbox.say_at(*at, Kind.JOIN_REFRESH, refresh.to_wire(self._identity.name, self._identity.key))
+        wire = refresh.to_wire(self._state.me, self._state.identity.key)
+        self._state.outbox.say_at(*at, Kind.JOIN_REFRESH, wire)
 
 
 class ReceivedJoins:

@@ -1,6 +1,6 @@
 """Location updates: verified statements come in; name cache, routes, trees and attached readers follow.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The caller has verified every location (``evidence.py``).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``evidence.py`` verifies every location.
 """
 
 from __future__ import annotations
@@ -12,21 +12,17 @@ from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import relayed
-from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.switch.dependents import Dependents
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.sansio import Timestamps
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.outbox import Outbox
 from gdp.switch.relocation import Relocations
 from gdp.switch.trees import Downstream
 from gdp.switch.unicast import Unicast
-from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
 
 __all__ = ["LocationUpdates"]
@@ -39,34 +35,23 @@ class LocationUpdates:
 
     def __init__(
         self,
-        *,
-        identity: Identity,
-        policy: Policy,
-        attached: LocalAdvertisements,
-        resolver: NameResolver,
+        state: ForwardingState,
         multicast: MulticastTrees,
         unicast: Unicast,
         relocations: Relocations,
-        held: Dependents,
-        outbox: Outbox,
     ) -> None:
-        self._identity = identity
-        self._policy = policy
-        self._attached = attached
-        self._resolver = resolver
+        self._state = state
         self._multicast = multicast
         self._unicast = unicast
         self._relocations = relocations
-        self._held = held
-        self._outbox = outbox
 
     def get(self, name: Name, advertiser: Name) -> Location | None:
         """Return the known location of one advertiser of a name, or None."""
-        return self._resolver.cache.get(name, advertiser)
+        return self._state.resolver.cache.get(name, advertiser)
 
     def is_newer(self, location: Location) -> bool:
         """Return whether a location is newer than what is known of its advertiser, here or elsewhere."""
-        attachment = self._attached.get(location.name, location.advertiser)
+        attachment = self._state.attached.get(location.name, location.advertiser)
         known = self.get(location.name, location.advertiser)
         newest = max(
             -1 if attachment is None else attachment.advertisement.sequence, -1 if known is None else known.sequence
@@ -79,11 +64,11 @@ class LocationUpdates:
         Args:
             statement: the proof of it.
         """
-        is_ours = location.switch == self._identity.name
-        attachment = self._attached.get(location.name, location.advertiser)
+        is_ours = location.switch == self._state.me
+        attachment = self._state.attached.get(location.name, location.advertiser)
         was_here = self._relocations.was_here(location.name, location.advertiser, now_s)
         if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:
-            self._attached.remove(location.name, location.advertiser)  # it has moved to another switch
+            self._state.attached.remove(location.name, location.advertiser)  # it has moved to another switch
             self._relocations.departed(attachment.advertisement, now_s)
             self._unicast.remove(location.name)
             was_here = True
@@ -91,8 +76,8 @@ class LocationUpdates:
         if before is not None and before.sequence > location.sequence:
             # the sender's information is older
             location = replace(before, expires_s=max(before.expires_s, location.expires_s))
-        self._held.note_place(location)
-        self._resolver.receive_location(location, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
+        self._state.dependents.note_place(location)
+        self._state.resolver.receive_location(location, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
         if before is None or (before.switch, before.domain) != (location.switch, location.domain):
             self._unicast.remove(location.name)
             self._unicast.remove(location.advertiser)
@@ -101,29 +86,41 @@ class LocationUpdates:
                 self._relocations.moved(location, statement, now_s)
         self._multicast.publisher_found(location, now_s)
         if before is None or before.advertisement != location.advertisement:
-            for at, right in self._multicast.readers(location.name):
-                self.send_to_reader(at, right, location, now_s)
+            for at, reader in self._state.readers.of(location.name).items():
+                self.send_to_reader(at, reader.advertisement.right, location, now_s)
         for name in (location.name, location.advertiser):
             self._unicast.release(name, now_s)
 
-    def receive_relocation(self, location: Location, statement: bytes, now_s: float) -> None:
-        """Handle the new location of a node that was attached here; send its new switch the names that it reads."""
+    def receive_relocation(self, statement: Statement, now: Timestamps) -> None:
+        """Handle the new location of a node that was attached here; send its new switch the names that it reads.
+
+        Raises:
+            StatementError: it is not valid.
+        """
+        location, now_s = self._state.evidence.from_relay(statement, now), now.mono_s
         if location.right in HEARS and self._multicast.reader_moved(location):
-            self._resolver.unwatch(location.name)
+            self._state.resolver.unwatch(location.name)
         self.acknowledge_relocation(location, now_s)
         if location.right is not Right.READ and self.is_newer(location):
-            self.receive(location, statement, now_s)
+            self.receive(location, statement.wire, now_s)
 
-    def receive_redirect(self, location: Location, statement: bytes, now_s: float) -> None:
-        """Handle the location of a node to which we sent frames by a neighbour that no longer has it."""
+    def receive_redirect(self, _neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Handle a redirect: a neighbour that received our frames for a node reports where that node is now.
+
+        Raises:
+            StatementError: it is not valid, or contains no location.
+        """
+        is_relay = statement.type is StatementType.RELAY
+        verify = self._state.evidence.from_relay if is_relay else self._state.evidence.from_forwarded_answer
+        location = verify(statement, now)
         if self.is_newer(location):
             is_known = self.get(location.name, location.advertiser) is not None
-            has_moved = is_known or self._multicast.trees.get(location.name, location.advertiser) is not None
-            self.receive(location, statement, now_s)
+            has_moved = is_known or self._state.trees.get(location.name, location.advertiser) is not None
+            self.receive(location, statement.wire, now.mono_s)
             if has_moved:
-                self._relocations.moved(location, statement, now_s)
+                self._relocations.moved(location, statement.wire, now.mono_s)
 
-    def answer_query(self, neighbour: Neighbour, statement: Statement, now_s: float) -> None:
+    def answer_query(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Reply to a neighbour that receives our frames for a node with that node's location.
 
         Raises:
@@ -133,8 +130,8 @@ class LocationUpdates:
         if not neighbour.role.is_switch or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
         statement.verify(neighbour.key)
-        for known in self.proofs_of(query.name, now_s):
-            self._outbox.send_to_neighbour(neighbour, Kind.REDIRECT, known)
+        for known in self.proofs_of(query.name, now.mono_s):
+            self._state.outbox.send_to_neighbour(neighbour, Kind.REDIRECT, known)
 
     def receive_removal(self, response: Response, now_s: float) -> None:
         """Remove an advertiser that has withdrawn.
@@ -145,41 +142,38 @@ class LocationUpdates:
         known = self.get(response.name, response.advertiser)
         if known is not None and known.sequence > response.sequence:
             raise StatementError(DropReason.STALE, "a removal of an earlier advertisement")
-        self._resolver.receive_removal(response.name, response.advertiser, now_s)
+        self._state.resolver.receive_removal(response.name, response.advertiser, now_s)
         self._multicast.publisher_gone(response.name, response.advertiser)
         self._unicast.remove(response.name)
-        wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        for at, _ in self._multicast.readers(response.name):
-            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
+        wire = self._state.signed_wire(response)
+        for at in self._state.readers.of(response.name):
+            self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
 
     def expire(self, now_s: float) -> None:
         """Remove locations that no RIB has confirmed for a lease, and frames that waited too long."""
-        for location in self._resolver.expire(now_s):
+        for location in self._state.resolver.expire(now_s):
             self._multicast.publisher_gone(location.name, location.advertiser)
 
     def send_to_reader(self, at: Downstream, right: Right, location: Location, now_s: float) -> None:
         """Send an advertiser's advertisement to an attached node that reads it by ``right``; the node verifies it."""
         if HEARS[right] is location.right:
-            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s))
+            self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s))
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
         """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""
-        identity = self._identity
-        ack = AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence)
-        statements = [ack.to_wire(identity.name, identity.key, identity.membership)]
-        for location in self._resolver.cache.of(moved.name, now_s):
+        statements = [self._state.signed_wire(AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence))]
+        for location in self._state.resolver.cache.of(moved.name, now_s):
             if HEARS.get(moved.right) is location.right:
                 statements.append(self._as_answer(location, now_s))
         for statement in statements:
-            frames = self._outbox.remote_frames(Kind.RIB_ANSWER, statement, moved.switch)
-            self._unicast.send(frames, moved.switch, identity.name, now_s)
+            self._unicast.send_statement(Kind.RIB_ANSWER, statement, moved.switch, now_s)
 
     def proofs_of(self, name: Name, now_s: float) -> list[bytes]:
         """Return statements that prove the location of a node, or of a name's advertisers; at most ``PROOFS_MAX``."""
-        attachment = self._attached.at(name)
+        attachment = self._state.attached.at(name)
         if attachment is not None:
-            return [relayed(attachment.advertisement.wire, self._identity, self._policy.transit)]
-        cache = self._resolver.cache
+            return [relayed(attachment.advertisement.wire, self._state.identity, self._state.policy.transit)]
+        cache = self._state.resolver.cache
         node = cache.of_node(name, now_s)
         locations = cache.of(name, now_s) + ([] if node is None else [node])
         return [self._as_answer(location, now_s) for location in locations[:PROOFS_MAX]]
@@ -194,4 +188,4 @@ class LocationUpdates:
             transit=tuple(sorted(location.transit)),
             lease_s=lease_s,
         )
-        return response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        return self._state.signed_wire(response)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES
+from gdp.control.hello_port import HelloPort
 from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S
@@ -148,6 +149,11 @@ class LinkStateDatabase:
             )
             digest = self._digests[is_home] = hashlib.sha256(b"".join(lines)).digest()[:DIGEST_BYTES]
         return digest
+
+    def digest_for(self, port: HelloPort) -> bytes:
+        """Return the digest for a hello on a port: nothing where its switches are of several domains."""
+        domains = {each.domain for each in port.neighbours.values() if each.role.is_switch}
+        return self.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
 
     def _is_shared(self, key: tuple[Name, Scope], domain: Name) -> bool:
         return key[1] is Scope.BORDER or domain == self._domain

@@ -28,14 +28,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 from gdp.control.join import Join, Route
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import second_path_key
 from gdp.limits import (
@@ -46,24 +45,19 @@ from gdp.limits import (
     JOIN_REFRESH_S,
     JOINS_AGAIN_MAX,
     JOINS_LOST_FROM,
-    READERS_MAX,
     TREES_MAX,
 )
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.switch.backups import Backups
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.joins import JoinSender, ReceivedJoins
-from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.name_cache import Location
-from gdp.switch.outbox import Outbox
 from gdp.switch.path_pairs import PathPairs
-from gdp.switch.paths import Paths
-from gdp.switch.table import Table
-from gdp.switch.trees import Branch, Downstream, JoinTerms, Tree, Trees
+from gdp.switch.trees import Branch, Downstream, JoinTerms, Tree, owner_of
 from gdp.trust.advertisement import Advertisement
-from gdp.trust.domain import Policy
-from gdp.trust.right import HEARS, Right
+from gdp.trust.right import HEARS
 
 __all__ = ["MulticastTrees"]
 
@@ -75,14 +69,6 @@ _OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after t
 _ACTIVE_S: Final = 1.0  # for which a backup replaces a branch that was lost
 
 
-@dataclass(slots=True)
-class _Reader:
-    """A node attached here that reads a topic, serves or calls."""
-
-    advertisement: Advertisement
-    expires_s: float
-
-
 class MulticastTrees:
     """The multicast trees of one switch.
 
@@ -90,46 +76,19 @@ class MulticastTrees:
         first_sequence: of our joins.
     """
 
-    def __init__(
-        self,
-        *,
-        identity: Identity,
-        policy: Policy,
-        table: Table,
-        paths: Paths,
-        attached: LocalAdvertisements,
-        outbox: Outbox,
-        first_sequence: int,
-    ) -> None:
-        self._identity = identity
-        self._is_leaf = identity.role is Role.LEAF
-        self._policy = policy
-        self._table = table
-        self._paths = paths
-        self._attached = attached
-        self._outbox = outbox
-        self._pairs = PathPairs(identity.name, paths)
-        self._backups = Backups(identity.name, policy.own, paths, outbox)
-        self._readers: dict[Name, dict[Downstream, _Reader]] = {}
-        self._reader_shares = Shares(READERS_MAX)
-        self._readers_end_s = float("inf")  # no reader's lease ends before
+    def __init__(self, state: ForwardingState, first_sequence: int) -> None:
+        self._state = state
+        self._is_leaf = state.identity.role is Role.LEAF
+        self._pairs = PathPairs(state.me, state.paths)
+        self._backups = Backups(state)
         self._branch_shares = Shares(TREES_MAX)
         self._paired: set[tuple[Name, Name]] = set()  # topics and publishers that readers here want over two paths
         self._second: dict[Name, dict[Name, Tree]] = {}  # trees of second copies, by publisher and topic
-        self.trees = Trees()
-        self._joins = JoinSender(identity, outbox, self.trees, first_sequence)
+        self.trees = state.trees
+        self._joins = JoinSender(state, first_sequence)
         self._received = ReceivedJoins()
-        self._phase = identity.name[0] / 256  # of renewals, so that not all switches send theirs at once
+        self._phase = state.me[0] / 256  # of renewals, so that not all switches send theirs at once
         self.drops: Counter[DropReason] = Counter()
-
-    def readers(self, topic: Name) -> list[tuple[Downstream, Right]]:
-        """Return where the readers of a topic are attached, and by which right they read."""
-        return [(at, reader.advertisement.right) for at, reader in self._readers.get(topic, {}).items()]
-
-    def advertisement_of(self, topic: Name, at: Downstream) -> Advertisement | None:
-        """Return the advertisement of a reader attached there, or None."""
-        reader = self._readers.get(topic, {}).get(at)
-        return None if reader is None else reader.advertisement
 
     def add_reader(self, advertisement: Advertisement, at: Downstream, locations: list[Location], now_s: float) -> bool:
         """Add the verified advertisement of an attached reader; return whether it is the name's first here.
@@ -137,44 +96,34 @@ class MulticastTrees:
         Raises:
             StatementError: QUOTA, the node reads too many topics.
         """
-        is_first = advertisement.name not in self._readers
-        if at not in self._readers.get(advertisement.name, {}) and not self._reader_shares.reserve(_owner(at)):
-            raise StatementError(DropReason.QUOTA, "topics that one node reads")
-        readers = self._readers.setdefault(advertisement.name, {})
-        readers[at] = _Reader(advertisement, now_s + advertisement.lease_s)
-        self._readers_end_s = min(self._readers_end_s, now_s + advertisement.lease_s)
+        is_first = self._state.readers.put(advertisement, at, now_s)
         for location in locations:
             self.publisher_found(location, now_s)
         return is_first
 
     def remove_reader(self, topic: Name, at: Downstream) -> bool:
         """Remove a reader; return whether the topic has none left here."""
-        readers = self._readers.get(topic, {})
-        if readers.pop(at, None) is not None:
-            self._reader_shares.release(_owner(at))
+        is_last = self._state.readers.remove(topic, at)
         for tree in self.trees.of_topic(topic):
             self._cut(tree, at)
-        if readers:
-            return False
-        self._readers.pop(topic, None)
-        return True
+        return is_last
 
     def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""
-        for at, reader in self._readers.get(location.name, {}).items():
+        for at, reader in self._state.readers.of(location.name).items():
             if (
                 reader.advertisement.node == location.advertiser
                 or HEARS[reader.advertisement.right] is not location.right
             ):
                 continue  # a publisher does not receive its own messages
-            allowed = (self._policy.transit & location.transit) | {self._policy.own, location.domain}
+            allowed = (self._state.policy.transit & location.transit) | {self._state.policy.own, location.domain}
             tree = self._tree(location.name, location.advertiser, allowed)
             if location.sequence >= tree.version:
                 self._place_at(tree, location.switch, location.domain, location.sequence, location.advertisement)
                 tree.allowed = allowed
             branch = Branch(
                 expires_s=reader.expires_s,
-                mtu=self._outbox.mtu_of(at[0]),
+                mtu=self._state.outbox.mtu_of(at[0]),
                 evidence=reader.advertisement.wire,
                 wants_pair=reader.advertisement.paths > 1 and location.proof is not None and location.proof.paths > 1,
             )
@@ -189,7 +138,7 @@ class MulticastTrees:
         """Handle a publisher's advertisement of its topic here: trees that pass here join it directly at once."""
         for tree in self.trees.both(advertisement.name, advertisement.node):
             version = max(advertisement.sequence, tree.version)
-            self._place_at(tree, self._identity.name, self._policy.own, version, advertisement.wire)
+            self._place_at(tree, self._state.me, self._state.policy.own, version, advertisement.wire)
             tree.renew_at_s = now_s
             self._route_pair(tree, now_s)
 
@@ -204,19 +153,19 @@ class MulticastTrees:
 
     def below(self, topic: Name, publisher: Name) -> list[Downstream]:
         """Return the neighbouring switches that receive a tree from here."""
-        readers = self._readers.get(topic, {})
+        readers = self._state.readers.of(topic)
         found = (at for tree in self.trees.both(topic, publisher) for at in tree.branches if at not in readers)
         return list(dict.fromkeys(found))
 
     def publisher_gone(self, topic: Name, publisher: Name) -> None:
         """Remove the readers attached here from a tree whose publisher is gone."""
         for tree in self.trees.both(topic, publisher):
-            for at in self._readers.get(topic, {}):
+            for at in self._state.readers.of(topic):
                 self._cut(tree, at)
 
     def reader_moved(self, location: Location) -> bool:
         """Remove a reader that is attached elsewhere now; return whether the topic has none left here."""
-        for at, reader in list(self._readers.get(location.name, {}).items()):
+        for at, reader in list(self._state.readers.of(location.name).items()):
             if reader.advertisement.node == location.advertiser and reader.advertisement.sequence < location.sequence:
                 return self.remove_reader(location.name, at)
         return False
@@ -236,13 +185,13 @@ class MulticastTrees:
             if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
                 self._cut(tree, at)
             return False
-        if self._is_leaf and join.switch != self._identity.name:
+        if self._is_leaf and join.switch != self._state.me:
             raise StatementError(DropReason.THROUGH_LEAF, "a tree that would pass a leaf")
-        if self._policy.own not in join.allowed or neighbour.domain not in join.allowed:
+        if self._state.policy.own not in join.allowed or neighbour.domain not in join.allowed:
             raise StatementError(DropReason.WRONG_DOMAIN, "a tree that must not pass here")
-        if join.backup_for != ZERO and neighbour.domain != self._policy.own:
+        if join.backup_for != ZERO and neighbour.domain != self._state.policy.own:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
-        if self._paths.domain_of(join.switch) not in (None, join.domain):
+        if self._state.paths.domain_of(join.switch) not in (None, join.domain):
             raise StatementError(DropReason.WRONG_DOMAIN, "the publisher's switch is of another domain")
         self._check_route(join, neighbour)
         tree = self._tree(join.topic, join.publisher, join.allowed, join.path)
@@ -266,7 +215,7 @@ class MulticastTrees:
             place=(join.switch, join.domain),
             proven_until_s=now_s + JOIN_PROOF_LEASE_S,
         )
-        branch.fit(self._outbox.mtu_of(neighbour.port))
+        branch.fit(self._state.outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
             branch.backup_for = join.backup_for
             branch.active_until_s = None if before is None else before.active_until_s
@@ -337,7 +286,7 @@ class MulticastTrees:
 
     def neighbour_lost(self, at: Downstream, now_s: float) -> None:
         """Remove every branch to a lost neighbour; backups of these branches replace them."""
-        for topic in [topic for topic, readers in self._readers.items() if at in readers]:
+        for topic in self._state.readers.topics_at(at):
             self.remove_reader(topic, at)
         for tree in self.trees.all():
             backup = tree.protection.get(at)
@@ -351,7 +300,7 @@ class MulticastTrees:
         for tree in self.trees.all():
             for (its, _), branch in tree.branches.items():
                 if its == port:
-                    branch.fit(self._outbox.mtu_of(port))
+                    branch.fit(self._state.outbox.mtu_of(port))
             self._restate(tree)
 
     def invalidate_evidence(
@@ -395,14 +344,7 @@ class MulticastTrees:
 
     def handle_timer(self, now_s: float) -> list[Name]:
         """Prune and renew trees; return the topics that lost their last reader here."""
-        orphaned = []
-        if now_s >= self._readers_end_s:
-            for topic in list(self._readers):
-                for at in [at for at, reader in self._readers[topic].items() if reader.expires_s <= now_s]:
-                    if self.remove_reader(topic, at):
-                        orphaned.append(topic)
-            ends = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
-            self._readers_end_s = min(ends, default=float("inf"))
+        orphaned = [topic for topic, at in self._state.readers.expired(now_s) if self.remove_reader(topic, at)]
         pairs_s = self._pairs.get_timer()
         if pairs_s is not None and pairs_s <= now_s:
             self._pairs.handle_timer(now_s)
@@ -437,7 +379,7 @@ class MulticastTrees:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         tree_s = self.trees.next_event()
-        times = (tree_s, self._pairs.get_timer(), self._readers_end_s, self._joins.get_timer())
+        times = (tree_s, self._pairs.get_timer(), self._state.readers.next_expiry(), self._joins.get_timer())
         next_s = min(time for time in times if time is not None)
         return None if next_s == float("inf") else next_s
 
@@ -447,9 +389,9 @@ class MulticastTrees:
             return
         if join.backup_for != ZERO:
             raise StatementError(DropReason.MALFORMED, "a backup of a tree with a route")
-        if join.route and neighbour.domain != self._policy.own:
+        if join.route and neighbour.domain != self._state.policy.own:
             raise StatementError(DropReason.WRONG_DOMAIN, "a route through another domain")
-        if {self._identity.name, neighbour.name} & {link.name for link in join.route}:
+        if {self._state.me, neighbour.name} & {link.name for link in join.route}:
             raise StatementError(DropReason.MALFORMED, "a route with a loop")
 
     def _route_pair(self, first: Tree, now_s: float) -> None:
@@ -495,8 +437,8 @@ class MulticastTrees:
                 topic=topic,
                 publisher=publisher,
                 path=path,
-                switch=self._identity.name,
-                domain=self._policy.own,
+                switch=self._state.me,
+                domain=self._state.policy.own,
                 allowed=allowed,
             )
             self.trees.put(tree)
@@ -504,14 +446,15 @@ class MulticastTrees:
 
     def _install(self, tree: Tree) -> None:
         tree.protection = self._backups.protection(tree)
-        if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
+        hops = tree.hops(self._state.outbox.mac_of())
+        if not self._state.table.install(tree.key, hops, tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
         if tree.path == 2:
             self._second.setdefault(tree.publisher, {})[tree.topic] = tree
             self._install_to_publisher(tree.publisher)
 
     def _uninstall(self, tree: Tree) -> None:
-        self._table.remove(tree.key)
+        self._state.table.remove(tree.key)
         trees = self._second.get(tree.publisher, {})
         if tree.path == 2 and trees.pop(tree.topic, None) is not None:
             self._install_to_publisher(tree.publisher)
@@ -523,18 +466,18 @@ class MulticastTrees:
 
         Of several trees it is the one with the shortest route, so that these paths form no loop either.
         """
-        macs, key = self._outbox.mac_of(), second_path_key(publisher)
+        macs, key = self._state.outbox.mac_of(), second_path_key(publisher)
         best: tuple[int, Name] | None = None
         for topic, tree in self._second.get(publisher, {}).items():
             if tree.upstream is not None and tree.upstream[0] in macs and tree.branches:
                 found = len(tree.guide.route) if tree.guide is not None else 0, topic
                 best = found if best is None else min(best, found)
         if best is None:
-            self._table.remove(key)
+            self._state.table.remove(key)
             return
         tree = self._second[publisher][best[1]]
         port, mac = self._apart_from_ordinary(tree) or (0, b"")
-        if not self._table.install(key, ((port, mac + macs[port]),), tree.expires_s()):
+        if not self._state.table.install(key, ((port, mac + macs[port]),), tree.expires_s()):
             self.drops[DropReason.QUOTA] += 1
 
     def _apart_from_ordinary(self, second: Tree) -> Downstream | None:
@@ -545,13 +488,13 @@ class MulticastTrees:
         first = self.trees.get(second.topic, second.publisher)
         if first is None or first.upstream is None or first.upstream_name != second.upstream_name:
             return second.upstream
-        ordinary = self._outbox.neighbour(first.upstream_name) if first.upstream_name is not None else None
+        ordinary = self._state.neighbours.cheapest(first.upstream_name) if first.upstream_name is not None else None
         is_taken = ordinary is not None and (ordinary.port, ordinary.mac) == second.upstream
         return first.upstream if is_taken else second.upstream
 
     def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
         """Add or replace a branch; return False, and remove a bare tree, where its neighbour has too many."""
-        if at not in tree.branches and not self._branch_shares.reserve(_owner(at)):
+        if at not in tree.branches and not self._branch_shares.reserve(owner_of(at)):
             if not tree.branches:
                 self.trees.remove(tree)
             return False
@@ -563,7 +506,7 @@ class MulticastTrees:
             self._received.remove(at, branch.sequence)
             if at == tree.shown_of:
                 tree.prove_at_s = 0.0  # the neighbour must not depend on the evidence of a reader that has left
-            self._branch_shares.release(_owner(at))
+            self._branch_shares.release(owner_of(at))
             self._after_cut(tree)
 
     def _after_cut(self, tree: Tree) -> None:
@@ -579,18 +522,18 @@ class MulticastTrees:
 
     def _upstream_queries(self, tree: Tree) -> tuple[int, bytes, Name] | None:
         """Return port, address and name of the next hop towards the publisher; None when there is no path now."""
-        if tree.switch == self._identity.name:
-            attachment = self._attached.get(tree.topic, tree.publisher)
+        if tree.switch == self._state.me:
+            attachment = self._state.attached.get(tree.topic, tree.publisher)
             return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
         link = tree.next_link
         if link is not None:
-            neighbour = self._outbox.neighbour_over(*link)
+            neighbour = self._state.neighbours.over_link(*link)
             if neighbour is not None:
                 return neighbour.port, neighbour.mac, neighbour.name
             if tree.path == 2:
                 return None  # the reader's switch chooses another route; the first tree carries every message
-        path = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
-        neighbour = None if path is None else self._outbox.neighbour(path.first)
+        path = self._state.paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        neighbour = None if path is None else self._state.neighbours.cheapest(path.first)
         return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
 
     def _follow(self, tree: Tree, now_s: float) -> bool:
@@ -626,7 +569,7 @@ class MulticastTrees:
                 if tree.backup is not None and tree.backup[0] == tree.upstream:
                     tree.backup = None  # an ordinary join replaces it
             self._install(tree)
-        if upstream is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
+        if upstream is None and self._state.paths.leads_through_leaf(tree.switch, tree.domain):
             self.drops[DropReason.THROUGH_LEAF] += 1
         if upstream is None or not tree.is_wanted_below:
             return
@@ -634,13 +577,13 @@ class MulticastTrees:
         if tree.joins < _NEW_JOINS_MAX:
             tree.joins += 1
             tree.renew_at_s = now_s + _NEW_JOINS.pause_s(tree.joins)
-        elif self._outbox.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
+        elif self._state.neighbours.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
             tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
         is_proof_due = not renews or now_s >= tree.prove_at_s
         if is_proof_due:  # spread, so that the whole joins of many trees do not leave together
             tree.prove_at_s = now_s + JOIN_PROOF_S * (1 + tree.topic[0] / 255) / 2
         self._show(tree, renews=not is_proof_due)
-        if has_settled and self._paths.has_alternates:
+        if has_settled and self._state.paths.has_alternates:
             self._ask_for_backup(tree, renews=not is_proof_due)
         if has_settled and tree.former_ports:
             tree.former_ports.clear()
@@ -659,8 +602,8 @@ class MulticastTrees:
 
     def _mtu_over(self, tree: Tree, port: int) -> int:
         """Return the MTU for a join over a port; the publisher gets that of both trees, since it sends one size."""
-        trees = self.trees.both(tree.topic, tree.publisher) if tree.switch == self._identity.name else (tree,)
-        return min(self._outbox.mtu_of(port), *(each.mtu for each in trees if each.branches))
+        trees = self.trees.both(tree.topic, tree.publisher) if tree.switch == self._state.me else (tree,)
+        return min(self._state.outbox.mtu_of(port), *(each.mtu for each in trees if each.branches))
 
     def _ask_for_backup(self, tree: Tree, *, renews: bool = False) -> None:
         """Request a backup branch from the neighbour that could replace the best one, or leave it."""
@@ -672,8 +615,8 @@ class MulticastTrees:
         evidence = self._evidence(tree)
         if other is not None and evidence:
             at, name = other
-            mtu = min(tree.mtu, self._outbox.mtu_of(at[0]))
-            terms = self._joins.terms(tree, at, name, mtu, self._identity.name)
+            mtu = min(tree.mtu, self._state.outbox.mtu_of(at[0]))
+            terms = self._joins.terms(tree, at, name, mtu, self._state.me)
             if not (renews and self._joins.add_renewal(tree, at, terms)):
                 self._joins.send_join(tree, at, name, terms, evidence)
 
@@ -702,7 +645,7 @@ class MulticastTrees:
         if tree.upstream is None or tree.upstream_name is None:
             return None
         backup_for = tree.backup_for or ZERO
-        if backup_for != ZERO and self._paths.domain_of(tree.upstream_name) != self._policy.own:
+        if backup_for != ZERO and self._state.paths.domain_of(tree.upstream_name) != self._state.policy.own:
             return None  # backups are internal to a domain
         mtu = self._mtu_over(tree, tree.upstream[0])
         return self._joins.terms(tree, tree.upstream, tree.upstream_name, mtu, backup_for, tree.asked_route)
@@ -710,9 +653,9 @@ class MulticastTrees:
     def _route_onwards(self, tree: Tree) -> Route:
         """Return the route for the upstream neighbour: what remains after the link to it."""
         guide = tree.guide
-        if guide is None or tree.switch == self._identity.name:
+        if guide is None or tree.switch == self._state.me:
             return ()
-        neighbour = self._outbox.neighbour_over(*guide.route[0])
+        neighbour = self._state.neighbours.over_link(*guide.route[0])
         leads_there = neighbour is not None and (neighbour.port, neighbour.mac) == tree.upstream
         return guide.route[1:] if leads_there else ()
 
@@ -722,11 +665,11 @@ class MulticastTrees:
         A neighbour may still take a tree from a leaf that its publisher has just left. No join is sent for that
         neighbour.
         """
-        if not self._is_leaf or tree.switch == self._identity.name:
+        if not self._is_leaf or tree.switch == self._state.me:
             return tree.evidence
         if (guide := tree.guide) is not None and guide.wants_pair:
             return guide.evidence
-        own = self._readers.get(tree.topic, {}).keys() & tree.branches.keys()
+        own = self._state.readers.of(tree.topic).keys() & tree.branches.keys()
         return max((tree.branches[at] for at in own), key=lambda each: each.expires_s).evidence if own else b""
 
     def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int, proof: bytes) -> None:
@@ -755,11 +698,11 @@ class MulticastTrees:
         if tree.has_moved or tree.upstream_name is None:
             return False
         if tree.path == 2 or tree.followed or tree.guide is not None:
-            return self._readers.get(tree.topic, {}).keys() >= tree.branches.keys()  # it is the end of its route
+            return self._state.readers.of(tree.topic).keys() >= tree.branches.keys()  # it is the end of its route
         if self._is_leaf:
             return True
-        own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
-        its = self._paths.distance_from(tree.upstream_name, tree.switch, tree.domain, tree.allowed)
+        own = self._state.paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        its = self._state.paths.distance_from(tree.upstream_name, tree.switch, tree.domain, tree.allowed)
         return own is not None and its is not None and its < own.distance
 
     def _leave_former(self, tree: Tree) -> None:
@@ -774,11 +717,6 @@ class MulticastTrees:
             tree.former_ports.add(tree.upstream[0])
             self._joins.send_leave(tree, tree.upstream, tree.upstream_name)
         tree.upstream = tree.upstream_name = None
-
-
-def _owner(at: Downstream) -> bytes:
-    """Return the owner whose quota the state of a neighbour uses."""
-    return at[0].to_bytes(4, "big") + at[1]
 
 
 def _is_overtaken(join: Join, branch: Branch) -> bool:

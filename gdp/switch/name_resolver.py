@@ -6,7 +6,7 @@ and 7.2.2: a miss makes one query and keeps the frame; the response releases the
     frame without an entry (core.py)
       -> Unicast.miss -> resolve: a location, or a negative entry -> table entry, and the frame goes on
                       `-> resolve: unknown                        -> a query is open: buffer_frame
-    timer of the core -> RibClient.ask -> queries_to_send            -> query to the RIB, repeated until a response
+    timer of the core -> RibClient.send_due -> queries_to_send       -> query to the RIB, repeated until a response
     response of a RIB -> RibClient.receive -> LocationUpdates.receive -> receive_location -> Unicast.release: the frame
                                            |-> receive_negative      -> the frame is dropped, counted
                                            `-> receive_unknown       -> known locations stay; the next RIB is queried

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.neighbour import Neighbour
-from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.neighbour_table import NeighbourTable
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames
 from gdp.switch.table import Hop, ProtectedHop
@@ -18,8 +18,8 @@ __all__ = ["Outbox"]
 class Outbox:
     """Collects frames, and maps neighbours to ports and addresses."""
 
-    def __init__(self, hello_protocol: HelloProtocol, fragmenter: ControlFragmenter) -> None:
-        self._hello_protocol = hello_protocol
+    def __init__(self, neighbours: NeighbourTable, fragmenter: ControlFragmenter) -> None:
+        self._neighbours = neighbours
         self._fragmenter = fragmenter
         self._waiting: list[OutgoingFrames] = []
 
@@ -29,7 +29,7 @@ class Outbox:
 
     def say_at(self, port: int, mac: bytes, kind: int, statement: bytes) -> None:
         """Send a statement to the node with this address on a port."""
-        if port in self._hello_protocol.ports:
+        if port in self._neighbours.ports:
             self.frames(port, mac, self.frames_of(port, kind, statement))
 
     def frames_of(self, port: int, kind: int, statement: bytes) -> list[bytes]:
@@ -38,7 +38,7 @@ class Outbox:
 
     def remote_frames(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
         """Return the frames of a statement that goes beyond a neighbour."""
-        mtu = min((port.mtu for port in self._hello_protocol.ports.values()), default=1_500)
+        mtu = min((port.mtu for port in self._neighbours.ports.values()), default=1_500)
         return self._fragmenter.split(kind, statement, mtu, destination)
 
     def frames(self, port: int, mac: bytes, frames: list[bytes]) -> None:
@@ -49,65 +49,31 @@ class Outbox:
         """Add outgoing frames."""
         self._waiting.append(transmit)
 
-    def neighbour(self, name: Name) -> Neighbour | None:
-        """Return the neighbour of this name over the cheapest link, or None."""
-        found = [
-            n
-            for port in self._hello_protocol.ports
-            if (n := self._hello_protocol.neighbours.get(port, name)) is not None
-        ]
-        return min(found, key=lambda n: (n.cost, n.port), default=None)
-
-    def neighbour_over(self, name: Name, key: int) -> Neighbour | None:
-        """Return the neighbour of this name over the link with this key (``link_key``), or None."""
-        for index, port in self._hello_protocol.ports.items():
-            found = self._hello_protocol.neighbours.get(index, name)
-            if found is not None and port.link_key(found) == key:
-                return found
-        return None
-
-    def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
-        """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
-        neighbour = self._hello_protocol.neighbours.get(port, name)
-        return None if neighbour is None else (self._hello_protocol.ports[port].nonce, neighbour.echo)
-
-    def loss_between(self, port: int, name: Name) -> float:
-        """Return the larger loss of keepalives to and from a neighbour, 0 to 1; 0 also if it is not up."""
-        neighbour = self._hello_protocol.neighbours.get(port, name)
-        session = None if neighbour is None else neighbour.keepalives
-        return 0.0 if session is None else max(session.quality.loss_in, session.quality.loss_out)
-
-    def rtt_to(self, name: Name) -> float:
-        """Return the smoothed round trip of the link to a neighbour in seconds; 0: not measured, or it is not up."""
-        neighbour = self.neighbour(name)
-        session = None if neighbour is None else neighbour.keepalives
-        return 0.0 if session is None else session.quality.rtt.srtt_s or 0.0
-
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""
-        return neighbour.port, neighbour.mac + self._hello_protocol.ports[neighbour.port].mac
+        return neighbour.port, neighbour.mac + self._neighbours.ports[neighbour.port].mac
 
     def protected_hop(self, neighbour: Neighbour, alternate: Name | None) -> Hop | ProtectedHop:
         """Return the hop to a neighbour with an alternate: over a second link to it, or else through ``alternate``."""
         hop = self.hop(neighbour)
-        others = [port for port in self._hello_protocol.ports if port != hop[0]]
+        others = [port for port in self._neighbours.ports if port != hop[0]]
         for name in (neighbour.name, alternate or neighbour.name):
-            found = [n for port in others if (n := self._hello_protocol.neighbours.get(port, name)) is not None]
+            found = [n for port in others if (n := self._neighbours.get(port, name)) is not None]
             if found:
                 return *hop, *self.hop(min(found, key=lambda n: (n.cost, n.port)))
         return hop
 
     def hop_at(self, port: int, mac: bytes) -> Hop:
         """Return the table's hop to an address on a port."""
-        return port, mac + self._hello_protocol.ports[port].mac
+        return port, mac + self._neighbours.ports[port].mac
 
     def mac_of(self) -> dict[int, bytes]:
         """Return our own address on each port that is up."""
-        return {index: port.mac for index, port in self._hello_protocol.ports.items() if port.is_up}
+        return {index: port.mac for index, port in self._neighbours.ports.items() if port.is_up}
 
     def mtu_of(self, port: int) -> int:
         """Return a port's MTU in bytes after the Ethernet header."""
-        return self._hello_protocol.ports[port].mtu
+        return self._neighbours.ports[port].mtu
 
     def poll_frames(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""

@@ -10,8 +10,8 @@ from typing import Final
 
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
-from gdp.names import Name
 from gdp.switch.flooding import Flooding
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.rib_client import RibClient
 from gdp.switch.spf_delay import SpfDelay
@@ -28,17 +28,16 @@ class PathUpdates:
 
     def __init__(
         self,
+        state: ForwardingState,
         *,
-        me: Name,
         flooding: Flooding,
         hello_protocol: HelloProtocol,
         multicast: MulticastTrees,
         unicast: Unicast,
         rib_client: RibClient,
     ) -> None:
-        self._me = me
+        self._state = state
         self._flooding = flooding
-        self._paths = flooding.paths
         self._hello_protocol = hello_protocol
         self._multicast = multicast
         self._unicast = unicast
@@ -66,7 +65,7 @@ class PathUpdates:
         self._flooding.neighbour_changed(now_s)  # our domain's interior may have changed
         self._seen_version = self._flooding.link_states.version
         self._followed_s = now_s
-        self._paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
+        self._state.paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
         self._unicast.refresh(now_s)
         self._multicast.reroute(now_s)
         self._rib_client.links_changed(now_s)
@@ -84,7 +83,7 @@ class PathUpdates:
             self.plan(now_s)
         if self._protect_at_s is not None and self._protect_at_s <= now_s:
             self._protect_at_s = None
-            self._paths.has_alternates = True
+            self._state.paths.has_alternates = True
             self._unicast.refresh(now_s)
         if self._unicast.is_refreshing:
             self._unicast.refresh_more(now_s)
@@ -96,18 +95,18 @@ class PathUpdates:
         times = [self._spf_delay.due_s, self._protect_at_s]
         if self._unicast.is_refreshing:
             times.append(self._followed_s)  # in the past: due at once
-        if self._paths.refused_elsewhere():
+        if self._state.paths.refused_elsewhere():
             times.append(self._conflicts_sought_s + _CONFLICTS_S)
         return min((time for time in times if time is not None), default=None)
 
     def _find_conflicts(self, now_s: float) -> None:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
-        for neighbour in self._hello_protocol.neighbours.all_up():
-            elsewhere = self._paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
+        for neighbour in self._state.neighbours.all_up():
+            elsewhere = self._state.paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
             if elsewhere is not None and elsewhere < neighbour.incarnation_id:
                 self._hello_protocol.schedule_removal(neighbour, now_s)
-        for name in self._paths.refused_elsewhere():
+        for name in self._state.paths.refused_elsewhere():
             self._hello_protocol.tell_conflicts(name, now_s)
-            if name == self._me:
+            if name == self._state.me:
                 self._hello_protocol.conflicts.record_clash(name, now_s)

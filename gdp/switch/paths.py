@@ -42,6 +42,7 @@ class Paths:
     """Shortest paths, computed at the first request after a change.
 
     Attributes:
+        link_states: that the paths follow from.
         has_alternates: whether paths include their loop-free alternates (RFC 5286). Alternates cost a computation for
             each neighbour, so that no urgent work may wait for them.
     """
@@ -49,7 +50,7 @@ class Paths:
     def __init__(self, me: Name, domain: Name, link_states: LinkStateDatabase) -> None:
         self._me = me
         self._domain = domain
-        self._link_states = link_states
+        self.link_states = link_states
         self._version = -1
         self._graph: nx.DiGraph[Name] | None = None
         self._members: frozenset[Name] = frozenset()  # switches of our domain that are reachable within it
@@ -199,7 +200,7 @@ class Paths:
     def ribs_inside(self) -> frozenset[AttachedRib]:
         """Return the RIBs that are attached to switches of our domain that are reachable within it."""
         self._refresh()
-        hosts = (state for state in self._link_states.states(Scope.DOMAIN) if state.origin in self._members)
+        hosts = (state for state in self.link_states.states(Scope.DOMAIN) if state.origin in self._members)
         return frozenset(rib for state in hosts for rib in state.ribs)
 
     def members(self) -> frozenset[Name]:
@@ -220,14 +221,14 @@ class Paths:
     def borders(self) -> dict[Name, int]:
         """Return the other switches of our domain that have links leaving it, with their distance within it."""
         ways = self._to_all(frozenset({self._domain}))
-        states = self._link_states.states(Scope.DOMAIN)
+        states = self.link_states.states(Scope.DOMAIN)
         borders = {s.origin for s in states if any(link.domain != self._domain for link in s.links)}
         return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
     @property
     def version(self) -> int:
         """Return a number that rises with every change that may change a path."""
-        return self._link_states.version
+        return self.link_states.version
 
     def cost_of(self, path: DirectedPath) -> int | None:
         """Return the cost of a path; None where one of its links is gone."""
@@ -305,13 +306,13 @@ class Paths:
         return ways
 
     def _refresh(self) -> None:
-        if self._version == self._link_states.version:
+        if self._version == self.link_states.version:
             return
-        self._version = self._link_states.version
+        self._version = self.link_states.version
         self._ways.clear()
         self._alternates.clear()
         self._pairs.clear()
-        home = self._link_states.states(Scope.DOMAIN)
+        home = self.link_states.states(Scope.DOMAIN)
         self._leaves = frozenset(state.origin for state in home if state.is_leaf)
         self._members = _reachable(self._me, home, self._domain, self._leaves)
         joined = _reachable(self._me, home, self._domain) if self._leaves else self._members
@@ -320,7 +321,7 @@ class Paths:
             state.origin in self._severed and any(link.domain != self._domain for link in state.links) for state in home
         )
         inside = [state for state in home if state.origin in self._members]
-        beyond = [state for state in self._link_states.states(Scope.BORDER) if state.origin not in self._members]
+        beyond = [state for state in self.link_states.states(Scope.BORDER) if state.origin not in self._members]
         self._domains = {member: state.domain for state in beyond for member in state.members}
         self._domains |= {state.origin: state.domain for state in [*home, *beyond]}
         self._known_domains = frozenset(self._domains.values())

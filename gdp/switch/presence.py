@@ -9,13 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.presence import Presence
-from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.switch.outbox import Outbox
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.unicast import Unicast
 
 __all__ = ["PresenceAnswers"]
@@ -33,19 +30,9 @@ class _Question:
 class PresenceAnswers:
     """Open questions of RIBs about attached nodes."""
 
-    def __init__(
-        self,
-        identity: Identity,
-        hello_protocol: HelloProtocol,
-        attached: LocalAdvertisements,
-        unicast: Unicast,
-        outbox: Outbox,
-    ) -> None:
-        self._identity = identity
-        self._hello_protocol = hello_protocol
-        self._attached = attached
+    def __init__(self, state: ForwardingState, unicast: Unicast) -> None:
+        self._state = state
         self._unicast = unicast
-        self._outbox = outbox
         self._open: dict[Name, _Question] = {}
 
     def handle_question(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
@@ -53,9 +40,9 @@ class PresenceAnswers:
         if len(self._open) >= _OPEN_MAX and presence.node not in self._open:
             return  # the RIB repeats its question
         self._open[presence.node] = _Question(presence, rib, now_s)
-        held = self._attached.get(presence.node, presence.node)
+        held = self._state.attached.get(presence.node, presence.node)
         if held is not None and held.advertisement.incarnation == presence.incarnation:
-            self._outbox.say_at(held.port, held.mac, Kind.ADVERTISE_ACK, wire)
+            self._state.outbox.say_at(held.port, held.mac, Kind.ADVERTISE_ACK, wire)
         self.answer(now_s)
 
     def answer(self, now_s: float) -> None:
@@ -65,17 +52,16 @@ class PresenceAnswers:
             if is_there is not None:
                 del self._open[question.presence.node]
                 answer = replace(question.presence, is_answer=True, is_there=is_there)
-                wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-                frames = self._outbox.remote_frames(Kind.RIB_REQUEST, wire, question.rib)
-                self._unicast.send(frames, question.rib, self._identity.name, now_s)
+                wire = self._state.signed_wire(answer)
+                self._unicast.send_statement(Kind.RIB_REQUEST, wire, question.rib, now_s)
 
     def _is_there(self, question: _Question) -> bool | None:
         """Return whether the node is there; None while that is not known."""
         node = question.presence.node
-        held = self._attached.get(node, node)
+        held = self._state.attached.get(node, node)
         if held is None or held.advertisement.incarnation != question.presence.incarnation:
             return False
-        neighbour = self._hello_protocol.neighbours.get(held.port, node)
+        neighbour = self._state.neighbours.get(held.port, node)
         if neighbour is None:
             return False
         return True if neighbour.heard_s > question.asked_s else None

@@ -24,15 +24,13 @@ from typing import Final
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
 from gdp.control.relayed_statement import relayed
-from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
-from gdp.switch.outbox import Outbox
 from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement
-from gdp.trust.domain import Policy
 
 __all__ = ["GRACE_S", "Relocations"]
 
@@ -68,14 +66,10 @@ class _Moved:
 class Relocations:
     """Handles the nodes of one switch that came from, or went to, another switch."""
 
-    def __init__(
-        self, identity: Identity, policy: Policy, multicast: MulticastTrees, unicast: Unicast, outbox: Outbox
-    ) -> None:
-        self._identity = identity
-        self._policy = policy
+    def __init__(self, state: ForwardingState, multicast: MulticastTrees, unicast: Unicast) -> None:
+        self._state = state
         self._multicast = multicast
         self._unicast = unicast
-        self._outbox = outbox
         self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
         self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose responses are accepted, until when
         self._departed: OrderedDict[_Key, float] = OrderedDict()
@@ -85,9 +79,9 @@ class Relocations:
 
     def arrived(self, advertisement: Advertisement, now_s: float) -> None:
         """Notify the former switch of a node that advertises a name here."""
-        if advertisement.previous in (ZERO, self._identity.name):
+        if advertisement.previous in (ZERO, self._state.me):
             return
-        statement = relayed(advertisement.wire, self._identity, self._policy.transit)
+        statement = relayed(advertisement.wire, self._state.identity, self._state.policy.transit)
         _remember(
             self._notices,
             (advertisement.name, advertisement.node),
@@ -122,7 +116,7 @@ class Relocations:
             self._moved_names = {name: end_s for name, end_s in self._moved_names.items() if end_s > now_s}
         self._moved_names[location.name] = until_s
         for at in self._multicast.below(location.name, location.advertiser):
-            self._outbox.say_at(*at, Kind.REDIRECT, statement)
+            self._state.outbox.say_at(*at, Kind.REDIRECT, statement)
 
     def frame_came(self, destination: Name, neighbour: Neighbour, now_s: float) -> None:
         """Redirect the neighbour that sent a frame here for a node that has moved.
@@ -150,17 +144,14 @@ class Relocations:
         No RIB responds, and the neighbour must have had the location to send the frame.
         """
         if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
-            identity = self._identity
-            query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
-            self._outbox.send_to_neighbour(neighbour, Kind.WHERE, query)
+            self._state.outbox.send_to_neighbour(neighbour, Kind.WHERE, self._state.signed_wire(Query(name, 0.0)))
 
     def handle_timer(self, now_s: float) -> None:
         """Send the notices that are due."""
         for key, notice in list(self._notices.items()):
             if notice.due_s > now_s:
                 continue
-            frames = self._outbox.remote_frames(Kind.RELOCATE, notice.statement, notice.to)
-            self._unicast.send(frames, notice.to, self._identity.name, now_s)
+            self._unicast.send_statement(Kind.RELOCATE, notice.statement, notice.to, now_s)
             notice.sent += 1
             if notice.sent == len(_NOTICE_AT_S):
                 del self._notices[key]
@@ -171,7 +162,7 @@ class Relocations:
 
     def _redirect(self, neighbour: Neighbour, name: Name, statement: bytes, now_s: float) -> None:
         if self._may_say(name, neighbour, now_s):
-            self._outbox.send_to_neighbour(neighbour, Kind.REDIRECT, statement)
+            self._state.outbox.send_to_neighbour(neighbour, Kind.REDIRECT, statement)
 
     def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
         """Return whether a message to a neighbour about a name is allowed now, and record it as sent."""

@@ -19,24 +19,19 @@ from typing import Final
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
-from gdp.crypto.statements import Statement, parse
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import AttachedAdvertisement, Dependents, JoinedBranch, KnownLocation
-from gdp.switch.evidence import Evidence
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.dependents import AttachedAdvertisement, JoinedBranch, KnownLocation
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.outbox import Outbox
 from gdp.switch.unicast import Unicast
-from gdp.trust.advertisement import Advertisement
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR
-from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["RevocationHandler"]
 
@@ -50,65 +45,67 @@ class RevocationHandler:
     """Handles, applies and distributes revocations at one switch.
 
     One that is not valid, concerns nothing here, or exceeds a quota raises ``StatementError``.
+
+    Args:
+        first_sequence: above those of an earlier incarnation.
+
+    Attributes:
+        sync: comparison of revocations with the neighbours.
     """
 
     def __init__(
         self,
-        *,
-        verifier: AdvertisementVerifier,
+        state: ForwardingState,
         hello_protocol: HelloProtocol,
-        attached: LocalAdvertisements,
         multicast: MulticastTrees,
         unicast: Unicast,
-        resolver: NameResolver,
-        evidence: Evidence,
-        held: Dependents,
-        sync: RevocationSync,
-        outbox: Outbox,
+        first_sequence: int,
     ) -> None:
-        self._verifier = verifier
-        self._revoked = verifier.revoked
+        self._state = state
+        self._revoked = state.policy.revoked
         self._hello_protocol = hello_protocol
-        self._attached = attached
         self._multicast = multicast
         self._unicast = unicast
-        self._resolver = resolver
-        self._evidence = evidence
-        self._held = held
-        self._sync = sync
-        self._outbox = outbox
+        self.sync = RevocationSync(
+            state.identity, self._revoked, state.neighbours, self._send_to_reconcile, first_sequence
+        )
         self._handed_in: dict[bytes, bytes] = {}  # statements of owners that the operator submitted, by fingerprint
         self._requests = Requests[bytes]()  # to the RIB, by fingerprint
         self._next_send_s = float("-inf")
         self._sent_to: Name | None = None  # the RIB that received the operator's revocations
 
-    def receive_revocation(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Handle a revocation from a neighbour; return the topics that lost all readers here."""
-        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
-        return [] if revocation is None else self._spread(revocation, statement, neighbour, now)
+    def receive_revocation(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Handle a revocation from a neighbour."""
+        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._state.dependents.has_issuer)
+        if revocation is not None:
+            self._spread(revocation, statement, neighbour, now)
 
-    def receive_lacking(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Handle a revocation that was missing here; the other neighbours receive it by digests."""
-        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
-        if revocation is None:
-            return []
-        self._sync.took(neighbour, now.mono_s)
-        return self._apply(revocation, now)
+    def receive_sync(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Take part in the comparison of revocations; other neighbours get one that was missing here by digests."""
+        if statement.type is not StatementType.REVOKE:
+            self.sync.receive(neighbour, statement, now)
+            return
+        revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._state.dependents.has_issuer)
+        if revocation is not None:
+            self.sync.took(neighbour, now.mono_s)
+            self._apply(revocation, now)
 
-    def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> list[Name]:
+    def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> None:
         """Handle a revocation that a RIB sent."""
-        revocation = self._revoked.receive_revocation(statement, rib, now, self._held.has_issuer)
-        return [] if revocation is None else self._spread(revocation, statement, None, now)
+        revocation = self._revoked.receive_revocation(statement, rib, now, self._state.dependents.has_issuer)
+        if revocation is not None:
+            self._spread(revocation, statement, None, now)
 
-    def hand_in(self, statement: Statement, now: Timestamps) -> list[Name]:
+    def hand_in(self, statement: Statement, now: Timestamps) -> None:
         """Handle a revocation from this node's operator, for any issuer."""
-        revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._held.has_issuer)
+        revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._state.dependents.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
             self._handed_in[statement.fingerprint] = statement.wire
             if statement.fingerprint not in self._requests:
                 self._requests.start(statement.fingerprint, now.mono_s)
-        return [] if revocation is None else self._spread(revocation, statement, None, now)
+        if revocation is not None:
+            self._spread(revocation, statement, None, now)
 
     def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
         """Return the few revocations of the operator that are due at this RIB; expired ones are removed.
@@ -139,20 +136,21 @@ class RevocationHandler:
         due_s = self._requests.next_due()
         return None if due_s is None else max(due_s, self._next_send_s)
 
-    def _spread(
-        self, revocation: Revocation, statement: Statement, origin: Neighbour | None, now: Timestamps
-    ) -> list[Name]:
-        for other in self._hello_protocol.neighbours.all_up():
-            if origin is None or (other.port, other.name) != (origin.port, origin.name):
-                self._outbox.send_to_neighbour(other, Kind.REVOKE, statement.wire)
-        return self._apply(revocation, now)
+    def _send_to_reconcile(self, neighbour: Neighbour, wire: bytes) -> None:
+        self._state.outbox.send_to_neighbour(neighbour, Kind.REVOKED, wire)
 
-    def _apply(self, revocation: Revocation, now: Timestamps) -> list[Name]:
-        """Close what carries the revoked certificate; return the topics that lost all readers here."""
+    def _spread(self, revocation: Revocation, statement: Statement, origin: Neighbour | None, now: Timestamps) -> None:
+        for other in self._state.neighbours.all_up():
+            if origin is None or (other.port, other.name) != (origin.port, origin.name):
+                self._state.outbox.send_to_neighbour(other, Kind.REVOKE, statement.wire)
+        self._apply(revocation, now)
+
+    def _apply(self, revocation: Revocation, now: Timestamps) -> None:
+        """Close what carries the revoked certificate; topics that lose all readers here are no longer watched."""
         issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
-        self._verifier.policy.audit.record(Action.REVOKED, "certificate", who=issuer, about=about)
+        self._state.policy.audit.record(Action.REVOKED, "certificate", who=issuer, about=about)
         orphaned: list[Name] = []
-        for holder in self._held.resting_on(revocation.fingerprint):
+        for holder in self._state.dependents.resting_on(revocation.fingerprint):
             if isinstance(holder, AttachedAdvertisement):
                 orphaned += self._close_advertisement(holder, now)
             elif isinstance(holder, KnownLocation):
@@ -160,25 +158,28 @@ class RevocationHandler:
             else:
                 self._doubt(holder, now)
         self._hello_protocol.recheck(revocation.fingerprint, now)
-        return orphaned
+        for topic in orphaned:
+            self._state.resolver.unwatch(topic)
 
     def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> list[Name]:
-        attachment = self._attached.get(holder.name, holder.node)
-        if attachment is not None and not self._holds(attachment.advertisement, now):
-            self._attached.remove(holder.name, holder.node)
+        attachment = self._state.attached.get(holder.name, holder.node)
+        if attachment is not None and not self._state.evidence.still_holds(attachment.advertisement, now):
+            self._state.attached.remove(holder.name, holder.node)
             self._unicast.remove(holder.name)
-        advertisement = self._multicast.advertisement_of(holder.name, holder.at)
-        if advertisement is None or self._holds(advertisement, now):
+        advertisement = self._state.readers.advertisement_of(holder.name, holder.at)
+        if advertisement is None or self._state.evidence.still_holds(advertisement, now):
             return []
         is_last = self._multicast.remove_reader(holder.name, holder.at)
-        for tree in self._multicast.trees.of_topic(holder.name):
+        for tree in self._state.trees.of_topic(holder.name):
             self._doubt(JoinedBranch(tree.topic, tree.publisher, holder.at), now)
         return [holder.name] if is_last else []
 
     def _close_place(self, holder: KnownLocation, now: Timestamps) -> None:
-        place = self._resolver.cache.get(holder.name, holder.advertiser)
-        if place is not None and not self._evidence.still_holds(place, now):
-            self._resolver.receive_removal(place.name, place.advertiser, now.mono_s)
+        place = self._state.resolver.cache.get(holder.name, holder.advertiser)
+        if place is None or place.proof is None:
+            return
+        if not self._state.evidence.still_holds(place.proof, now):
+            self._state.resolver.receive_removal(place.name, place.advertiser, now.mono_s)
             self._multicast.publisher_gone(place.name, place.advertiser)
             self._unicast.remove(place.name)
 
@@ -188,16 +189,9 @@ class RevocationHandler:
             branch.topic, branch.publisher, branch.at, proves, now.mono_s + GRACE_S, now.mono_s
         )
 
-    def _holds(self, advertisement: Advertisement, now: Timestamps) -> bool:
-        try:
-            self._verifier.recheck(advertisement, now.unix_s)
-        except StatementError:
-            return False
-        return True
-
     def _proves(self, evidence: bytes, now: Timestamps) -> bool:
         try:
-            self._verifier.verify(evidence, now.unix_s)
+            self._state.verifier.verify(evidence, now.unix_s)
         except StatementError:
             return False
         return True

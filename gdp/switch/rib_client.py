@@ -26,7 +26,6 @@ from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
-from gdp.crypto.identity import Identity
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
@@ -35,18 +34,11 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.endpoint_exchange import EndpointExchange
-from gdp.switch.evidence import Evidence
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.location_updates import LocationUpdates
-from gdp.switch.multicast import MulticastTrees
-from gdp.switch.name_cache import Location
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.outbox import Outbox
-from gdp.switch.paths import Paths
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
-from gdp.trust.domain import Policy
 
 __all__ = ["SILENT_S", "RibClient"]
 
@@ -59,41 +51,26 @@ class RibClient:
     """Exchanges statements with the nearest RIB.
 
     Attributes:
+        endpoints: exchange of endpoint records with it.
+        presence: answers to questions of RIBs about attached nodes.
         rib: the RIB in use, or None while none is known.
     """
 
     def __init__(
         self,
-        *,
-        identity: Identity,
-        policy: Policy,
-        paths: Paths,
-        attached: LocalAdvertisements,
-        resolver: NameResolver,
-        multicast: MulticastTrees,
+        state: ForwardingState,
+        channels: Channels,
         unicast: Unicast,
         relocations: Relocations,
-        evidence: Evidence,
         locations: LocationUpdates,
-        outbox: Outbox,
-        presence: PresenceAnswers,
-        channels: Channels,
-        endpoints: EndpointExchange,
     ) -> None:
-        self._identity = identity
-        self._policy = policy
-        self._paths = paths
-        self._attached = attached
-        self._resolver = resolver
-        self._multicast = multicast
+        self._state = state
+        self._channels = channels
         self._unicast = unicast
         self._relocations = relocations
-        self._evidence = evidence
         self._locations = locations
-        self._outbox = outbox
-        self._presence = presence
-        self._channels = channels
-        self._endpoints = endpoints
+        self.presence = PresenceAnswers(state, unicast)
+        self.endpoints = EndpointExchange(state.identity, state.policy)
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
@@ -107,27 +84,27 @@ class RibClient:
         """Select the RIB again; a new one receives all advertisements and queries."""
         reached = self._reached(now_s)
         rib = reached[0].name if reached else None
-        self._others = tuple(reached) if reached and reached[0].domain != self._policy.own else ()
-        known = None if rib is None else self._paths.ribs().get(rib)
+        self._others = tuple(reached) if reached and reached[0].domain != self._state.policy.own else ()
+        known = None if rib is None else self._state.paths.ribs().get(rib)
         session = b"" if known is None else known.session
         if (rib, session) != (self.rib, self._session):
             self.rib, self._session, self._chosen_s = rib, session, now_s
             self._owed.clear()
             if rib is not None:
                 self._channels.renew(rib)
-            self._attached.relay_all(now_s)
-            self._resolver.rib_changed(now_s, has_rib=rib is not None)
-            self._endpoints.rib_changed(now_s)
+            self._state.attached.relay_all(now_s)
+            self._state.resolver.rib_changed(now_s, has_rib=rib is not None)
+            self.endpoints.rib_changed(now_s)
         self.send_due(now_s)
 
     def _reached(self, now_s: float) -> list[AttachedRib]:
         """Return the RIBs in reach, the one to use first."""
-        own, transit, me = self._policy.own, self._policy.transit, self._identity.name
+        own, transit, me = self._state.policy.own, self._state.policy.transit, self._state.me
         reached: list[tuple[bool, bool, int, bytes, AttachedRib]] = []
-        for name, rib in self._paths.ribs().items():
+        for name, rib in self._state.paths.ribs().items():
             if rib.domain not in transit:
                 continue
-            way, host = self._paths.to_rib(name, transit)
+            way, host = self._state.paths.to_rib(name, transit)
             if host is not None:
                 is_avoided = self._avoided.get(name, 0.0) > now_s
                 distance, spread = 0 if way is None else way.distance, hashlib.sha256(me + name).digest()
@@ -136,11 +113,11 @@ class RibClient:
 
     def _rib_for(self, name: Name, now_s: float) -> Name | None:
         """Return the RIB to query for a name."""
-        passed_over = self._resolver.passed_over(name)
+        passed_over = self._state.resolver.passed_over(name)
         left = [rib for rib in self._others if rib.name not in passed_over] or self._others
         if not left:
             return self.rib
-        known = self._resolver.cache.of(name, now_s)
+        known = self._state.resolver.cache.of(name, now_s)
         sources, domains = {place.source[0] for place in known if place.source}, {place.domain for place in known}
         avoided = {rib for rib, until_s in self._avoided.items() if until_s > now_s}
         return min(left, key=lambda rib: (rib.name in avoided, rib.name not in sources, rib.domain not in domains)).name
@@ -156,21 +133,21 @@ class RibClient:
             self.links_changed(now_s)
         for rib in [rib for rib, since_s in self._owed.items() if now_s - since_s >= SILENT_S]:
             self._leave_silent_rib(rib, now_s)
-        if self._attached.is_relay_due(now_s):
-            for attachment in self._attached.due(now_s, self._trip_s(self.rib)):
+        if self._state.attached.is_relay_due(now_s):
+            for attachment in self._state.attached.due(now_s, self._trip_s(self.rib)):
                 self.relay(attachment.advertisement.wire, now_s)
-        for statement in self._endpoints.statements_to_send(now_s):
+        for statement in self.endpoints.statements_to_send(now_s):
             self._to_rib(statement, now_s)
-        for name, watch_s in self._resolver.queries_to_send(now_s):
-            is_heard = bool(self._multicast.readers(name))
-            query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
-            wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        for name, watch_s in self._state.resolver.queries_to_send(now_s):
+            is_heard = bool(self._state.readers.of(name))
+            query = Query(name, watch_s, self._state.policy.revoked.digest_about(name) if is_heard else None)
+            wire = self._state.signed_wire(query)
             self._to_rib(wire, now_s, self._rib_for(name, now_s))
 
     def _trip_s(self, rib: Name) -> float:
         """Return the round trip of the link towards a RIB, in seconds; 0: not measured, or the RIB is here."""
-        way, _ = self._paths.to_rib(rib, self._policy.transit)
-        return 0.0 if way is None else self._outbox.rtt_to(way.first)
+        way, _ = self._state.paths.to_rib(rib, self._state.policy.transit)
+        return 0.0 if way is None else self._state.neighbours.rtt_to(way.first)
 
     def _leave_silent_rib(self, silent: Name, now_s: float) -> None:
         """Avoid a RIB; if it is the one in use, switch to another, and where there is none, serve known locations."""
@@ -178,13 +155,13 @@ class RibClient:
         self._avoided[silent] = self._review_s = now_s + _AVOID_S
         self._owed.pop(silent, None)
         if silent == self.rib:
-            self._resolver.serve_stale(now_s, stale=True)
+            self._state.resolver.serve_stale(now_s, stale=True)
             if [rib.name for rib in self._reached(now_s)[:1]] != [silent]:
                 self.links_changed(now_s)
 
     def relay(self, statement: bytes, now_s: float) -> None:
         """Relay an attached node's advertisement or withdrawal, or a revocation, to the RIB."""
-        self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
+        self._to_rib(relayed(statement, self._state.identity, self._state.policy.transit), now_s)
 
     def _to_rib(self, statement: bytes, now_s: float, rib: Name | None = None) -> None:
         rib = rib or self.rib
@@ -200,8 +177,7 @@ class RibClient:
 
     def _send(self, now_s: float) -> None:
         for each in self._channels.records_to_send():
-            frames = self._outbox.remote_frames(Kind.RIB_REQUEST, each.wire, each.to)
-            self._unicast.send(frames, each.to, self._identity.name, now_s)
+            self._unicast.send_statement(Kind.RIB_REQUEST, each.wire, each.to, now_s)
 
     def open(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
         """Handle a message for this switch; return its statement, if it is for more than the channel to a RIB.
@@ -225,10 +201,10 @@ class RibClient:
             StatementError: it is not valid, or its sender received no query.
         """
         fields = statement.fields
-        member = self._policy.verify_membership(CERTIFICATE.read(fields), now.unix_s)
+        member = self._state.policy.verify_membership(CERTIFICATE.read(fields), now.unix_s)
         if statement.type is StatementType.PRESENCE and member.role is Role.RIB and member.name == statement.signer:
             statement.verify(member.key)
-            self._presence.handle_question(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
+            self.presence.handle_question(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
         self._check_asked(statement, member, now.mono_s)
         if member.role.is_switch:
@@ -241,7 +217,7 @@ class RibClient:
             self._handle_ack(statement)
             return
         if statement.type is StatementType.SYNC:
-            self._endpoints.receive(SyncMessage.from_fields(fields), now)
+            self.endpoints.receive(SyncMessage.from_fields(fields), now)
             return
         statement.expect(StatementType.ANSWER)
         response = Response.from_fields(fields)
@@ -261,7 +237,7 @@ class RibClient:
             StatementError: the sender is no RIB that received a query, or the statement is another one.
         """
         relay = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
-        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        member = self._state.policy.verify_membership(relay.membership, now.unix_s)
         if member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "a revocation that no RIB passed on")
         self._check_asked(statement, member, now.mono_s)
@@ -272,36 +248,20 @@ class RibClient:
             raise StatementError(DropReason.WRONG_DOMAIN, "an answer from a node that was not asked")
         statement.verify(member.key)
 
-    def verify_answer(self, statement: Statement, now: Timestamps) -> Location:
-        """Return the location in a response that was forwarded; any RIB of a trusted domain may have issued it.
-
-        Raises:
-            StatementError: it is not valid, or contains no location.
-        """
-        fields = statement.expect(StatementType.ANSWER)
-        member = self._policy.verify_sender(statement, now.unix_s)
-        if not (member.role.is_switch or member.role is Role.RIB):
-            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
-        statement.verify(member.key)
-        response = Response.from_fields(fields)
-        if not response.advertisement:
-            raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
-        return self._evidence.from_answer(response, now)
-
     def _was_asked(self, member: Membership, now_s: float) -> bool:
         if member.role is Role.RIB:
-            return member.domain == self._policy.own or member.name in self._asked
+            return member.domain == self._state.policy.own or member.name in self._asked
         return member.role.is_switch and self._relocations.is_former(member.name, now_s)
 
     def _rib_answered(self, rib: Name, now_s: float) -> None:
         self._avoided.pop(rib, None)
         self._owed.pop(rib, None)
         if rib == self.rib:
-            self._resolver.serve_stale(now_s, stale=False)
+            self._state.resolver.serve_stale(now_s, stale=False)
 
     def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
-            place = self._evidence.from_answer(response, now)
+            place = self._state.evidence.from_answer(response, now)
         except StatementError:
             # it is of no use here, but still counts as a response
             self._receive_negative(response.name, member, now.mono_s)
@@ -309,7 +269,7 @@ class RibClient:
         self._locations.receive(replace(place, source=self._source(member.name)), wire, now.mono_s)
 
     def _source(self, rib: Name) -> tuple[Name, bytes]:
-        known = self._paths.ribs().get(rib)
+        known = self._state.paths.ribs().get(rib)
         return rib, b"" if known is None else known.session
 
     def _receive_negative(self, name: Name, member: Membership, now_s: float) -> None:
@@ -317,16 +277,16 @@ class RibClient:
 
         It can where it gave the known locations since it started, or where they and this switch are in its domain.
         """
-        source, own = self._source(member.name), self._policy.own
-        for place in self._resolver.cache.of(name, now_s):
+        source, own = self._source(member.name), self._state.policy.own
+        for place in self._state.resolver.cache.of(name, now_s):
             if place.source != source and not (place.domain == member.domain == own):
                 self._receive_unknown(name, member.name, now_s)
                 return
-        self._resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
+        self._state.resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
 
     def _receive_unknown(self, name: Name, rib: Name, now_s: float) -> None:
         """Keep the known locations of a name; query other RIBs where the own domain has none."""
-        self._resolver.receive_unknown(name, rib, now_s, {each.name for each in self._others})
+        self._state.resolver.receive_unknown(name, rib, now_s, {each.name for each in self._others})
 
     def _take_context(self, statement: Statement, now: Timestamps) -> None:
         """Handle the names that a node reads, from the node's former switch; a RIB's information takes precedence."""
@@ -335,7 +295,7 @@ class RibClient:
             self._relocations.acknowledged(ack.name, ack.advertiser, ack.sequence)
             return
         statement.expect(StatementType.ANSWER)
-        place = self._evidence.from_answer(Response.from_fields(statement.fields), now)
+        place = self._state.evidence.from_answer(Response.from_fields(statement.fields), now)
         known = self._locations.get(place.name, place.advertiser)
         if known is None or known.sequence < place.sequence:
             self._locations.receive(place, statement.wire, now.mono_s)
@@ -343,22 +303,22 @@ class RibClient:
     def _handle_ack(self, statement: Statement) -> None:
         ack = AdvertiseAck.from_fields(statement.fields)
         taken = ack.sequence if ack.refused is None else None
-        attachment = self._attached.handle_ack(ack.name, ack.advertiser, taken)
+        attachment = self._state.attached.handle_ack(ack.name, ack.advertiser, taken)
         if attachment is not None:
-            self._outbox.say_at(attachment.port, attachment.mac, Kind.ADVERTISE_ACK, statement.wire)
+            self._state.outbox.say_at(attachment.port, attachment.mac, Kind.ADVERTISE_ACK, statement.wire)
             if ack.refused is DropReason.IN_USE:  # the older node with this identity is elsewhere
-                self._attached.remove(ack.name, ack.advertiser)
+                self._state.attached.remove(ack.name, ack.advertiser)
                 self._unicast.remove(ack.name)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
         times = [
-            self._attached.next_event(),
-            self._resolver.next_query(),
+            self._state.attached.next_event(),
+            self._state.resolver.next_query(),
             owed_s,
             self._review_s,
-            self._endpoints.get_timer(),
+            self.endpoints.get_timer(),
             self._channels.get_timer(),
         ]
         return None if self.rib is None else min((time for time in times if time is not None), default=None)

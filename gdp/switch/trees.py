@@ -24,7 +24,7 @@ from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
-__all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees"]
+__all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees", "owner_of"]
 
 Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
 TreeKey = tuple[Name, Name, int]  # topic, publisher and path
@@ -295,3 +295,8 @@ class Trees:
         for key, tree in self._touched.items():
             self._due.put(key, tree.next_s())
         self._touched.clear()
+
+
+def owner_of(at: Downstream) -> bytes:
+    """Return the owner whose quota the state of a neighbour uses."""
+    return at[0].to_bytes(4, "big") + at[1]

@@ -18,12 +18,10 @@ from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
 from gdp.names import Name
-from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
-from gdp.switch.name_resolver import NameResolver
-from gdp.switch.outbox import Outbox
-from gdp.switch.paths import Path, Paths
-from gdp.switch.table import NOWHERE, Hop, ProtectedHop, Table
+from gdp.switch.paths import Path
+from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
 __all__ = ["Unicast"]
 
@@ -50,26 +48,10 @@ class _Installed:
 class Unicast:
     """Resolves and installs the paths of frames to one name."""
 
-    def __init__(
-        self,
-        *,
-        me: Name,
-        own_domain: Name,
-        transit: frozenset[Name],
-        table: Table,
-        paths: Paths,
-        resolver: NameResolver,
-        attached: LocalAdvertisements,
-        outbox: Outbox,
-    ) -> None:
-        self._me = me
-        self._own_domain = own_domain
-        self._transit = transit
-        self._table = table
-        self._paths = paths
-        self._resolver = resolver
-        self._attached = attached
-        self._outbox = outbox
+    def __init__(self, state: ForwardingState) -> None:
+        self._state = state
+        self._own_domain = state.policy.own
+        self._transit = state.policy.transit
         self._installed: dict[bytes, _Installed] = {}
         self._stale = deque[bytes]()  # keys of paths to compute again
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
@@ -78,7 +60,7 @@ class Unicast:
     def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
         """Handle a neighbour's frame without a table entry; return the name whose location it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
-        return self._find(destination, source, frame, self._resolver.owner_of(neighbour), now_s)
+        return self._find(destination, source, frame, self._state.resolver.owner_of(neighbour), now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the same path as forwarded frames."""
@@ -87,7 +69,12 @@ class Unicast:
             if hop is None:
                 self.drops[self._reason(destination, source)] += len(frames)
             else:
-                self._outbox.frames(hop[0], hop[1][:6], frames)
+                self._state.outbox.frames(hop[0], hop[1][:6], frames)
+
+    def send_statement(self, kind: int, statement: bytes, destination: Name, now_s: float) -> None:
+        """Send a statement of our own to a node that may be beyond a neighbour."""
+        frames = self._state.outbox.remote_frames(kind, statement, destination)
+        self.send(frames, destination, self._state.me, now_s)
 
     def originate(self, frames: Iterable[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name as ``send`` does, but keep them while its location is queried.
@@ -101,7 +88,7 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Retry the frames that wait for a name."""
-        for frame, until_s, owner in self._resolver.release_frames(name):
+        for frame, until_s, owner in self._state.resolver.release_frames(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 
@@ -148,8 +135,8 @@ class Unicast:
     def _uninstall(self, key: bytes) -> None:
         """Remove an entry of ours, but not a tree that may have replaced a negative one."""
         why = self._let_go(key)
-        if why is not None and (not why.is_negative or self._table.entries.get(key) == NOWHERE):
-            self._table.remove(key)
+        if why is not None and (not why.is_negative or self._state.table.entries.get(key) == NOWHERE):
+            self._state.table.remove(key)
 
     def _note(self, key: bytes, why: _Installed) -> None:
         self._let_go(key)
@@ -164,7 +151,7 @@ class Unicast:
         if waits_for is None:
             self._forward(destination, source, frame)
         else:
-            self._resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
+            self._state.resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
         return waits_for
 
     def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
@@ -175,7 +162,7 @@ class Unicast:
             self.drops[DropReason.HOPS_EXPIRED] += 1
         else:
             on = frame[:HOPS_AT] + bytes([frame[HOPS_AT] - 1]) + frame[HOPS_AT + 1 :]
-            self._outbox.frames(hop[0], hop[1][:6], [on])
+            self._state.outbox.frames(hop[0], hop[1][:6], [on])
 
     def _reason(self, destination: Name, source: Name) -> DropReason:
         """Return why an entry leads nowhere."""
@@ -183,7 +170,7 @@ class Unicast:
         return DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere
 
     def _hop(self, destination: Name, source: Name) -> Hop | None:
-        hops = self._table.entries.get(destination + source) or self._table.entries.get(destination)
+        hops = self._state.table.entries.get(destination + source) or self._state.table.entries.get(destination)
         return hops[0][:2] if hops else None
 
     def _resolve(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
@@ -192,29 +179,29 @@ class Unicast:
         Args:
             owner: the neighbour whose query rate applies; empty: our own.
         """
-        at = self._attached.at(destination)
+        at = self._state.attached.at(destination)
         if at is not None:
-            self._install(destination, b"", self._outbox.hop_at(at.port, at.mac), source, at.expires_s)
+            self._install(destination, b"", self._state.outbox.hop_at(at.port, at.mac), source, at.expires_s)
             return None
-        neighbour = self._outbox.neighbour(destination)
+        neighbour = self._state.neighbours.cheapest(destination)
         # a proxy is where its advertisement was accepted
         if neighbour is not None and neighbour.role is not Role.PROXY:
-            self._install(destination, b"", self._outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
+            self._install(destination, b"", self._state.outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
             return None
-        if self._paths.is_switch(destination):
-            domain = self._paths.domain_of(destination) or self._own_domain
-            way = self._paths.to_switch(destination, domain, self._transit | {domain})
+        if self._state.paths.is_switch(destination):
+            domain = self._state.paths.domain_of(destination) or self._own_domain
+            way = self._state.paths.to_switch(destination, domain, self._transit | {domain})
             otherwise = self._why(destination, domain)
             self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s, otherwise)
             return None
-        if self._paths.is_rib(destination):
-            way, _ = self._paths.to_rib(destination, self._transit)
+        if self._state.paths.is_rib(destination):
+            way, _ = self._state.paths.to_rib(destination, self._transit)
             self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
             return None
         return self._resolve_by_rib(destination, source, owner, now_s)
 
     def _resolve_by_rib(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
-        found = self._resolver.resolve(destination, now_s, owner)
+        found = self._state.resolver.resolve(destination, now_s, owner)
         if found is None:
             return destination
         if found.reason is not None:
@@ -227,8 +214,8 @@ class Unicast:
                 self._install_place(destination, b"", best, source, now_s)
                 return None
         transit = self._transit
-        if self._attached.at(source) is None and not self._paths.is_switch(source) and not self._paths.is_rib(source):
-            origin = self._resolver.resolve_source(source, now_s, owner)
+        if not self._is_known_here(source):
+            origin = self._state.resolver.resolve_source(source, now_s, owner)
             if origin is None:
                 return source
             if origin.reason is not None:
@@ -242,19 +229,25 @@ class Unicast:
 
     def _why(self, switch: Name, domain: Name) -> DropReason:
         """Return the reason to report where there is no path to a switch."""
-        return DropReason.THROUGH_LEAF if self._paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
+        return DropReason.THROUGH_LEAF if self._state.paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
+
+    def _is_known_here(self, source: Name) -> bool:
+        """Return whether a source needs no query: it is attached here, or link states name it."""
+        paths = self._state.paths
+        return self._state.attached.at(source) is not None or paths.is_switch(source) or paths.is_rib(source)
 
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
-        if self._attached.at(source) is not None or self._paths.domain_of(source) == self._own_domain:
+        if self._state.attached.at(source) is not None or self._state.paths.domain_of(source) == self._own_domain:
             return True
-        places = self._resolver.cache.of(source, now_s)
+        places = self._state.resolver.cache.of(source, now_s)
         return bool(places) and all(place.domain == self._own_domain for place in places)
 
     def _nearest(self, takers: list[Location], allowed: frozenset[Name]) -> tuple[Location, Path] | None:
+        paths = self._state.paths
         ways = [
             (place, way)
             for place in takers
-            if (way := self._paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
+            if (way := paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
         ]
         return min(ways, key=lambda each: (each[1].distance, each[0].advertiser), default=None)
 
@@ -288,11 +281,11 @@ class Unicast:
         otherwise: DropReason = DropReason.NO_ROUTE,
     ) -> None:
         """Install a path; where there is none, a negative entry with the reason ``otherwise``."""
-        neighbour = None if path is None else self._outbox.neighbour(path.first)
+        neighbour = None if path is None else self._state.neighbours.cheapest(path.first)
         if neighbour is None:
             self._install_negative(destination, source, otherwise, now_s)
         else:
-            hop = self._outbox.protected_hop(neighbour, None if path is None else path.alternate)
+            hop = self._state.outbox.protected_hop(neighbour, None if path is None else path.alternate)
             self._install(destination, source_key, hop, source, expires_s)
 
     def _install(
@@ -302,11 +295,11 @@ class Unicast:
         negative = self._installed.get(destination + source)
         if negative is not None and negative.is_negative:
             self._uninstall(destination + source)  # the longer key would match first
-        if self._table.install(key, (hop,), expires_s):
+        if self._state.table.install(key, (hop,), expires_s):
             self._note(key, _Installed(destination, source))
 
     def _install_negative(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
         """Make the data plane drop such frames briefly, unless a tree stands there."""
         key = destination + source
-        if not self._table.entries.get(key) and self._table.install(key, NOWHERE, now_s + NEGATIVE_S):
+        if not self._state.table.entries.get(key) and self._state.table.install(key, NOWHERE, now_s + NEGATIVE_S):
             self._note(key, _Installed(destination, source, reason))

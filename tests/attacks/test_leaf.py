@@ -61,14 +61,14 @@ def detour(*, far: bool = False) -> Simulation:
 def first_to(world: Simulation, at: str, to: str) -> str | None:
     """Return the switch through which another one is reached, or None."""
     switch, target = world.switches[at], world.identities[to]
-    way = switch._paths.to_switch(target.name, target.root.domain, switch._policy.transit | {target.root.domain})
+    way = switch.paths.to_switch(target.name, target.root.domain, switch.state.policy.transit | {target.root.domain})
     return next((label for label, each in world.switches.items() if way and each.name == way.first), None)
 
 
 def say(world: Simulation, state: LinkState, liar: Identity, to: str, port: int) -> None:
     """Hand the liar's link state to a neighbour."""
     wire = state.to_wire(liar.name, liar.key, liar.membership)
-    for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject(to, port, frame, mac_of(world, to, port))
     world.network.run(1.0)
 
@@ -171,7 +171,7 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
         topic=tree.topic,
         publisher=tree.publisher,
         switch=left.name,
-        domain=left._policy.own,
+        domain=left.state.policy.own,
         allowed=tree.allowed,
         mtu=1_500,
         lease_s=5.0,
@@ -184,7 +184,9 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     )
     tap = Tap("left", "leaf")
     world.network.taps.append(tap)
-    for frame in world.switches["leaf"]._fragmenter.split(Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500):
+    for frame in world.switches["leaf"].state.outbox._fragmenter.split(
+        Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500
+    ):
         world.network.inject("left", 1, frame, mac_of(world, "left", 1))
     assert arrives(flow, LISTENER)
     assert left.drops()[DropReason.THROUGH_LEAF] == 1
@@ -201,11 +203,11 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     assert [wait.refused for wait in waits if wait.reason is WaitReason.STRANGER] == [DropReason.THROUGH_LEAF]
     border = replace(
         state_of(world, "leaf"), scope=Scope.BORDER, members=(world.switches["left"].name,),
-        links=(Adjacency(right.name, right._policy.own, 1, 1_500),),
+        links=(Adjacency(right.name, right.state.policy.own, 1, 1_500),),
     )  # fmt: skip
     before = right.drops()[DropReason.THROUGH_LEAF]
     wire = border.to_wire(leaf.name, leaf.key, leaf.membership)
-    for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour forwarded it
     assert right.drops()[DropReason.THROUGH_LEAF] > before
     assert not any(each.origin == leaf.name for each in right._flooding.link_states.states(Scope.BORDER))
@@ -226,7 +228,7 @@ def test_l06_a_leaf_hosts_no_rib_that_its_own_root_does_not_name(signed_by: str)
     listed = AttachedRib(rib.name, rib.root.domain, b"session!", membership=rib.membership, rtcert=proof)
     before = left.rib
     say(world, replace(state_of(world, "leaf"), ribs=(listed,)), leaf, "left", 1)
-    assert leaf.name not in left._paths._ribs.get(rib.name, {})
+    assert leaf.name not in left.paths._ribs.get(rib.name, {})
     assert left.rib == before
     assert left.drops()[DropReason.MISPLACED] + left.drops()[DropReason.WRONG_DOMAIN] >= 1
 
@@ -293,7 +295,7 @@ def test_a_leaf_reads_itself_as_one_and_reaches_both_its_sides() -> None:
     assert first_to(world, "leaf", "left") == "left"
     assert first_to(world, "leaf", "right") == "right"
     assert first_to(world, "leaf", "middle") == "right"
-    assert leaf._paths.members() == frozenset(each.name for each in world.switches.values())
+    assert leaf.paths.members() == frozenset(each.name for each in world.switches.values())
 
 
 def test_a_node_that_moves_to_a_leaf_and_on_keeps_its_reader() -> None:
@@ -318,5 +320,5 @@ def test_a_sim_link_to_a_leaf_from_a_second_switch_makes_no_way_through_it() -> 
     world.network.connect("middle", "leaf", SimLink(), CHEAP)
     world.network.run(3)
     assert first_to(world, "left", "right") == first_to(world, "left", "middle") == "middle"
-    assert world.switches["left"]._paths.domain_of(Name(world.switches["leaf"].name)) is not None
+    assert world.switches["left"].paths.domain_of(Name(world.switches["leaf"].name)) is not None
     flow.outlive()

@@ -29,7 +29,7 @@ def liar_of(world: Simulation, switch: str) -> LinkState:
 def say(world: Simulation, state: LinkState, liar: Identity) -> None:
     """Hand the liar's link state to nuc1 as its neighbour nuc2 would."""
     wire = state.to_wire(liar.name, liar.key, liar.membership)
-    frames = world.switches["nuc2"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500)
+    frames = world.switches["nuc2"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500)
     for frame in frames:
         world.network.inject("nuc1", 0, frame, mac_of(world, "nuc1"))
 
@@ -53,7 +53,7 @@ def test_a07_a08_a72_a_switch_that_lists_anothers_rib_or_proxy_draws_none_of_its
     own = AttachedRib(attacked.name, attacked.root.domain, b"session!", membership=attacked.membership, rtcert=proof)
     before = nuc1.rib
     say(world, replace(liar_of(world, "nuc5"), ribs=(lie, own)), liar)
-    hosts = nuc1._paths._ribs.get(attacked.name, {})
+    hosts = nuc1.paths._ribs.get(attacked.name, {})
     assert liar.name not in hosts
     assert nuc1.rib == before
     drops = nuc1.drops()
@@ -68,11 +68,11 @@ def test_a07_a_border_that_lists_switches_of_another_domain_is_no_way_to_them() 
     nuc1, liar = world.switches["nuc1"], world.identities["nuc5"]
     nuc3 = world.switches["nuc3"]
     domain = world.identities["nuc3"].root.domain
-    before = nuc1._paths.to_switch(nuc3.name, domain, nuc1._policy.transit)
+    before = nuc1.paths.to_switch(nuc3.name, domain, nuc1.state.policy.transit)
     say(world, replace(liar_of(world, "nuc5"), members=(liar.name, nuc3.name, Name(b"m" * 32))), liar)
-    assert nuc1._paths.to_switch(nuc3.name, domain, nuc1._policy.transit) == before
-    assert nuc1._paths.to_switch(Name(b"m" * 32), domain, nuc1._policy.transit) != (
-        nuc1._paths.to_switch(liar.name, liar.root.domain, nuc1._policy.transit)
+    assert nuc1.paths.to_switch(nuc3.name, domain, nuc1.state.policy.transit) == before
+    assert nuc1.paths.to_switch(Name(b"m" * 32), domain, nuc1.state.policy.transit) != (
+        nuc1.paths.to_switch(liar.name, liar.root.domain, nuc1.state.policy.transit)
     )
     still_flows(flow)
     flow.outlive()
@@ -80,9 +80,9 @@ def test_a07_a_border_that_lists_switches_of_another_domain_is_no_way_to_them() 
 
 def test_a55_joins_of_invented_domains_recompute_no_paths() -> None:
     world = ring()
-    paths = world.switches["nuc1"]._paths
+    paths = world.switches["nuc1"].paths
     target, domain = world.switches["nuc4"].name, world.identities["nuc4"].root.domain
-    transit = world.switches["nuc1"]._policy.transit
+    transit = world.switches["nuc1"].state.policy.transit
     paths.to_switch(target, domain, transit)
     known = len(paths._ways)
     for number in range(100):

@@ -136,8 +136,8 @@ def test_a15_a_nodes_advertisements_are_bounded_and_cost_the_same_however_many_t
 def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gdp.switch.core.ADVERTISEMENTS_PER_S", 10.0)
-    monkeypatch.setattr("gdp.switch.core.ADVERTISEMENTS_BURST", 20.0)
+    monkeypatch.setattr("gdp.switch.advertisements.ADVERTISEMENTS_PER_S", 10.0)
+    monkeypatch.setattr("gdp.switch.advertisements.ADVERTISEMENTS_BURST", 20.0)
     world = ring()
     other = world.add_member("nuc1/other", "nuc1")
     assert world.network.run(5, lambda: other.attachment.is_attached)

@@ -153,4 +153,4 @@ def test_a39_a_recorded_advertisement_of_an_earlier_life_of_an_attached_node_is_
 
 
 def _is_pending_advertisement(switch: SwitchCore, name: Name, node: Name) -> bool:
-    return switch.attached.get(name, node) is not None or bool(switch.multicast.readers(name))
+    return switch.attached.get(name, node) is not None or bool(switch.state.readers.of(name))

@@ -88,7 +88,7 @@ def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: boo
     for number in range(1_200):
         say(world, junk_of(key, number, far), THIEF, "nuc1")
     world.network.run(2)
-    kept = {node: len(switch._policy.revoked) for node, switch in world.switches.items()}
+    kept = {node: len(switch.state.policy.revoked) for node, switch in world.switches.items()}
     assert kept["nuc1"] <= (700 if matters else 0)
     assert kept["nuc4"] == kept["nuc5"] == 0  # none of it passed nodes that store nothing of that key
     still_flows(flow)
@@ -97,14 +97,14 @@ def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: boo
     assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
     for switch in ("nuc1", "nuc5"):
         fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
-        assert world.switches[switch]._policy.revoked.has(fingerprint, world.owner.key.public.compressed)
+        assert world.switches[switch].state.policy.revoked.has(fingerprint, world.owner.key.public.compressed)
     flow.outlive(negative=True)
 
 
 def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: Path) -> None:
     world, flow = with_thief()
     switch = world.switches["nuc1"]
-    upkeep = RevocationUpkeep(tmp_path, switch._policy.revoked)
+    upkeep = RevocationUpkeep(tmp_path, switch.state.policy.revoked)
     upkeep.restore(world.network.now)
     upkeep.start()
     member = world.identities[ROBOT].member
@@ -121,7 +121,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
         world.network.stop(node)
     world.network.run(2)
     restarted = world.restart_switch("nuc1")  # neither neighbour comes back: no node can inform it
-    again = RevocationUpkeep(tmp_path, restarted._policy.revoked)
+    again = RevocationUpkeep(tmp_path, restarted.state.policy.revoked)
     again.restore(world.network.now)
     again.close()
     world.network.run(5)
@@ -160,13 +160,13 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
     looks = [0]
     switch = world.switches["nuc1"]
     for what in ("verify", "recheck"):
-        before = getattr(switch._verifier, what)
+        before = getattr(switch.state.verifier, what)
 
         def counted(*given: object, before: Callable[..., object] = before) -> object:
             looks[0] += 1
             return before(*given)
 
-        monkeypatch.setattr(switch._verifier, what, counted)
+        monkeypatch.setattr(switch.state.verifier, what, counted)
     now = world.network.now
     neighbour = next(
         each for each in switch.hello_protocol.neighbours.all_up() if each.name == world.members[THIEF].name
@@ -177,12 +177,12 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
     begun_s = time.process_time()
     for statement in junk:
         with pytest.raises(Exception, match=r"unconcerned|quota"):
-            switch._revoker.receive_revocation(statement, neighbour, now)
+            switch._revoker.receive_revocation(neighbour, statement, now)
     spent_s = time.process_time() - begun_s
     assert (looks, verified) == ([0], [0])
     assert spent_s / len(junk) < 0.005  # not a benchmark: it was 46.6 ms
     wire = world.owner.revoke(flow.topic.delegation.subject, b"x" * 32, until(world))
-    switch._revoker.receive_revocation(parse(wire), neighbour, now)  # an owner's, for another object
+    switch._revoker.receive_revocation(neighbour, parse(wire), now)  # an owner's, for another object
     assert looks == [0]
     flow.outlive()
 
@@ -197,13 +197,13 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
     assert world.network.run(5, lambda: flow.is_read_by(9))
     switch = world.switches["nuc1"]
     seen: list[Name] = []
-    before = switch._verifier.recheck
+    before = switch.state.verifier.recheck
 
     def recheck(advertisement: Advertisement, unix_s: float) -> None:
         seen.append(advertisement.node)
         before(advertisement, unix_s)
 
-    monkeypatch.setattr(switch._verifier, "recheck", recheck)
+    monkeypatch.setattr(switch.state.verifier, "recheck", recheck)
     reader = world.members["nuc1/reader3"]
     delegation = reader.subscribed()[0].delegation
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
@@ -333,7 +333,7 @@ def test_a_reader_of_a_topic_whose_switch_restarted_is_refused_by_what_its_rib_k
     world.network.run(3)
     world.restart_switch("nuc5")
     world.network.run(10)
-    assert world.switches["nuc5"].multicast.readers(flow.topic.name) == []
+    assert not world.switches["nuc5"].state.readers.of(flow.topic.name)
     flow.outlive(negative=True)
 
 

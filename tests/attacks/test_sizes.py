@@ -157,7 +157,7 @@ def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quaran
     robot = world.identities[ROBOT]
     wire = sign(StatementType.ADVERTISE, {}, robot.name, robot.key)
     with monkeypatch.context() as patch:
-        patch.setattr(nuc1._advertisements, "receive_advertisement", broken)
+        patch.setitem(nuc1._handlers, Kind.ADVERTISE, broken)
         for number in range(6):
             say(world, Kind.ADVERTISE, wire, (1 << 40) + number)
     assert nuc1.drops()[DropReason.INTERNAL] == 3

@@ -245,8 +245,9 @@ class Stage:
         """Return whether a node accepts a persona: its domain is trusted there, and it is not revoked."""
         domain = self.identity(persona).root.domain
         machine = self.machines().get(place.node)
-        holder = machine if isinstance(machine, SwitchCore) or machine is None else machine.attachment
-        policy: Policy | None = None if holder is None else holder._policy
+        policy: Policy | None = None
+        if machine is not None:
+            policy = machine.state.policy if isinstance(machine, SwitchCore) else machine.attachment._policy
         is_revoked = persona.node == "nuc2/outcast"
         return policy is not None and policy.trusts(domain) and not is_revoked
 

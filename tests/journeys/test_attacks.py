@@ -305,12 +305,12 @@ def test_a_join_without_evidence_installs_nothing() -> None:
     secret = Name(b"t" * 32)
     session, neighbour = nuc1.hello_protocol.ports[0].echo, nuc1.hello_protocol.neighbours.get(0, nuc2.name)
     assert neighbour is not None
-    domains = frozenset(nuc1._policy.transit)
+    domains = frozenset(nuc1.state.policy.transit)
     join = Join(
         topic=secret,
         publisher=world.members[ROBOT].name,
         switch=nuc1.name,
-        domain=nuc1._policy.own,
+        domain=nuc1.state.policy.own,
         allowed=domains,
         mtu=1_500,
         lease_s=5.0,
@@ -334,12 +334,12 @@ def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
     secret, session = Name(b"t" * 32), nuc1.hello_protocol.ports[0].echo
     neighbour = nuc1.hello_protocol.neighbours.get(0, nuc2.name)
     assert neighbour is not None
-    domains = frozenset(nuc1._policy.transit)
+    domains = frozenset(nuc1.state.policy.transit)
     join = Join(
         topic=secret,
         publisher=world.members[ROBOT].name,
         switch=nuc1.name,
-        domain=nuc1._policy.own,
+        domain=nuc1.state.policy.own,
         allowed=domains,
         mtu=1_500,
         lease_s=5.0,

@@ -14,7 +14,7 @@ def lines(policy: Policy) -> list[AuditLine]:
 
 def audited() -> tuple[Flow, list[Policy], list[Policy]]:
     world = ring()
-    switches = [each._policy for each in world.switches.values()]
+    switches = [each.state.policy for each in world.switches.values()]
     ribs = [each.rib._policy for each in world.ribs.values()]
     for policy in (*switches, *ribs):
         policy.audit.begin()

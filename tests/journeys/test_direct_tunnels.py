@@ -56,7 +56,7 @@ class Internet:
         candidates = (Candidate(0, CandidateType.REFLEXIVE, Endpoint(address, 51_820)),)
         keys = (TunnelKey.derive(identity.kem).public,)
         until_unix_s = int(self.network.now.unix_s) + 86_400
-        self.switches[of].publish_endpoints(
+        self.switches[of].tunnels.publish_endpoints(
             EndpointRecord.make(identity, keys, candidates, sequence=self.sequences[of], until_unix_s=until_unix_s)
         )
         self.network.send_pending(of)
@@ -69,7 +69,7 @@ class Internet:
 
     def _poll(self, of: str) -> None:
         now = self.network.now
-        self.actions[of] += [(now.mono_s, each) for each in self.switches[of].poll_tunnel_actions(now)]
+        self.actions[of] += [(now.mono_s, each) for each in self.switches[of].tunnels.poll_actions(now)]
         self.network.send_pending(of)
         self.network.call(POLL_S, partial(self._poll, of))
 
@@ -91,7 +91,7 @@ class Internet:
         """Join the switches behind NATs by a direct tunnel."""
         link = self.network.connect("home", "cloud", SimLink(0.005), cost=5)
         for at, peer in (("home", "cloud"), ("cloud", "home")):
-            self.switches[at].set_tunnel_port(max(self.switches[at].hello_protocol.ports), self.name(peer))
+            self.switches[at].tunnels.set_direct_port(max(self.switches[at].hello_protocol.ports), self.name(peer))
         return link
 
 

@@ -45,7 +45,7 @@ def diamond(seed: int = 1, left_s: float = 0.01, right_s: float = 0.01) -> Simul
 def next_hop(world: Simulation) -> str:
     """Return the switch through which s1 reaches s4."""
     s1, s4 = world.switches["s1"], world.switches["s4"]
-    path = s1._paths.to_switch(s4.name, s1._policy.own, frozenset((s1._policy.own,)))
+    path = s1.paths.to_switch(s4.name, s1.state.policy.own, frozenset((s1.state.policy.own,)))
     assert path is not None
     return next(label for label, each in world.switches.items() if each.name == path.first)
 

@@ -144,12 +144,12 @@ def test_a_link_that_flaps_is_left_out_until_it_stays() -> None:
     world.network.run(1.0)
     a, b = world.switches["a"], world.switches["b"]
     assert neighbours(world, "a") == {"b", "c"}
-    allowed = frozenset({a._identity.member.domain})
-    way = a._paths.to_switch(b.name, a._identity.member.domain, allowed)
+    allowed = frozenset({a.state.identity.member.domain})
+    way = a.paths.to_switch(b.name, a.state.identity.member.domain, allowed)
     assert way is not None
     assert way.first == world.switches["c"].name
     world.network.run(12.0)
-    way = a._paths.to_switch(b.name, a._identity.member.domain, allowed)
+    way = a.paths.to_switch(b.name, a.state.identity.member.domain, allowed)
     assert way is not None
     assert way.first == b.name
     stays(world, lambda: neighbours(world, "a") == {"b", "c"})

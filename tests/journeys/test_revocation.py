@@ -37,7 +37,7 @@ def three_tiers() -> Simulation:
 
 def keeps(world: Simulation, fingerprint: bytes, key: bytes) -> set[str]:
     """Return the nodes that store a revocation: switches by name, RIBs by domain in capitals, members."""
-    who = {node for node, switch in world.switches.items() if switch._policy.revoked.has(fingerprint, key)}
+    who = {node for node, switch in world.switches.items() if switch.state.policy.revoked.has(fingerprint, key)}
     who |= {label.upper() for label, host in world.ribs.items() if host.rib._policy.revoked.has(fingerprint, key)}
     members = world.members.items()
     return who | {label for label, each in members if each.attachment._policy.revoked.has(fingerprint, key)}

@@ -42,7 +42,7 @@ def renew_all(world: Simulation, lasts_s: int) -> None:
 
 
 def policies(world: Simulation) -> list[Policy]:
-    switches = [each._policy for each in world.switches.values()]
+    switches = [each.state.policy for each in world.switches.values()]
     ribs = [each.attachment._policy for each in world.ribs.values()]
     return [*switches, *ribs, *(each.attachment._policy for each in world.members.values())]
 

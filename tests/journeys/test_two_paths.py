@@ -301,7 +301,7 @@ def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
     now = at.world.network.now
     check: Callable[[], object] = partial(middle.multicast.join, join, neighbour, now.mono_s)
     if wrong == "one path asked":
-        check = partial(middle._evidence.of_join, join, now)
+        check = partial(middle.state.evidence.of_join, join, now)
     with pytest.raises(StatementError):
         check()
 

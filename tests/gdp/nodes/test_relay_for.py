@@ -58,7 +58,7 @@ def test_a_border_takes_the_records_of_the_members_that_it_serves(
 ) -> None:
     labels = {each.name: each.member.label for each in (HOME, LEAF)}
     with links(tmp_path, *relay_for) as (_, switch):
-        assert {labels[name] for name in switch._tunnel_peers} == served
+        assert {labels[name] for name in switch.tunnels._configured} == served
 
 
 def test_a_member_that_is_not_served_gets_no_direct_tunnel_either(tmp_path: Path) -> None:

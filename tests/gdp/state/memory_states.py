@@ -38,7 +38,7 @@ def plane_of(world: Simulation, node: str) -> Plane:
 def switch_state(world: Simulation, label: str, *, begun_s: float | None = None) -> SwitchState:
     """Return the state of a switch; ``begun_s``: monotonic second of its start, by default now."""
     switch, begun_s = world.switches[label], world.network.now.mono_s if begun_s is None else begun_s
-    return SwitchState(world.identities[label], switch._policy, plane_of(world, label), switch, begun_s)
+    return SwitchState(world.identities[label], switch.state.policy, plane_of(world, label), switch, begun_s)
 
 
 def rib_state(world: Simulation, label: str) -> RibState:

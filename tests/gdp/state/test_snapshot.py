@@ -71,7 +71,7 @@ def test_a_topology_shows_both_ends_of_every_link_of_the_domain() -> None:
     rows = topology_snapshot(switch)["switches"]
     assert isinstance(rows, list)
     assert {row[0] for row in rows} == {
-        short_id(each.origin) for scope in Scope for each in switch.known_link_states(scope)
+        short_id(each.origin) for scope in Scope for each in switch.paths.link_states.states(scope)
     }
     assert all(len(link) == 3 for _, _, links in rows for link in links)
     flow.outlive()

@@ -119,14 +119,14 @@ def test_neighbours_that_missed_a_flood_catch_up_by_their_digests() -> None:
 def test_a_port_with_several_switches_shows_what_all_of_them_should_have() -> None:
     world = ring()
     world.network.run(1)
-    flooding = world.switches["nuc1"]._flooding
+    nuc1, link_states = world.switches["nuc1"], world.switches["nuc1"].paths.link_states
     (port,) = (
         port
-        for port in flooding._hello_protocol.ports.values()
+        for port in nuc1.hello_protocol.ports.values()
         if any(each.name == world.identities["nuc2"].name for each in port.neighbours.values())
     )
     (inside,) = port.neighbours.values()
     port.neighbours[ZERO] = replace(inside, name=ZERO)
-    assert flooding.digest_for(port) == flooding.link_states.digest(inside.domain) != bytes(DIGEST_BYTES)
+    assert link_states.digest_for(port) == link_states.digest(inside.domain) != bytes(DIGEST_BYTES)
     port.neighbours[ZERO] = replace(inside, name=ZERO, domain=ZERO)
-    assert flooding.digest_for(port) == bytes(DIGEST_BYTES)
+    assert link_states.digest_for(port) == bytes(DIGEST_BYTES)

@@ -130,7 +130,7 @@ def test_borders_are_those_of_our_domain_with_links_that_leave_it() -> None:
 def test_paths_follow_the_link_states() -> None:
     found = paths("a", state("a", link("b")), state("b", link("a")))
     assert found.to_switch(name("b"), HOME, ALL) is not None
-    found._link_states.put(state("b", sequence=2), b"", 0.0)
+    found.link_states.put(state("b", sequence=2), b"", 0.0)
     assert found.to_switch(name("b"), HOME, ALL) is None
     assert found.is_switch(name("b"))
 

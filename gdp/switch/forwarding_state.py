@@ -1,0 +1,81 @@
+"""Forwarding state of a switch: the objects that its parts share.
+
+Sans-I/O. ``core.py`` builds it once and hands it to every part. A part that handles a statement changes it and sends by
+its outbox.
+"""
+
+from __future__ import annotations
+
+from gdp.control.neighbour_table import NeighbourTable
+from gdp.crypto.identity import Identity
+from gdp.crypto.schema import Body
+from gdp.switch.attached_readers import AttachedReaders
+from gdp.switch.dependents import Dependents
+from gdp.switch.evidence import Evidence
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.outbox import Outbox
+from gdp.switch.paths import Paths
+from gdp.switch.table import Table
+from gdp.switch.trees import Trees
+from gdp.trust.domain import Policy
+from gdp.trust.verifier import AdvertisementVerifier
+
+__all__ = ["ForwardingState"]
+
+
+class ForwardingState:
+    """State of one switch that its parts share.
+
+    Args:
+        lease_s: seconds for which the RIB keeps a watch.
+
+    Attributes:
+        me: name of this switch.
+        table: entries of the data plane.
+        paths: to the switches and RIBs that link states name.
+        neighbours: of all ports.
+        outbox: frames to send.
+        resolver: names, with the cache of their locations.
+        attached: advertisements of attached nodes that others must find.
+        readers: attached nodes that read topics.
+        trees: multicast trees that pass here.
+        dependents: which certificates ``attached``, ``readers``, ``trees`` and known locations depend on.
+        verifier: of advertisements; shared, so that a known one is cheap.
+        evidence: verifies locations.
+    """
+
+    __slots__ = (
+        "attached", "dependents", "evidence", "identity", "me", "neighbours", "outbox", "paths", "policy",
+        "readers", "resolver", "table", "trees", "verifier",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        identity: Identity,
+        policy: Policy,
+        *,
+        table: Table,
+        paths: Paths,
+        neighbours: NeighbourTable,
+        outbox: Outbox,
+        lease_s: float,
+    ) -> None:
+        self.identity = identity
+        self.me = identity.name
+        self.policy = policy
+        self.table = table
+        self.paths = paths
+        self.neighbours = neighbours
+        self.outbox = outbox
+        self.resolver = NameResolver(identity.name, lease_s)
+        self.attached = LocalAdvertisements()
+        self.readers = AttachedReaders()
+        self.trees = Trees()
+        self.dependents = Dependents(self.attached, self.resolver.cache, self.readers, self.trees)
+        self.verifier = AdvertisementVerifier(policy)
+        self.evidence = Evidence(policy, self.verifier)
+
+    def signed_wire(self, body: Body) -> bytes:
+        """Return a statement of this switch, with its membership."""
+        return body.to_wire(self.identity.name, self.identity.key, self.identity.membership)

@@ -1,0 +1,79 @@
+"""Joins from downstream: a switch verifies each before its trees follow it.
+
+Sans-I/O. A join carries the advertisements of a reader and of the publisher (``evidence.py``). A refresh renews joins
+by number, and its reply names the joins that the neighbour does not know (``joins.py``).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.control.join import Join
+from gdp.control.join_refresh import JoinRefresh
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.certificates import Role
+from gdp.crypto.statements import Statement, StatementType
+from gdp.errors import DropReason, StatementError
+from gdp.limits import JOINS_BURST, JOINS_PER_S
+from gdp.sansio import Timestamps
+from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.relocation import Relocations
+from gdp.token_bucket import TokenBuckets
+
+__all__ = ["JoinHandler"]
+
+_REFRESH_TOKENS: Final = 4.0  # of joins: it renews up to 128 of them, and may cost a reply
+
+
+class JoinHandler:
+    """Handles the joins, leaves and refreshes of neighbouring switches; one that is not valid raises an error."""
+
+    def __init__(self, state: ForwardingState, multicast: MulticastTrees, relocations: Relocations) -> None:
+        self._state = state
+        self._multicast = multicast
+        self._relocations = relocations
+        self._paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)
+
+    def handle_join(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Handle a join, or a leave, which has no lease.
+
+        Raises:
+            StatementError: it is not valid, not from a neighbouring switch, or one too many.
+        """
+        join = Join.from_fields(statement.expect(StatementType.JOIN))
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a join is from a neighbouring switch")
+        self._check(neighbour, statement, now.mono_s, 1.0)
+        self._state.neighbours.ports[neighbour.port].receive_join(join, neighbour)
+        if join.lease_s > 0:
+            advertisement = self._state.evidence.of_join(join, now)
+            if neighbour.role is Role.LEAF and advertisement.switch != neighbour.name:
+                raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
+            at = (neighbour.port, neighbour.mac)
+            self._state.dependents.note_branch(join.topic, join.publisher, at, advertisement)
+        if self._multicast.join(join, neighbour, now.mono_s):
+            self._relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
+
+    def handle_refresh(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Handle a refresh of joins, or the reply to one.
+
+        Raises:
+            StatementError: as ``handle_join``.
+        """
+        is_reply = statement.type is StatementType.JOIN_UNKNOWN
+        expected = StatementType.JOIN_UNKNOWN if is_reply else StatementType.JOIN_REFRESH
+        refresh = JoinRefresh.from_fields(statement.expect(expected), is_reply=is_reply)
+        if statement.signer != neighbour.name or not (is_reply or neighbour.role.is_switch):
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
+        self._check(neighbour, statement, now.mono_s, _REFRESH_TOKENS)
+        self._state.neighbours.ports[neighbour.port].receive_join(refresh, neighbour)
+        if is_reply:
+            self._multicast.join_unknown(refresh, neighbour, now.mono_s)
+        else:
+            self._multicast.refresh(refresh, neighbour, now.mono_s)
+
+    def _check(self, neighbour: Neighbour, statement: Statement, now_s: float, tokens: float) -> None:
+        if not self._paces.spend(neighbour.name, now_s, tokens):
+            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
+        statement.verify(neighbour.key)
