@@ -6,6 +6,7 @@ Sans-I/O. Leases, other RIBs of the domain (``replication.py``) or a snapshot re
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Collection, Iterator
 from typing import Protocol
 
@@ -75,7 +76,7 @@ class MemoryStore:
     def __init__(self) -> None:
         self._routes: dict[Name, dict[Name, Route]] = {}
         self._withdrawn: dict[tuple[Name, Name], Withdrawn] = {}
-        self._counts: dict[Name, int] = {}
+        self._counts = Counter[Name]()
         self._ends: list[tuple[float, Name, Name]] = []
         self._forget: list[tuple[int, Name, Name]] = []
         self._size = 0
@@ -118,7 +119,7 @@ class MemoryStore:
             self.digests.put(route.name + route.advertiser, route.rank)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._evidence.put((route.name, route.advertiser), route.fingerprints | route.issuers)
-        self._count(route.sender, route.advertiser)
+        self._counts.update((route.sender, route.advertiser))
         self._size += 1
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
@@ -133,7 +134,7 @@ class MemoryStore:
             self.changes.add((name, advertiser))
         self._forget_withdrawn(name, advertiser)
         self._withdrawn[name, advertiser] = withdrawn
-        self._count(withdrawn.sender, advertiser)
+        self._counts.update((withdrawn.sender, advertiser))
         heapq.heappush(self._forget, (withdrawn.valid_until_unix_s, name, advertiser))
         if withdrawn.proof:
             self.digests.put(name + advertiser, withdrawn.rank)
@@ -163,7 +164,7 @@ class MemoryStore:
 
     def count_of(self, owner: Name) -> int:
         """Return how many routes are stored that a sender relayed, or a node advertises."""
-        return self._counts.get(owner, 0)
+        return self._counts[owner]
 
     def resting_on(self, mark: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate, by its fingerprint, or one that a key issued."""
@@ -192,14 +193,8 @@ class MemoryStore:
             self._uncount(withdrawn.sender, advertiser)
             self.digests.remove(name + advertiser)
 
-    def _count(self, *owners: Name) -> None:
-        for owner in owners:
-            self._counts[owner] = self._counts.get(owner, 0) + 1
-
     def _uncount(self, *owners: Name) -> None:
         for owner in owners:
-            left = self._counts[owner] - 1
-            if left:
-                self._counts[owner] = left
-            else:
+            self._counts[owner] -= 1
+            if not self._counts[owner]:
                 del self._counts[owner]
