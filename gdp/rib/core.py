@@ -7,7 +7,7 @@ Sans-I/O; it takes statements and returns statements to send, each for a name. T
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
@@ -23,13 +23,12 @@ from gdp.names import Name
 from gdp.rib.advertisements import forward_due, receive_ack, receive_advertisement, receive_presence, receive_withdrawal
 from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.queries import handle_query_timer, keep_of_silent_rib, receive_query, receive_response
-from gdp.rib.replication import begin_replication, poll_replication, receive_entry, receive_sync
+from gdp.rib.replication import poll_replication, receive_entry, receive_sync
 from gdp.rib.revocations import receive_revocation
 from gdp.rib.route import Route
 from gdp.rib.state import RibCoreState, RibSettings
 from gdp.rib.store import Store
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import Advertisement
 from gdp.trust.domain import Policy
 
 __all__ = ["RibCore"]
@@ -104,9 +103,12 @@ class RibCore:
         return self.names - before
 
     def connected(self, now: Timestamps) -> None:
-        """Record that statements arrive from now on: there is a switch."""
-        self.state.now_s = now.mono_s
-        begin_replication(self.state, now.mono_s)
+        """Begin to replicate: there is a switch, and messages reach the peers from now on."""
+        state = self.state
+        state.now_s = now.mono_s
+        if state.started_s is None:
+            state.started_s = now.mono_s
+        state.exchange.announce(now.mono_s)
 
     def handle_timer(self, now: Timestamps) -> None:
         """Expire routes and notify their watchers; repeat open queries upstream."""
@@ -135,19 +137,6 @@ class RibCore:
         state = self.state
         letters = state.outbox.poll_statements() + poll_replication(state)
         return letters + state.endpoints.poll_statements()
-
-    def routes_of(self, name: Name, now: Timestamps) -> list[tuple[Route, Advertisement]]:
-        """Return the routes of a name with their advertisements, each verified; invalid ones by now are left out.
-
-        Raises:
-            StoreError: the store does not answer.
-        """
-        self.state.store.prefetch([name], now)
-        found = list[tuple[Route, Advertisement]]()
-        for route in self.state.store.routes(name):
-            with suppress(StatementError):
-                found.append((route, self.state.verifier.verify_statement(parse(route.advertisement), now.unix_s)))
-        return found
 
     def waits(self, now_s: float) -> list[Wait]:
         """Return what this RIB waits for."""
@@ -179,9 +168,8 @@ def _receive_relay(state: RibCoreState, statement: Statement, now: Timestamps) -
     handle(state, inner, relayed, member, now)
 
 
-_Handler = Callable[[RibCoreState, Statement, Timestamps], None]
 _RelayHandler = Callable[[RibCoreState, Statement, RelayedStatement, Membership, Timestamps], None]
-_HANDLERS: Final[Mapping[StatementType, _Handler]] = {
+_HANDLERS: Final[Mapping[StatementType, Callable[[RibCoreState, Statement, Timestamps], None]]] = {
     StatementType.RELAY: _receive_relay,
     StatementType.QUERY: receive_query,
     StatementType.ANSWER: receive_response,

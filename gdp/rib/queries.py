@@ -43,7 +43,8 @@ def receive_query(state: RibCoreState, statement: Statement, now: Timestamps) ->
     if query.name == state.identity.name:
         state.outbox.send_none(query.name, member.name)  # a probe for a sign of life
         return
-    asker, name = Asker.of(member), query.name
+    asker = Asker.of(member)
+    name = query.name
     routes = [route for route in state.store.routes(name) if state.outbox.may_receive(route, asker)]
     cost = _QUESTION_BYTES + sum(len(route.advertisement) + _ANSWER_BYTES for route in routes)
     if not state.answer_paces.spend(member.name, now.mono_s, cost):
@@ -56,7 +57,8 @@ def receive_query(state: RibCoreState, statement: Statement, now: Timestamps) ->
     send_lacked(state, query, member.name, now.mono_s)
     for route in routes:
         state.outbox.send_route(route, asker, now.mono_s)
-    queries, is_below = state.upstream_queries, not state.upstream.has(member.name)
+    queries = state.upstream_queries
+    is_below = not state.upstream.has(member.name)
     if is_below and queries.request(name, asker, query.watch_s, now.mono_s, is_known=bool(routes)):
         _query_upper(state, name, queries.watch_s(name), now.mono_s)
     elif not routes and not queries.is_waiting(name):

@@ -23,16 +23,9 @@ from gdp.sansio import Timestamps
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.withdrawal import Withdrawal
 
-__all__ = ["begin_replication", "is_cold", "poll_replication", "receive_entry", "receive_sync"]
+__all__ = ["is_cold", "poll_replication", "receive_entry", "receive_sync"]
 
 COLD_S: Final = 3.0  # a RIB that just started denies no name before it compared with a peer, for so long at most
-
-
-def begin_replication(state: RibCoreState, now_s: float) -> None:
-    """Begin: messages reach the peers from now on."""
-    if state.started_s is None:
-        state.started_s = now_s
-    state.exchange.announce(now_s)
 
 
 def is_cold(state: RibCoreState, now_s: float) -> bool:
@@ -117,8 +110,9 @@ def _is_newer(advertisement: Advertisement, known: Route | Withdrawn, expires_s:
     """Return whether a peer's advertisement replaces the known one: a higher sequence, or the same for longer."""
     if advertisement.sequence != known.sequence:
         return advertisement.sequence > known.sequence
-    is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
-    return is_same and isinstance(known, Route) and (known.is_from_upstream or expires_s > known.expires_s)
+    if not isinstance(known, Route) or known.advertisement != advertisement.wire:
+        return False
+    return known.is_from_upstream or expires_s > known.expires_s
 
 
 def _receive_withdrawn(state: RibCoreState, entry: Entry, statement: Statement, now: Timestamps) -> None:
