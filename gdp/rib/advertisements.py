@@ -18,7 +18,8 @@ from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.rib.revocations import send_revoking
 from gdp.rib.route import Route, Withdrawn
-from gdp.rib.state import RibCoreState
+from gdp.rib.state import ROUTES, RibCoreState
+from gdp.rib.store import check_quota
 from gdp.rib.upstream_advertisements import Passed
 from gdp.rib.watches import Asker
 from gdp.sansio import Timestamps
@@ -48,9 +49,10 @@ def receive_advertisement(
     if not isinstance(known, Route):
         who, about = route.advertiser.to_text(), route.name.to_text()
         state.policy.audit.record(Action.ACCEPTED, "name", who=who, about=about)
-    state.outbox.send_ack(route.key, None, route.sequence, member.name)
+    key = route.key
+    state.outbox.send_ack(key, None, route.sequence, member.name)
     state.outbox.notify(route, known, now.mono_s)
-    state.push_route(route.key)
+    state.exchange.push(ROUTES, b"".join(key))
     if route.is_global and not state.upstream.has(member.name):
         _forward(state, route, statement, route.sequence, now.mono_s)
 
@@ -71,7 +73,7 @@ def receive_withdrawal(
     state.former.note_gone(known, is_lapsed=False)
     state.outbox.send_ack(key, None, sequence, member.name)
     state.outbox.notify_gone(known, now.mono_s, by=member.name)
-    state.push_route(key)
+    state.exchange.push(ROUTES, b"".join(key))
     if known.is_global and not state.upstream.has(member.name):
         _forward(state, known, statement, sequence, now.mono_s)
 
@@ -138,13 +140,12 @@ def _check_identity(state: RibCoreState, advertisement: Advertisement, now: Time
     if not isinstance(held, Route) or held.switch == advertisement.switch:
         return
     older = UnverifiedAdvertisement.from_statement(parse(held.advertisement)).incarnation
-    if older == advertisement.incarnation or state.identities.is_free(
-        advertisement.node, older, held.switch, now.mono_s
-    ):
+    node = advertisement.node
+    if older == advertisement.incarnation or state.identities.is_free(node, older, held.switch, now.mono_s):
         return
     number = int(now.unix_s * 1_000)
-    if state.identities.must_ask(advertisement.node, older, held.switch, number, now.mono_s):
-        question = Presence(node=advertisement.node, incarnation=older, other=advertisement.switch, question=number)
+    if state.identities.must_ask(node, older, held.switch, number, now.mono_s):
+        question = Presence(node=node, incarnation=older, other=advertisement.switch, question=number)
         state.outbox.send_body(Kind.RIB_ANSWER, question, held.switch)
     raise StatementError(DropReason.IN_USE, "another node with this identity")
 
@@ -163,7 +164,7 @@ def _check_news(state: RibCoreState, advertisement: Advertisement, member: Membe
         if not isinstance(known, Route) or (known.advertisement, known.via) != repeated:
             raise StatementError(DropReason.STALE, str(known.sequence))
     if known is None or known.sender != member.name:
-        state.check_names_quota(member.name, advertisement.node)
+        check_quota(state.store, state.settings.names_per_sender, member.name, advertisement.node)
     return known
 
 

@@ -18,7 +18,7 @@ from gdp.names import Name
 from gdp.rib.replication import is_cold
 from gdp.rib.revocations import send_lacked
 from gdp.rib.route import Route, Withdrawn
-from gdp.rib.state import RibCoreState
+from gdp.rib.state import ROUTES, RibCoreState
 from gdp.rib.upstream_advertisements import PROBE_S
 from gdp.rib.upstream_queries import WATCH_AGAIN_S
 from gdp.rib.watches import Asker
@@ -148,7 +148,7 @@ def _learn(
     )
     state.store.put(route)
     if own is not None:
-        state.push_route(route.key)  # a peer has the old location
+        state.exchange.push(ROUTES, b"".join(route.key))  # a peer has the old location
     state.outbox.notify(
         route, known, now.mono_s, state.upstream_queries.answered(route.name, now.mono_s, response.lease_s)
     )

@@ -19,6 +19,7 @@ from gdp.limits import CLOCK_SKEW_S
 from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState
+from gdp.rib.store import check_quota
 from gdp.sansio import Timestamps
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.withdrawal import Withdrawal
@@ -92,7 +93,7 @@ def receive_entry(state: RibCoreState, entry: Entry, now: Timestamps) -> None:
     if entry.is_from_upstream and (not isinstance(known, Route) or known.is_from_upstream):
         return  # no entry here that it corrects
     if known is None:
-        state.check_names_quota(entry.sender, advertisement.node)
+        check_quota(state.store, state.settings.names_per_sender, entry.sender, advertisement.node)
     route = Route.of(
         advertisement,
         sender=entry.sender,
@@ -129,7 +130,7 @@ def _receive_withdrawn(state: RibCoreState, entry: Entry, statement: Statement, 
     if until_unix_s <= now.unix_s:
         return  # expired here already
     if known is None:
-        state.check_names_quota(entry.sender, statement.signer)
+        check_quota(state.store, state.settings.names_per_sender, entry.sender, statement.signer)
     gone = Withdrawn(entry.sender, sequence, until_unix_s, statement.wire, entry.membership)
     route = state.store.withdraw(name, statement.signer, gone)
     if route is not None:

@@ -98,18 +98,6 @@ class RibCoreState:
         self.refusals: Counter[DropReason] = Counter()
         self.accepted = 0
 
-    def check_names_quota(self, sender: Name, node: Name) -> None:
-        """Return if sender and node may have another name; a node gets at most as many as the sender has left.
-
-        Raises:
-            StatementError: QUOTA.
-        """
-        free = self.settings.names_per_sender - self.store.count_of(sender)
-        if free <= 0:
-            raise StatementError(DropReason.QUOTA, "names of one sender")
-        if self.store.count_of(node) >= free:
-            raise StatementError(DropReason.QUOTA, "names of one node")
-
     def verify_upper(self, statement: Statement, now: Timestamps) -> Membership:
         """Return the signer of a statement from the tier above. Raises ``StatementError``: it is not from there."""
         member = self.policy.verify_sender(statement, now.unix_s)
@@ -127,11 +115,6 @@ class RibCoreState:
                 return False
             self.exchange.add_peer(name, name, now_s)
         return True
-
-    def push_route(self, key: Key) -> None:
-        """Send a route or its withdrawal to the other RIBs of the domain, unless they share the store."""
-        if ROUTES in self.sets:
-            self.exchange.push(ROUTES, b"".join(key))
 
     def entry_of(self, key: Key, now_s: float) -> Entry | None:
         """Return the stored entry of an advertiser of a name, for a peer or a snapshot, or None."""

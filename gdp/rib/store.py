@@ -11,13 +11,14 @@ from collections.abc import Collection, Iterator
 from typing import Protocol
 
 from gdp.control.rib_replication import Key
+from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_set import SyncSet
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
 from gdp.trust.evidence_index import EvidenceIndex
 
-__all__ = ["MemoryStore", "Store"]
+__all__ = ["MemoryStore", "Store", "check_quota"]
 
 
 class Store(Protocol):
@@ -68,6 +69,19 @@ class Store(Protocol):
 
     def has_issuer(self, key: bytes) -> bool:
         """Return whether a route depends on a certificate that this key, 33 bytes, issued."""
+
+
+def check_quota(store: Store, names_max: int, sender: Name, node: Name) -> None:
+    """Return if sender and node may have another name; a node gets at most as many as the sender has left.
+
+    Raises:
+        StatementError: QUOTA.
+    """
+    free = names_max - store.count_of(sender)
+    if free <= 0:
+        raise StatementError(DropReason.QUOTA, "names of one sender")
+    if store.count_of(node) >= free:
+        raise StatementError(DropReason.QUOTA, "names of one node")
 
 
 class MemoryStore:

@@ -65,10 +65,11 @@ class UpstreamAdvertisements:
 
     def put(self, passed: Passed, now_s: float) -> None:
         """Send an advertisement upstream until it is acknowledged; it replaces the same advertiser's pending one."""
-        if passed.route.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
+        key = passed.route.key
+        if key not in self._waiting and len(self._waiting) >= WAITING_MAX:
             self.remove(next(iter(self._waiting)))
-        self._waiting[passed.route.key] = passed
-        self._requests.start(passed.route.key, now_s)
+        self._waiting[key] = passed
+        self._requests.start(key, now_s)
 
     def handle_ack(self, key: Key, sequence: int) -> None:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
