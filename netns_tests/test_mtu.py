@@ -34,7 +34,8 @@ from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import ProtocolCore

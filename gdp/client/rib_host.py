@@ -57,7 +57,7 @@ class RibHost:
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
         own = self._drops + self._reassembler.drops + self._channels.drops + self.diagnostics.drops
-        return own + self.attachment.drops + self.rib.refusals
+        return own + self.attachment.drops + self.rib.state.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to discover a switch on a port."""

@@ -148,8 +148,8 @@ class AntiEntropy(Generic[P]):
         self._out = [each for each in self._out if each[0] != peer]
 
     def push(self, of: bytes, key: bytes) -> None:
-        """Send an item to all peers at once, and unasked."""
-        if self._peers:
+        """Send an item to all peers at once, and unasked, if its set is among those that are exchanged."""
+        if self._peers and of in self._sets:
             self._news[of, key] = None
 
     def announce(self, now_s: float) -> None:

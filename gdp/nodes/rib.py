@@ -22,7 +22,8 @@ from gdp.nodes.node import Node, common_handlers, common_sources
 from gdp.nodes.node_log import OnWait
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import Store
 from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.state.member_tables import rib_tables
@@ -125,11 +126,11 @@ def rib_sources(state: RibState) -> Sources:
         frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "punted": counters.punted},
         table_entries=lambda: rib.names,
         rib_answers=lambda: {
-            "found": rib.answers,
-            "negative": rib.negative_answers,
-            "unknown": rib.unknown_answers,
-            "accepted": rib.accepted,
+            "found": rib.state.outbox.answers,
+            "negative": rib.state.outbox.negative_answers,
+            "unknown": rib.state.outbox.unknown_answers,
+            "accepted": rib.state.accepted,
         },
-        rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
-        clashes=lambda: rib.identities.clashes + state.hello_protocol.conflicts.clashes,
+        rib_refusals=lambda: {reason.label: count for reason, count in list(rib.state.refusals.items())},
+        clashes=lambda: rib.state.identities.clashes + state.hello_protocol.conflicts.clashes,
     )

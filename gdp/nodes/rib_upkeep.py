@@ -63,9 +63,8 @@ class MemoryUpkeep(Upkeep):
         if self._snapshot is None:
             return
         live = sum(rib.load(entries, now) for entries in self._snapshot.load(now.unix_s))
-        log.info(
-            "snapshot read live=%d unreadable=%d refused=%d", live, self._snapshot.unreadable, rib.refusals.total()
-        )
+        refused = rib.state.refusals.total()
+        log.info("snapshot read live=%d unreadable=%d refused=%d", live, self._snapshot.unreadable, refused)
         self._memory.changes = set()
         self._snapshot.start()
 
@@ -81,7 +80,7 @@ class MemoryUpkeep(Upkeep):
             return
         keys = list(islice(changes, SLICE))
         changes.difference_update(keys)
-        snapshot.write([(key, rib.entry_of(key, now.mono_s)) for key in keys], now.unix_s)
+        snapshot.write([(key, rib.state.entry_of(key, now.mono_s)) for key in keys], now.unix_s)
 
     def close(self) -> None:
         """Write the changes that wait in the snapshot's queue."""

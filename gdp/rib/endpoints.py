@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of, record_in
@@ -36,6 +36,7 @@ from gdp.limits import (
 )
 from gdp.names import NAME_BYTES, Name
 from gdp.requests import Backoff, Requests
+from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.watches import Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
@@ -47,12 +48,6 @@ _CHANGES: Final = Backoff(0.3, 0.6)
 _CHANGE_TRIES: Final = 3  # nothing acknowledges a change
 _WATCH_S: Final = 30.0  # a switch that requests a record also gets changes for so long
 _LEASE_LEFT_S: Final = 1.0  # a lease that is about to end is not passed on
-
-
-class _Outgoing(NamedTuple):
-    to: Name
-    kind: Kind
-    wire: bytes
 
 
 @dataclass(slots=True)
@@ -92,15 +87,10 @@ class RibEndpoints:
         self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
         self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
         self._changes = Requests[Name]()  # for watchers, by switch
-        self._out: list[_Outgoing] = []
+        self._out: list[OutgoingStatement] = []
 
     def __len__(self) -> int:
         return len(self._kept)
-
-    def get(self, name: Name) -> EndpointRecord | None:
-        """Return the record of a switch, or None."""
-        kept = self._kept.get(name)
-        return None if kept is None else kept.record
 
     def item_of(self, name: Name, now_s: float) -> bytes | None:
         """Return the item of a kept record, or None."""
@@ -193,7 +183,7 @@ class RibEndpoints:
             raise StatementError(DropReason.MALFORMED, "a switch's query for endpoints")
         if not self._query_paces.spend(member.name, now.mono_s):
             raise StatementError(DropReason.QUOTA, "queries for endpoints")
-        asker = Asker(member.name, member.domain, False)
+        asker = Asker.of(member)
         lacked: list[bytes] = []
         refused: StatementError | None = None
         for prefix, line in query.lacking:
@@ -233,8 +223,8 @@ class RibEndpoints:
         times = [self._changes.next_due(), self._ends.next_due()]
         return min((each for each in times if each is not None), default=None)
 
-    def poll_statements(self) -> list[_Outgoing]:
-        """Return, once, the statements to send: receiver, kind and wire form."""
+    def poll_statements(self) -> list[OutgoingStatement]:
+        """Return, once, the statements to send."""
         out, self._out = self._out, []
         return out
 
@@ -267,4 +257,4 @@ class RibEndpoints:
         line = b"" if own is None else line_of(to, own.record.sequence)
         response = SyncMessage(of=ENDPOINTS, items=items, lacking=((to, line),), refused=refused)
         wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._out.append(_Outgoing(to, Kind.RIB_ANSWER, wire))
+        self._out.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire))

@@ -8,85 +8,124 @@ bounded rate, and is not stored.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Final
 
-from gdp.crypto.statements import Statement
-from gdp.errors import StatementError
+from gdp.control.query import Query
+from gdp.control.relayed_statement import RelayedStatement
+from gdp.crypto.statements import Statement, parse
+from gdp.errors import DropReason, StatementError
+from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
-from gdp.rib.store import Store
+from gdp.rib.state import RibCoreState
+from gdp.rib.watches import Asker
 from gdp.sansio import Timestamps
-from gdp.token_bucket import TokenBuckets
+from gdp.trust.adcert import AdCert
+from gdp.trust.advertisement import UnverifiedAdvertisement
+from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
-from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["RibRevocations"]
+__all__ = ["receive_revocation", "send_lacked", "send_revoking"]
 
-_PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # forwarded to the tier above, of one sender
-_SENT_PER_S, _SENT_BURST = 64.0, 2_048.0  # to one asker, of what it lacks
 _SENT_ABOUT_MAX: Final = 1_024  # in one response
+_NAMES_OF_ISSUER_MAX: Final = 256  # names whose watchers receive a revocation by an issuer that is not the names' owner
 
 
-class RibRevocations:
-    """Handles revocations for one RIB.
+def receive_revocation(state: RibCoreState, statement: Statement, origin: Name, now: Timestamps) -> None:
+    """Handle a revocation from a neighbour or a relay: it removes routes, and is sent on."""
+    issued_for = Revocation.read(statement).issuer.name
 
-    Args:
-        is_watched: whether any node watches a name.
-    """
+    def holds(key: bytes) -> bool:
+        is_watched = state.store.has_issuer(key) or state.outbox.watches.watchers(issued_for, now.mono_s)
+        return bool(is_watched or state.store.routes(issued_for))
 
-    def __init__(self, verifier: AdvertisementVerifier, store: Store, is_watched: Callable[[Name], bool]) -> None:
-        self._verifier = verifier
-        self._revoked = verifier.revoked
-        self._store = store
-        self._is_watched = is_watched
-        self._passed = TokenBuckets(_PASSED_PER_S, _PASSED_BURST)
-        self._reported = TokenBuckets(_SENT_PER_S, _SENT_BURST)
+    try:
+        revocation = state.policy.revoked.receive_revocation(statement, origin, now, holds)
+    except StatementError as error:
+        if error.reason is DropReason.UNCONCERNED:
+            _pass_up(state, statement, origin, now)
+        raise
+    if revocation is None:
+        _pass_up(state, statement, origin, now)  # it is repeated for those that lacked it
+        return
+    state.endpoints.recheck(now)
+    who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
+    state.policy.audit.record(Action.REVOKED, "certificate", who=who, about=about)
+    closed = _closed_by(state, revocation, now)
+    # switches flood revocations of roots everywhere
+    if not state.policy.revoked.is_root(revocation.issuer.owner_key):
+        recipients = _affected(state, revocation, closed, now.mono_s)
+        ribs = _upstream_and_peers(state, origin)
+        _send(state, [statement.wire], ribs, Kind.RIB_REQUEST)
+        _send(state, [statement.wire], [each.name for each in recipients if each.name not in (origin, *ribs)])
+    for route in closed:
+        state.store.withdraw(route.name, route.advertiser)
+        state.outbox.notify_gone(route, now.mono_s)
 
-    def receive_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> Revocation | None:
-        """Handle a revocation; return it if it is news.
 
-        Raises:
-            StatementError: it is not valid, concerns nothing here (UNCONCERNED), or exceeds a quota.
-            StoreError: a shared store did not respond.
-        """
-        issued_for = Revocation.read(statement).issuer.name
-        return self._revoked.receive_revocation(
-            statement, origin, now, lambda key: self._store.has_issuer(key) or self._concerns(issued_for)
-        )
+def send_lacked(state: RibCoreState, query: Query, to: Name, now_s: float) -> None:
+    """Send an asker the revocations about a name that it lacks, if it asked for them."""
+    if query.revoked is not None and query.revoked != state.policy.revoked.digest_about(query.name):
+        about = state.policy.revoked.about(query.name)[:_SENT_ABOUT_MAX]
+        _send(state, [wire for wire in about if state.revocation_paces.spend(to, now_s)], [to])
 
-    def closed(self, revocation: Revocation, now: Timestamps) -> list[Route]:
-        """Return the routes that depend on what was revoked, and are no longer valid."""
-        closed = []
-        for route in self._store.resting_on(revocation.fingerprint):
-            try:
-                self._verifier.verify(route.advertisement, now.unix_s)
-            except StatementError:
-                closed.append(route)
-        return closed
 
-    def may_pass_up(self, statement: Statement, sender: Name, now: Timestamps) -> bool:
-        """Return whether a revocation that is not stored here goes on to the tier above.
+def send_revoking(state: RibCoreState, advertisement: Statement, to: Name) -> None:
+    """Send a relay the statements that revoked certificates in an unverified advertisement's evidence."""
+    body = UnverifiedAdvertisement.from_statement(advertisement)
+    issuer_key = body.subject.owner_key
+    found: list[bytes | None] = []
+    for wire in body.chain:
+        link = AdCert.from_statement(parse(wire))
+        keys = dict.fromkeys((body.subject.owner_key, issuer_key))
+        found += [state.policy.revoked.wire(key, link.fingerprint) for key in keys]
+        issuer_key = link.delegate_key
+    _send(state, [wire for wire in found if wire is not None], [to])
 
-        Raises:
-            StatementError: its signature is not valid.
-        """
-        if not self._passed.spend(sender, now.mono_s):
-            return False
+
+def _closed_by(state: RibCoreState, revocation: Revocation, now: Timestamps) -> list[Route]:
+    """Return the routes that depend on what was revoked, and are no longer valid."""
+    closed = []
+    for route in state.store.resting_on(revocation.fingerprint):
+        try:
+            state.verifier.verify(route.advertisement, now.unix_s)
+        except StatementError:
+            closed.append(route)
+    return closed
+
+
+def _affected(state: RibCoreState, revocation: Revocation, closed: list[Route], now_s: float) -> dict[Asker, None]:
+    """Return the nodes that advertised, hold or watch a name that a revocation affects."""
+    recipients: dict[Asker, None] = {}
+    for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
+        recipients |= state.outbox.concerned_by(name, now_s)
+    if not recipients:  # the issuer signs in its own name: an owner's successor, or a delegate
+        others = state.store.resting_on(revocation.issuer.owner_key)
+        for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
+            recipients |= state.outbox.concerned_by(name, now_s)
+    return recipients
+
+
+def _pass_up(state: RibCoreState, statement: Statement, sender: Name, now: Timestamps) -> None:
+    """Forward a revocation that changes nothing here to the tier above, if that is allowed, at a bounded rate."""
+    upper = state.upstream.rib
+    is_root = state.policy.revoked.is_root(Revocation.read(statement).issuer.owner_key)
+    if upper is None or is_root or state.upstream.has(sender) or sender in state.settings.peers:
+        return
+    if state.passed_paces.spend(sender, now.mono_s):
         Revocation.from_statement(statement)
-        return True
+        _send(state, [statement.wire], [upper], Kind.RIB_REQUEST)
 
-    def lacked_by(self, asker: Name, name: Name, digest: bytes, now_s: float) -> list[bytes]:
-        """Return the revocations about a name that an asker lacks, given the digest of what it has."""
-        if digest == self._revoked.digest_about(name):
-            return []
-        wires = self._revoked.about(name)[:_SENT_ABOUT_MAX]
-        return [wire for wire in wires if self._reported.spend(asker, now_s)]
 
-    def behind(self, fingerprints: list[tuple[bytes, bytes]]) -> list[bytes]:
-        """Return the statements that revoked these certificates, each a fingerprint and a key that may revoke it."""
-        found = (self._revoked.wire(key, fingerprint) for fingerprint, key in fingerprints)
-        return [wire for wire in found if wire is not None]
+def _upstream_and_peers(state: RibCoreState, origin: Name) -> list[Name]:
+    """Return the RIBs that receive every revocation: the tier above, and peers."""
+    if state.upstream.has(origin):
+        return list(state.settings.peers)
+    upstream = [] if state.upstream.rib is None else [state.upstream.rib]
+    return upstream if origin in state.settings.peers else [*upstream, *state.settings.peers]
 
-    def _concerns(self, name: Name) -> bool:
-        return self._is_watched(name) or bool(self._store.routes(name))
+
+def _send(state: RibCoreState, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
+    for wire in wires:
+        state.outbox.send_body(kind, RelayedStatement(wire, (), state.identity.membership), *to)

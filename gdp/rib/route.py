@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gdp.limits import CLOCK_SKEW_S
+from gdp.control.rib_replication import Entry, Key
+from gdp.limits import CLOCK_SKEW_S, LEASE_MAX_S
 from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 
@@ -81,6 +82,11 @@ class Route:
         )
 
     @property
+    def key(self) -> Key:
+        """Return the key under which it is stored and replicated."""
+        return self.name, self.advertiser
+
+    @property
     def place(self) -> tuple[Name, Name]:
         """Return what a move changes: switch and domain."""
         return self.switch, self.domain
@@ -89,6 +95,21 @@ class Route:
     def rank(self) -> int:
         """Return a rank that is higher for the newer of two entries: by sequence number, then the withdrawal."""
         return 2 * self.sequence
+
+    def to_entry(self, _own: Name, now_s: float) -> Entry | None:
+        """Return what a peer receives; None: the lease ended."""
+        if self.expires_s <= now_s:
+            return None
+        return Entry(
+            statement=self.advertisement,
+            membership=b"",
+            sender=self.sender,
+            domain=self.domain,
+            via=self.via,
+            transit=self.transit,
+            lease_s=min(self.expires_s - now_s, LEASE_MAX_S),
+            is_from_upstream=self.is_from_upstream,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,3 +133,19 @@ class Withdrawn:
     def rank(self) -> int:
         """Return its rank, as of a route; a lease that ended ranks like the advertisement."""
         return 2 * self.sequence + bool(self.proof)
+
+    def to_entry(self, own: Name, _now_s: float) -> Entry | None:
+        """Return what a peer of domain ``own`` receives; None: a lease that ended."""
+        if not self.proof:
+            return None
+        return Entry(
+            statement=self.proof,
+            membership=self.membership,
+            sender=self.sender,
+            domain=own,
+            via=own,
+            transit=(),
+            lease_s=0.0,
+            is_from_upstream=False,
+            until_unix_s=self.valid_until_unix_s,
+        )

@@ -6,17 +6,19 @@ Sans-I/O. Leases, other RIBs of the domain (``replication.py``) or a snapshot re
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Collection, Iterator
 from typing import Protocol
 
 from gdp.control.rib_replication import Key
+from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_set import SyncSet
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
 from gdp.trust.evidence_index import EvidenceIndex
 
-__all__ = ["MemoryStore", "Store"]
+__all__ = ["MemoryStore", "Store", "check_quota"]
 
 
 class Store(Protocol):
@@ -69,13 +71,26 @@ class Store(Protocol):
         """Return whether a route depends on a certificate that this key, 33 bytes, issued."""
 
 
+def check_quota(store: Store, names_max: int, sender: Name, node: Name) -> None:
+    """Return if sender and node may have another name; a node gets at most as many as the sender has left.
+
+    Raises:
+        StatementError: QUOTA.
+    """
+    free = names_max - store.count_of(sender)
+    if free <= 0:
+        raise StatementError(DropReason.QUOTA, "names of one sender")
+    if store.count_of(node) >= free:
+        raise StatementError(DropReason.QUOTA, "names of one node")
+
+
 class MemoryStore:
     """Routes in dictionaries; lease ends in a heap whose stale items are skipped."""
 
     def __init__(self) -> None:
         self._routes: dict[Name, dict[Name, Route]] = {}
         self._withdrawn: dict[tuple[Name, Name], Withdrawn] = {}
-        self._counts: dict[Name, int] = {}
+        self._counts = Counter[Name]()
         self._ends: list[tuple[float, Name, Name]] = []
         self._forget: list[tuple[int, Name, Name]] = []
         self._size = 0
@@ -118,7 +133,7 @@ class MemoryStore:
             self.digests.put(route.name + route.advertiser, route.rank)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._evidence.put((route.name, route.advertiser), route.fingerprints | route.issuers)
-        self._count(route.sender, route.advertiser)
+        self._counts.update((route.sender, route.advertiser))
         self._size += 1
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
@@ -133,7 +148,7 @@ class MemoryStore:
             self.changes.add((name, advertiser))
         self._forget_withdrawn(name, advertiser)
         self._withdrawn[name, advertiser] = withdrawn
-        self._count(withdrawn.sender, advertiser)
+        self._counts.update((withdrawn.sender, advertiser))
         heapq.heappush(self._forget, (withdrawn.valid_until_unix_s, name, advertiser))
         if withdrawn.proof:
             self.digests.put(name + advertiser, withdrawn.rank)
@@ -163,7 +178,7 @@ class MemoryStore:
 
     def count_of(self, owner: Name) -> int:
         """Return how many routes are stored that a sender relayed, or a node advertises."""
-        return self._counts.get(owner, 0)
+        return self._counts[owner]
 
     def resting_on(self, mark: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate, by its fingerprint, or one that a key issued."""
@@ -192,14 +207,8 @@ class MemoryStore:
             self._uncount(withdrawn.sender, advertiser)
             self.digests.remove(name + advertiser)
 
-    def _count(self, *owners: Name) -> None:
-        for owner in owners:
-            self._counts[owner] = self._counts.get(owner, 0) + 1
-
     def _uncount(self, *owners: Name) -> None:
         for owner in owners:
-            left = self._counts[owner] - 1
-            if left:
-                self._counts[owner] = left
-            else:
+            self._counts[owner] -= 1
+            if not self._counts[owner]:
                 del self._counts[owner]

@@ -7,12 +7,12 @@ of their leases, within a bound.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.control.rib_replication import Key
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
+from gdp.rib.route import Route
 
 __all__ = ["Passed", "UpstreamAdvertisements"]
 
@@ -27,16 +27,12 @@ QUIET_S: Final = 2.0  # a RIB above may wait itself for the tier above it
 WAITING_MAX: Final = 65_536
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Passed:
-    """An advertisement or withdrawal for the tier above, until ``until_s`` at most."""
+class Passed(NamedTuple):
+    """An advertisement or a withdrawal of a route, for the tier above, until the lease of the route ends."""
 
-    key: Key
+    route: Route
     sequence: int
     statement: bytes
-    domain: Name
-    transit: tuple[Name, ...]
-    until_s: float
 
 
 class UpstreamAdvertisements:
@@ -57,10 +53,6 @@ class UpstreamAdvertisements:
         self._return_at_s = float("inf")  # when to probe the preferred RIBs
         self._probed_s: float | None = None  # when they were probed last, since another one is in use
         self._round_trip_s = 0.0  # smoothed, as in RFC 6298
-        self.given_up = 0
-
-    def __len__(self) -> int:
-        return len(self._waiting)
 
     @property
     def rib(self) -> Name | None:
@@ -73,20 +65,22 @@ class UpstreamAdvertisements:
 
     def put(self, passed: Passed, now_s: float) -> None:
         """Send an advertisement upstream until it is acknowledged; it replaces the same advertiser's pending one."""
-        if passed.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
-            self._drop(next(iter(self._waiting)))
-        self._waiting[passed.key] = passed
-        self._requests.start(passed.key, now_s)
+        key = passed.route.key
+        if key not in self._waiting and len(self._waiting) >= WAITING_MAX:
+            self.remove(next(iter(self._waiting)))
+        self._waiting[key] = passed
+        self._requests.start(key, now_s)
 
     def handle_ack(self, key: Key, sequence: int) -> None:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
         if waiting is not None and sequence >= waiting.sequence:
-            self._remove(key)
+            self.remove(key)
 
-    def refused(self, key: Key) -> None:
-        """Record that an advertiser's pending advertisement was rejected."""
-        self._remove(key)
+    def remove(self, key: Key) -> None:
+        """Drop an advertiser's pending advertisement: it was acknowledged or rejected, or its lease ended."""
+        self._waiting.pop(key, None)
+        self._requests.cancel(key)
 
     def probe(self, now_s: float, quiet_s: float) -> bool:
         """Return whether to probe the RIB in use, if it is one of several and silent for ``quiet_s``."""
@@ -139,13 +133,13 @@ class UpstreamAdvertisements:
         return True
 
     def due(self, now_s: float) -> list[Passed]:
-        """Return the advertisements to send to ``rib`` now; those with ended leases are dropped, and counted."""
+        """Return the advertisements to send to ``rib`` now; those with ended leases are dropped."""
         found: list[Passed] = []
         most = 1 if self._is_gone(now_s) else SEND_MAX
         while len(found) < SEND_MAX and (keys := self._requests.poll_due(now_s, 1)):
             waiting = self._waiting[keys[0]]
-            if waiting.until_s <= now_s:
-                self._drop(keys[0])
+            if waiting.route.expires_s <= now_s:
+                self.remove(keys[0])
                 continue
             self._requests.sent(keys[0], now_s, _REPEATS)
             if len(found) < most:
@@ -175,11 +169,3 @@ class UpstreamAdvertisements:
 
     def _is_gone(self, now_s: float) -> bool:
         return self._asked_s is not None and now_s - self._asked_s >= GONE_S
-
-    def _drop(self, key: Key) -> None:
-        self._remove(key)
-        self.given_up += 1
-
-    def _remove(self, key: Key) -> None:
-        self._waiting.pop(key, None)
-        self._requests.cancel(key)

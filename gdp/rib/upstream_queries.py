@@ -97,11 +97,12 @@ class UpstreamQueries:
         """Return whether a response from above is still pending."""
         return self._requests.is_open(name)
 
-    def answered(self, name: Name, now_s: float, lease_s: float = _NEVER_S) -> list[Asker]:
+    def answered(self, name: Name, now_s: float, lease_s: float = _NEVER_S, *, is_unknown: bool = False) -> list[Asker]:
         """Record a response; return the askers that waited for it. More responses may come for the same askers.
 
         Args:
             lease_s: how long the response counts.
+            is_unknown: the tier above does not know the name: the next renewal is an unanswered one.
         """
         question = self._open.get(name)
         if question is None:
@@ -109,15 +110,8 @@ class UpstreamQueries:
         again_s = now_s + max(min(WATCH_AGAIN_S, lease_s / 3), RETRY_S)
         self._requests.answered(name, again_s)
         self._requests.hasten(name, again_s)  # another update renews no watch, but its lease may be short
-        question.is_unknown = False
+        question.is_unknown = is_unknown
         return list(question.askers)
-
-    def not_known(self, name: Name, now_s: float) -> list[Asker]:
-        """Record that the tier above does not know a name; return the askers. The next renewal is an unanswered one."""
-        askers = self.answered(name, now_s)
-        if (question := self._open.get(name)) is not None:
-            question.is_unknown = True
-        return askers
 
     def due(self, now_s: float, *, is_silent: bool = False) -> tuple[list[DueQuery], list[tuple[Name, list[Asker]]]]:
         """Return the queries to send now, and those given up, as (name, askers).

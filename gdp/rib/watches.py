@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from gdp.crypto.certificates import Membership, Role
 from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
 from gdp.limits import RIB_WATCHES_MAX
@@ -22,6 +23,11 @@ class Asker(NamedTuple):
     name: Name
     domain: Name
     is_rib: bool
+
+    @classmethod
+    def of(cls, member: Membership) -> Asker:
+        """Return a proven member as one that queries or watches."""
+        return cls(member.name, member.domain, member.role is Role.RIB)
 
 
 class Watches:
@@ -53,10 +59,6 @@ class Watches:
     def watchers(self, name: Name, now_s: float) -> list[Asker]:
         """Return the askers that watch a name now."""
         return [asker for asker in self._by_name.get(name, {}) if self._ends.due_s((name, asker)) > now_s]
-
-    def names(self) -> list[Name]:
-        """Return every watched name."""
-        return list(self._by_name)
 
     def expire(self, now_s: float) -> None:
         """Remove watches that ended."""

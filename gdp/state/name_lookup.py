@@ -15,9 +15,10 @@ other. The client asks the switch again until the state is no longer ``asked``. 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Final
 
-from gdp.errors import LocalError
+from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
@@ -76,10 +77,13 @@ def rib_lookup(rib: RibCore, me: Name, name: Name, now: Timestamps) -> Mapping[s
     Raises:
         StoreError: its store does not answer.
     """
-    found = [
-        _fields(advertisement, switch=route.switch, domain=route.domain, left_s=route.expires_s - now.mono_s)
-        for route, advertisement in rib.routes_of(name, now)
-    ]
+    rib.state.store.prefetch([name], now)
+    found = []
+    for route in rib.state.store.routes(name):
+        with suppress(StatementError):  # invalid by now
+            advertisement = rib.state.verifier.verify(route.advertisement, now.unix_s)
+            left_s = route.expires_s - now.mono_s
+            found.append(_fields(advertisement, switch=route.switch, domain=route.domain, left_s=left_s))
     return _result("stored", me, found)
 
 

@@ -135,7 +135,7 @@ def topology_snapshot(switch: SwitchCore) -> dict[str, object]:
 
 def rib_snapshot(rib: RibCore, switch: Name | None) -> dict[str, object]:
     """Return the fields of a RIB; the names themselves are those of the switches."""
-    return {"switch": _id_or_none(switch), "routes": rib.names, "watches": rib.watching}
+    return {"switch": _id_or_none(switch), "routes": rib.names, "watches": len(rib.state.outbox.watches)}
 
 
 def member_snapshot(member: Participant, flows: Iterable[Mapping[str, object]] = ()) -> dict[str, object]:

@@ -11,18 +11,22 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.control.diagnostics import Diagnostics, Question
-from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact
+from gdp.crypto.statements import parse
+from gdp.diagnosis.facts import RibFacts, RouteFact, SwitchFacts, TunnelFact
 from gdp.diagnosis.fields import to_fields
 from gdp.errors import StoreError
 from gdp.names import Name
+from gdp.rib.state import RibCoreState
 from gdp.sansio import Timestamps
 from gdp.state.node_state import RibState, SwitchState
 from gdp.state.switch_facts import switch_facts
+from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 
-__all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state"]
+__all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state", "rib_facts"]
 
 ASK: Final = "state"
+_ROUTES_MAX: Final = 32
 _TUNNELS_MAX: Final = 32
 
 
@@ -75,13 +79,39 @@ def answer_for_switch(
 
 def answer_for_rib(state: RibState) -> None:
     """Answer ``state`` for a RIB."""
-    rib = state.host.rib
+    rib = state.host.rib.state
 
     def gather(question: Question, now: Timestamps) -> RibFacts:
-        known = rib.name_facts(question.name, now)
+        known = rib_facts(rib, question.name, now)
         return replace(known, waits=state.wait_facts(now.mono_s), is_attached=state.own_switch is not None)
 
-    answer_state(state.core.diagnostics, state.policy, gather, rib.parties)
+    def holders(name: Name, now_s: float) -> set[Name]:
+        watchers = {asker.name for asker in rib.outbox.watches.watchers(name, now_s)}
+        return watchers | {route.advertiser for route in rib.store.routes(name)}
+
+    answer_state(state.core.diagnostics, state.policy, gather, holders)
+
+
+def rib_facts(rib: RibCoreState, name: Name, now: Timestamps) -> RibFacts:
+    """Return what a RIB stores about a name, for a diagnosis. Raises ``StoreError``: the store is away."""
+    routes = [route for route in rib.store.routes(name) if route.expires_s > now.mono_s]
+    return RibFacts(
+        name=rib.identity.name.to_text(),
+        domain=rib.identity.member.domain.to_text(),
+        unix_s=now.unix_s,
+        routes=tuple(
+            RouteFact(
+                advertiser=route.advertiser.to_text(),
+                right=UnverifiedAdvertisement.from_statement(parse(route.advertisement)).right.value,
+                switch=route.switch.to_text(),
+                domain=route.domain.to_text(),
+                lease_s=round(route.expires_s - now.mono_s, 1),
+            )
+            for route in routes[:_ROUTES_MAX]
+        ),
+        gone=rib.former.gone(name),
+        refused=rib.former.refused(name),
+    )
 
 
 def _tunnel(row: Mapping[str, object]) -> TunnelFact:

@@ -23,7 +23,8 @@ from gdp.crypto.validity import Validity
 from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, HELLO_S, SCAPY_KEEPALIVE_MS
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

@@ -46,10 +46,10 @@ def test_a12_a13_recorded_questions_and_advertisements_draw_no_more_than_their_o
     assert len(recorded) > 20
     back.frames.clear()
     rib = world.ribs["school"]
-    accepted, answers = rib.rib.accepted, rib.rib.answers
+    accepted, answers = rib.rib.state.accepted, rib.rib.state.outbox.answers
     spent = played(world, node, recorded, times=20)
     assert sum(map(len, of_rib(back))) <= spent / 10
-    assert (rib.rib.accepted, rib.rib.answers) == (accepted, answers)
+    assert (rib.rib.state.accepted, rib.rib.state.outbox.answers) == (accepted, answers)
     assert rib.drops()[DropReason.REPLAYED] >= 20
     still_flows(flow)
 
@@ -65,13 +65,13 @@ def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorde
     rib = world.restart_rib("school")
     world.network.thaw(node.partition("/")[0])
     assert world.network.run(10, lambda: rib.attachment.is_attached)
-    before = rib.rib.accepted
+    before = rib.rib.state.accepted
     taken: list[int] = []
     for _ in range(3):
         played(world, node, recorded)
-        taken.append(rib.rib.accepted - before)
+        taken.append(rib.rib.state.accepted - before)
     assert rib.drops()[DropReason.NO_CHANNEL] >= len(recorded) // 4
-    assert rib.rib.refusals[DropReason.STALE] == 0  # no old advertisement came that far
+    assert rib.rib.state.refusals[DropReason.STALE] == 0  # no old advertisement came that far
     still_flows(flow)
     flow.outlive()
 

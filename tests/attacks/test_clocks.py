@@ -14,7 +14,8 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore

@@ -22,7 +22,8 @@ from gdp.frame.kinds import Kind
 from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_BURST
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements
@@ -57,21 +58,21 @@ def test_a14_a_greedy_client_leaves_capacity_for_the_watches_of_others() -> None
     at = rib(watches=100)
     for number in range(1, 200):
         watch(at, CLOUD_SWITCH, number)
-    assert at.watching == 50
+    assert len(at.state.outbox.watches) == 50
     for number in range(1, 20):
         watch(at, SWITCH, number)
-    assert at.watching == 69
+    assert len(at.state.outbox.watches) == 69
 
 
 def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
     at = rib()
     watch(at, CLOUD_PROXY, 1)
-    assert (at.watching, at.refusals) == (0, {DropReason.NOT_DELEGATED: 1})
+    assert (len(at.state.outbox.watches), at.state.refusals) == (0, {DropReason.NOT_DELEGATED: 1})
 
 
 def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.rib.core.ANSWER_BYTES_PER_S", 1_000.0)
-    monkeypatch.setattr("gdp.rib.core.ANSWER_BYTES_BURST", 30_000.0)
+    monkeypatch.setattr("gdp.rib.state.ANSWER_BYTES_PER_S", 1_000.0)
+    monkeypatch.setattr("gdp.rib.state.ANSWER_BYTES_BURST", 30_000.0)
     at = rib()
     for number in range(3):
         tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
@@ -85,7 +86,7 @@ def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypa
             said += len(wire)
             drawn += sum(len(outgoing.statement) for outgoing in at.statements_to_send())
         assert 15_000 < drawn <= 30_000 < said
-    assert at.refusals[DropReason.QUOTA] >= 150
+    assert at.state.refusals[DropReason.QUOTA] >= 150
 
 
 def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,7 +186,7 @@ def test_a16_one_nodes_names_leave_capacity_for_the_other_nodes_of_its_switch() 
     at = rib(names_per_sender=20)
     for number in range(30):
         tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
-    assert (at.names, at.refusals) == (10, {DropReason.QUOTA: 20})
+    assert (at.names, at.state.refusals) == (10, {DropReason.QUOTA: 20})
     rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
     tell(at, advertisement(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert))
     assert at.names == 11

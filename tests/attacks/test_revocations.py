@@ -348,4 +348,4 @@ def test_what_was_revoked_before_it_was_used_is_refused_within_a_minute() -> Non
     member.advertise(topic, b"", reliable=True)
     world.network.send_pending(SERVER)
     world.network.run(75)
-    assert all(rib.rib._store.routes(topic.name) == [] for rib in world.ribs.values())
+    assert all(rib.rib.state.store.routes(topic.name) == [] for rib in world.ribs.values())

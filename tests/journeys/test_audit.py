@@ -15,7 +15,7 @@ def lines(policy: Policy) -> list[AuditLine]:
 def audited() -> tuple[Flow, list[Policy], list[Policy]]:
     world = ring()
     switches = [each.state.policy for each in world.switches.values()]
-    ribs = [each.rib._policy for each in world.ribs.values()]
+    ribs = [each.rib.state.policy for each in world.ribs.values()]
     for policy in (*switches, *ribs):
         policy.audit.begin()
     return flowing(world), switches, ribs

@@ -60,7 +60,7 @@ def own_refusal(member: Participant) -> DropReason | None:
 def place_of(world: Simulation) -> str:
     """Return the switch of the robot according to the RIB of the school."""
     name = world.identities[ROBOT].name
-    (route,) = world.ribs["school"].rib._store.routes(name)
+    (route,) = world.ribs["school"].rib.state.store.routes(name)
     return next(label for label, switch in world.switches.items() if switch.name == route.switch)
 
 
@@ -87,7 +87,7 @@ def test_the_older_of_two_nodes_keeps_serving_past_three_leases_and_both_are_inf
     assert older.clashes > 0
     assert own_refusal(converter) is DropReason.IN_USE
     assert converter.attachment.clashes > 0
-    assert world.ribs["school"].rib._store.routes(flow.topic.name)
+    assert world.ribs["school"].rib.state.store.routes(flow.topic.name)
 
 
 def test_when_the_older_node_dies_the_younger_is_taken() -> None:

@@ -133,7 +133,7 @@ def test_records_outlive_their_leases() -> None:
     internet = Internet(lease_s=24.0, keepalive_ms=1_000)
     internet.begin()
     internet.network.run(3 * ENDPOINT_LEASE_S)
-    assert internet.world.ribs["lab"].rib.endpoints == 2
+    assert len(internet.world.ribs["lab"].rib.state.endpoints) == 2
     assert not internet.closes("home", "cloud")
 
 
@@ -145,7 +145,7 @@ def test_records_survive_the_death_of_the_rib(internet: Internet) -> None:
     assert not internet.closes("home", "cloud")
     internet.world.restart_rib("lab")
     rib = internet.world.ribs["lab"].rib
-    assert internet.network.run(5, lambda: rib.endpoints == 2)
+    assert internet.network.run(5, lambda: len(rib.state.endpoints) == 2)
     internet.publish("home", "203.0.113.5")
     assert internet.network.run(WITHIN_S, partial(internet.tries, "cloud", "home", "203.0.113.5"))
 
@@ -154,7 +154,9 @@ def test_records_survive_the_death_of_the_rib(internet: Internet) -> None:
 def test_each_of_two_ribs_has_the_records_and_either_may_die() -> None:
     internet = Internet(ribs=2)
     internet.begin()
-    assert internet.network.run(1, lambda: all(internet.world.ribs[each].rib.endpoints == 2 for each in RIBS))
+    assert internet.network.run(
+        1, lambda: all(len(internet.world.ribs[each].rib.state.endpoints) == 2 for each in RIBS)
+    )
     for number, dead in enumerate(RIBS, 1):
         internet.world.kill_rib(dead)
         internet.network.run(5)
@@ -162,7 +164,7 @@ def test_each_of_two_ribs_has_the_records_and_either_may_die() -> None:
         assert internet.network.run(WITHIN_S, partial(internet.tries, "cloud", "home", f"203.0.113.{number}"))
         internet.world.restart_rib(dead)
         rib = internet.world.ribs[dead].rib
-        assert internet.network.run(5, lambda rib=rib: rib.endpoints == 2)  # type: ignore[misc]
+        assert internet.network.run(5, lambda rib=rib: len(rib.state.endpoints) == 2)  # type: ignore[misc]
 
 
 RIBS = ("lab", "lab#2")
@@ -188,7 +190,7 @@ def test_a_revoked_switch_loses_its_record_and_its_tunnels_within_a_second(inter
     internet.switches["border"].revoke(wire, internet.network.now)
     internet.network.send_pending("border")
     internet.network.run(WITHIN_S)
-    assert internet.world.ribs["lab"].rib.endpoints == 1
+    assert len(internet.world.ribs["lab"].rib.state.endpoints) == 1
     assert internet.closes("cloud", "home")
     assert not is_direct(internet)
 

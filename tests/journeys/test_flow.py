@@ -216,13 +216,13 @@ def test_names_of_live_nodes_do_not_lapse_though_every_link_loses_statements(see
     """A statement has some five frames, so 8 % of lost frames are a third of the statements on each link."""
     flow = flowing(ring(seed, lease_s=6.0), reliable=False)
     world = flow.world
-    knowing = [host.rib for host in world.ribs.values() if host.rib.routes_of(flow.topic.name, world.network.now)]
+    knowing = [host.rib for host in world.ribs.values() if host.rib.state.store.routes(flow.topic.name)]
     assert len(knowing) == 3
     for sim_link in world.cables.values():
         sim_link.loss = 0.08
     for _ in range(120):
         world.network.run(0.25)
-        assert all(rib.routes_of(flow.topic.name, world.network.now) for rib in knowing), world.network.now
+        assert all(rib.state.store.routes(flow.topic.name) for rib in knowing), world.network.now
 
 
 def test_both_directions_flow_at_once() -> None:

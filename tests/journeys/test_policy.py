@@ -115,7 +115,7 @@ def test_a_local_topic_is_not_found_from_another_domain() -> None:
     flow.read_by(SERVER)
     world.network.run(5)
     assert flow.publisher.readers == 0
-    assert not world.ribs["backbone"].rib._store.routes(flow.topic.name)
+    assert not world.ribs["backbone"].rib.state.store.routes(flow.topic.name)
     flow.outlive(negative=True)
 
 

@@ -38,7 +38,7 @@ def three_tiers() -> Simulation:
 def keeps(world: Simulation, fingerprint: bytes, key: bytes) -> set[str]:
     """Return the nodes that store a revocation: switches by name, RIBs by domain in capitals, members."""
     who = {node for node, switch in world.switches.items() if switch.state.policy.revoked.has(fingerprint, key)}
-    who |= {label.upper() for label, host in world.ribs.items() if host.rib._policy.revoked.has(fingerprint, key)}
+    who |= {label.upper() for label, host in world.ribs.items() if host.rib.state.policy.revoked.has(fingerprint, key)}
     members = world.members.items()
     return who | {label for label, each in members if each.attachment._policy.revoked.has(fingerprint, key)}
 
@@ -69,7 +69,7 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
     assert keeps(world, fingerprint, key) >= expected
     if end != "reader":
         assert not reader.writer_proxies_of(flow.topic.name)
-        stored = [host.rib._store.routes(flow.topic.name) for host in world.ribs.values()]
+        stored = [host.rib.state.store.routes(flow.topic.name) for host in world.ribs.values()]
         assert not any(stored)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(negative=True)

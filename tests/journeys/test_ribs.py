@@ -26,7 +26,7 @@ def doubled() -> Simulation:
 
 def agree(world: Simulation, domain: str) -> bool:
     one, two = (world.ribs[label].rib for label in (domain, f"{domain}#2"))
-    hashes = {digests.total for rib in (one, two) if (digests := rib._store.digests) is not None}
+    hashes = {digests.total for rib in (one, two) if (digests := rib.state.store.digests) is not None}
     return len(hashes) == 1 and one.names > 0
 
 
@@ -73,7 +73,7 @@ def test_two_ribs_that_were_parted_agree_again() -> None:
     assert not agree(world, "school")
     network.set_link(lead, up=True)
     assert network.run(5, partial(agree, world, "school"))
-    routes = world.ribs["school#2"].rib._store.routes
+    routes = world.ribs["school#2"].rib.state.store.routes
     assert (len(routes(kept.topic.name)), len(routes(gone.topic.name))) == (1, 0)
 
 
@@ -86,7 +86,7 @@ def test_a_watch_at_one_rib_hears_what_another_took() -> None:
     identity = world.identities["nuc1"]
     asked.receive(query.to_wire(identity.name, identity.key, identity.membership), watcher.name, world.network.now)
     asked.statements_to_send()
-    answers = asked.answers
-    assert world.network.run(1, lambda: asked.answers > answers)
+    answers = asked.state.outbox.answers
+    assert world.network.run(1, lambda: asked.state.outbox.answers > answers)
     world.network.run(LEASES_S)
-    assert asked._store.routes(flow.topic.name)
+    assert asked.state.store.routes(flow.topic.name)

@@ -17,7 +17,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
     """Return the switch of a node according to a RIB."""
-    route = world.ribs[rib].rib._store.get(name, node)
+    route = world.ribs[rib].rib.state.store.get(name, node)
     assert isinstance(route, Route)
     switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields["switch"]
     return next(label for label, each in world.switches.items() if each.name == switch)

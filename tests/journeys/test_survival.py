@@ -193,10 +193,10 @@ def test_a_publisher_that_dies_while_the_tier_above_is_dead_is_gone_once_that_is
     cloud = world.ribs["cloud"].rib
     world.network.stop(ROBOT)
     world.network.run(SHORT_S)
-    assert cloud.routes_of(flow.topic.name, world.network.now), "it cannot be known that it is gone"
+    assert cloud.state.store.routes(flow.topic.name), "it cannot be known that it is gone"
     restart_rib(world, "backbone")
     world.network.run(SHORT_S)
-    assert not cloud.routes_of(flow.topic.name, world.network.now)
+    assert not cloud.state.store.routes(flow.topic.name)
 
 
 def three_tiers() -> Topology:
@@ -225,7 +225,7 @@ def test_the_tier_above_the_dead_one_takes_its_place_until_it_returns(reader: st
     world.kill_rib("m")
     world.network.run(SHORT_S)
     flowing(world, "/new", "a1/member", (reader,))  # ... and new names are found by way of the top
-    upstream = world.ribs["a"].rib._upstream
+    upstream = world.ribs["a"].rib.state.upstream
     assert upstream.rib == world.identities["rib:top"].name
     restart_rib(world, "m")
     # The first probe tells that its channel ended with the RIB, and the second one comes through the next channel.

@@ -111,7 +111,7 @@ def test_who_leaves_is_gone_in_every_tier() -> None:
     world.network.send_pending(ROBOT)
     world.network.run(1)
     for host in world.ribs.values():
-        assert host.rib._store.routes(flow.topic.name) == []
+        assert host.rib.state.store.routes(flow.topic.name) == []
 
 
 def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:

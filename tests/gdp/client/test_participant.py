@@ -175,7 +175,7 @@ def sizes(world: Simulation) -> list[int]:
         (len(switch.attached), len(switch.resolver.cache), len(switch.multicast.trees), len(switch.table.entries))
         for switch in world.switches.values()
     ]
-    ribs = [(host.rib.names, host.rib.watching) for host in world.ribs.values()]
+    ribs = [(host.rib.names, len(host.rib.state.outbox.watches)) for host in world.ribs.values()]
     return [each for row in [*switches, *ribs] for each in row]
 
 

@@ -17,8 +17,10 @@ from gdp.errors import DropReason, StoreError
 from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.route import Route
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.trust.advertisement import UnverifiedAdvertisement
@@ -158,7 +160,7 @@ def test_a_good_advertisement_is_accepted_and_its_relay_informed() -> None:
     at_rib = rib()
     (ack,) = acks(tell(at_rib, advertisement(sequence=4)))
     assert (ack.name, ack.advertiser, ack.refused, ack.sequence) == (NAME, ROBOT.name, None, 4)
-    assert (at_rib.names, at_rib.accepted, at_rib.refusals) == (1, 1, {})
+    assert (at_rib.names, at_rib.state.accepted, at_rib.state.refusals) == (1, 1, {})
 
 
 FOREIGN_SWITCH_ADVERTISEMENT = advertisement(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY))
@@ -183,7 +185,7 @@ def test_an_advertisement_that_does_not_hold_is_refused_with_its_reason(why: str
     wire, reason = REFUSED[why]
     at_rib = rib()
     reported = acks(tell(at_rib, wire))
-    assert at_rib.refusals == {reason: 1}
+    assert at_rib.state.refusals == {reason: 1}
     assert at_rib.names == 0
     assert {each.refused for each in reported} <= {reason}
 
@@ -194,7 +196,7 @@ def test_an_altered_advertisement_is_refused(at_byte: int) -> None:
     wire[at_byte % len(wire)] ^= 0x20
     tell(at_rib, bytes(wire))
     assert at_rib.names == 0
-    assert at_rib.refusals.total() == 1
+    assert at_rib.state.refusals.total() == 1
 
 
 def test_an_older_advertisement_played_back_is_stale_and_the_refusal_says_what_to_pass() -> None:
@@ -215,27 +217,27 @@ def test_a_rib_of_another_domain_cannot_draw_a_known_advertisement_to_itself() -
     at_rib, wire = rib(), advertisement()
     tell(at_rib, wire)
     tell(at_rib, wire, UPPER)
-    assert at_rib.refusals == {DropReason.STALE: 1}
+    assert at_rib.state.refusals == {DropReason.STALE: 1}
     assert [each.domain for each in answers(ask(at_rib))] == [SCHOOL.root.domain]
 
 
 def test_an_expired_delegation_is_refused() -> None:
     at_rib = rib()
     tell(at_rib, advertisement(chain=[adcert(validity=HOUR)]), now=at(0.0, LATER))
-    assert at_rib.refusals == {DropReason.EXPIRED: 1}
+    assert at_rib.state.refusals == {DropReason.EXPIRED: 1}
 
 
 def test_an_advertisement_of_a_stranger_is_refused() -> None:
     policy = Policy(SCHOOL.root)
     at_rib = RibCore(RIB, policy, MemoryStore(), RibSettings())
     tell(at_rib, advertisement(STRANGER))
-    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+    assert at_rib.state.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
 def test_a_proxy_relays_nothing() -> None:
     at_rib = rib()
     assert tell(at_rib, advertisement(), ROBOT) == []
-    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+    assert at_rib.state.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
 def test_a_switch_of_a_trusted_domain_relays_global_names_which_stand_in_its_own_domain() -> None:
@@ -256,27 +258,27 @@ def test_a_local_name_of_another_domain_is_refused() -> None:
 def test_a_switch_of_a_domain_that_is_not_trusted_relays_nothing() -> None:
     at_rib = RibCore(RIB, Policy(SCHOOL.root), MemoryStore(), RibSettings())
     assert tell(at_rib, foreign_advertisement(), CLOUD_SWITCH) == []
-    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+    assert at_rib.state.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
 def test_a_relay_under_anothers_name_is_refused() -> None:
     at_rib = rib()
     at_rib.receive(relay(advertisement()), OTHER_SWITCH.name, at(0.0))
-    assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.UNKNOWN_SENDER: 1})
+    assert (at_rib.statements_to_send(), at_rib.state.refusals) == ([], {DropReason.UNKNOWN_SENDER: 1})
 
 
 def test_a_relay_under_anothers_certificate_is_refused() -> None:
     at_rib = rib()
     wire = RelayedStatement(advertisement(), (), OTHER_SWITCH.membership).to_wire(SWITCH.name, SWITCH.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
-    assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.BAD_CERTIFICATE: 1})
+    assert (at_rib.statements_to_send(), at_rib.state.refusals) == ([], {DropReason.BAD_CERTIFICATE: 1})
 
 
 def test_a_relay_signed_by_another_key_gets_no_answer_and_leaves_nothing() -> None:
     at_rib = rib()
     wire = RelayedStatement(advertisement(), (), SWITCH.membership).to_wire(SWITCH.name, ROBOT.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
-    assert (at_rib.statements_to_send(), at_rib.names, at_rib.refusals) == ([], 0, {DropReason.BAD_SIGNATURE: 1})
+    assert (at_rib.statements_to_send(), at_rib.names, at_rib.state.refusals) == ([], 0, {DropReason.BAD_SIGNATURE: 1})
 
 
 def test_a_sender_has_a_quota_of_names() -> None:
@@ -294,7 +296,7 @@ def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
         tell(at_rib, Withdrawal(own.name, Right.PUBLISH, 2).to_wire(ROBOT.name, ROBOT.key))
-    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
+    assert at_rib.state.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 
 def test_a_node_leaves_capacity_for_the_other_nodes_of_its_switch() -> None:
@@ -318,7 +320,7 @@ def test_an_operator_may_bound_leases_further() -> None:
 def test_what_is_no_statement_for_a_rib_is_malformed(wire: bytes) -> None:
     at_rib = rib()
     at_rib.receive(wire, ROBOT.name, at(0.0))
-    assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.MALFORMED: 1})
+    assert (at_rib.statements_to_send(), at_rib.state.refusals) == ([], {DropReason.MALFORMED: 1})
 
 
 def test_an_ack_is_shorter_than_the_relay_that_it_answers() -> None:
@@ -345,7 +347,7 @@ def test_a_withdrawn_advertisement_played_back_stays_withdrawn() -> None:
     tell(at_rib, wire)
     tell(at_rib, withdrawal(4))
     tell(at_rib, wire)
-    assert (at_rib.names, at_rib.refusals) == (0, {DropReason.STALE: 1})
+    assert (at_rib.names, at_rib.state.refusals) == (0, {DropReason.STALE: 1})
 
 
 @pytest.mark.parametrize(
@@ -361,7 +363,7 @@ def test_a_withdrawal_that_does_not_hold_takes_nothing_away(wire: bytes, reason:
     at_rib = rib()
     tell(at_rib, advertisement(sequence=3))
     tell(at_rib, wire)
-    assert (at_rib.names, at_rib.refusals) == (1, {reason: 1})
+    assert (at_rib.names, at_rib.state.refusals) == (1, {reason: 1})
 
 
 def test_a_lease_that_is_not_renewed_ends() -> None:
@@ -401,7 +403,7 @@ def test_a_question_signed_by_another_key_gets_no_answer() -> None:
     at_rib = rib()
     tell(at_rib, advertisement())
     at_rib.receive(Query(NAME, 9.0).to_wire(SWITCH.name, ROBOT.key, SWITCH.membership), SWITCH.name, at(0.0))
-    assert (at_rib.statements_to_send(), at_rib.watching) == ([], 0)
+    assert (at_rib.statements_to_send(), len(at_rib.state.outbox.watches)) == ([], 0)
 
 
 def test_a_switch_of_another_domain_hears_of_global_names_only() -> None:
@@ -436,14 +438,14 @@ def test_a_watch_that_ended_gets_no_news() -> None:
     ask(at_rib, watch_s=5.0)
     assert answers(tell(at_rib, advertisement(), now=at(6.0))) == []
     at_rib.handle_timer(at(6.0))
-    assert at_rib.watching == 0
+    assert len(at_rib.state.outbox.watches) == 0
 
 
 def test_too_many_watches_are_counted_and_answered_all_the_same() -> None:
     at_rib = rib(watches=0)
     tell(at_rib, advertisement())
     assert len(answers(ask(at_rib, watch_s=20.0))) == 1
-    assert (at_rib.watching, at_rib.refusals) == (0, {DropReason.QUOTA: 1})
+    assert (len(at_rib.state.outbox.watches), at_rib.state.refusals) == (0, {DropReason.QUOTA: 1})
 
 
 def test_a_switch_that_loses_a_name_to_another_is_informed() -> None:
@@ -565,7 +567,7 @@ def test_what_the_tier_above_does_not_know_is_unknown_here_too() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     assert [each.is_unknown for each in answers(unknown_upstream(at_rib))] == [True]
-    assert (at_rib.negative_answers, at_rib.unknown_answers) == (0, 1)
+    assert (at_rib.state.outbox.negative_answers, at_rib.state.outbox.unknown_answers) == (0, 1)
     assert [outgoing.to for outgoing in ask(at_rib)] == [UPPER.name], "the next query is forwarded again"
 
 
@@ -648,21 +650,21 @@ def test_an_answer_from_no_tier_above_is_refused() -> None:
     ask(at_rib)
     other = NodeKeys.generate(Role.RIB, "other").join(CLOUD, DAY)
     assert answer_from_upstream(at_rib, advertisement(), by=other) == []
-    assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
+    assert at_rib.state.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
 def test_the_tier_above_cannot_forge_an_advertisement_either() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     assert answer_from_upstream(at_rib, REFUSED["forged"][0]) == []
-    assert (at_rib.names, at_rib.refusals) == (0, {DropReason.BAD_SIGNATURE: 1})
+    assert (at_rib.names, at_rib.state.refusals) == (0, {DropReason.BAD_SIGNATURE: 1})
 
 
 def test_a_tier_above_that_is_behind_does_not_undo_what_is_newer_here() -> None:
     at_rib = rib(UPPER.name)
     tell(at_rib, advertisement(sequence=5))
     answer_from_upstream(at_rib, advertisement(sequence=4))
-    assert at_rib.refusals == {DropReason.STALE: 1}
+    assert at_rib.state.refusals == {DropReason.STALE: 1}
     assert answers(ask(at_rib))[0].domain == SCHOOL.root.domain
 
 
@@ -687,6 +689,6 @@ def test_a_rib_outlives_a_shared_store_and_a_tier_above_that_are_both_away() -> 
     for step in range(30):
         at_rib.handle_timer(at(step / 2))
         at_rib.statements_to_send()
-    assert at_rib.refusals[DropReason.UNAVAILABLE] > 0
+    assert at_rib.state.refusals[DropReason.UNAVAILABLE] > 0
     store.is_away = False
     assert store.get(NAME, ROBOT.name) is not None

@@ -20,8 +20,10 @@ from gdp.exchange.sync_set import line_of, rank_in
 from gdp.frame.kinds import Kind
 from gdp.limits import ENDPOINT_LEASE_S, ENDPOINT_RECORDS_BURST
 from gdp.names import Name
-from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
+from gdp.rib.core import RibCore
 from gdp.rib.endpoints import RibEndpoints
+from gdp.rib.outbox import OutgoingStatement
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
@@ -71,10 +73,10 @@ def records_for(outgoing: list[OutgoingStatement], to: Identity) -> list[bytes]:
 def equalise(*cores: RibCore, now_s: float = 0.0) -> list[OutgoingStatement]:
     """Let RIBs send each other what they have; return all of it."""
     sent: list[OutgoingStatement] = []
-    by_name = {core._identity.name: core for core in cores}
+    by_name = {core.state.identity.name: core for core in cores}
     while outgoing := [(core, each) for core in cores for each in tick(core, now_s)]:
         for core, each in outgoing:
-            by_name[each.to].receive(each.statement, core._identity.name, at(now_s, UNIX_S + now_s))
+            by_name[each.to].receive(each.statement, core.state.identity.name, at(now_s, UNIX_S + now_s))
         sent += [each for _, each in outgoing]
         now_s += 0.01
     return sent
@@ -122,9 +124,9 @@ def test_a_record_is_dropped_unless_it_is_renewed() -> None:
     give(core, wire)
     give(core, wire, now_s=40.0)
     tick(core, ENDPOINT_LEASE_S + 1)
-    assert core.endpoints == 1
+    assert len(core.state.endpoints) == 1
     tick(core, 40.0 + ENDPOINT_LEASE_S)
-    assert core.endpoints == 0
+    assert len(core.state.endpoints) == 0
 
 
 def test_a_void_record_is_not_sent() -> None:
@@ -137,7 +139,7 @@ def test_each_switch_has_one_record() -> None:
     core = rib()
     for sequence in range(1, 6):
         give(core, record(sequence=sequence).wire, now_s=float(sequence))
-    assert core.endpoints == 1
+    assert len(core.state.endpoints) == 1
 
 
 @pytest.mark.parametrize(
@@ -156,7 +158,7 @@ def test_a_refusal_says_why(by: Identity, wire: bytes, reason: DropReason) -> No
     (answer,) = responses(give(core, wire, by), by)
     assert answer.refused is reason
     assert kept_sequence(answer) == (5 if by is ONE else 0)
-    assert core.refusals[reason] == 1
+    assert core.state.refusals[reason] == 1
 
 
 def test_a_record_that_another_replays_is_refused() -> None:
@@ -164,15 +166,15 @@ def test_a_record_that_another_replays_is_refused() -> None:
     assert give(core, wire, TWO) == []
     relayed = RelayedStatement(wire, (), TWO.membership).to_wire(TWO.name, TWO.key)
     assert give(core, relayed, TWO) == []
-    assert core.endpoints == 0
-    assert core.refusals == {DropReason.UNKNOWN_SENDER: 1, DropReason.MALFORMED: 1}
+    assert len(core.state.endpoints) == 0
+    assert core.state.refusals == {DropReason.UNKNOWN_SENDER: 1, DropReason.MALFORMED: 1}
 
 
 def test_a_record_of_an_untrusted_domain_is_refused() -> None:
     core, stranger = rib(), node("x", domain=ELSEWHERE)
     (answer,) = responses(give(core, record(stranger).wire, stranger), stranger)
     assert answer.refused is DropReason.WRONG_DOMAIN
-    assert core.endpoints == 0
+    assert len(core.state.endpoints) == 0
 
 
 def test_endpoints_stay_within_the_domain_of_their_switch() -> None:
@@ -189,7 +191,7 @@ def test_only_switches_and_ribs_of_the_domain_ask(asker: Identity) -> None:
     core = rib()
     give(core, record().wire)
     assert give(core, query(asker), asker) == []
-    assert core.refusals[DropReason.WRONG_DOMAIN] == 1
+    assert core.state.refusals[DropReason.WRONG_DOMAIN] == 1
 
 
 def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_and_no_memory() -> None:
@@ -197,8 +199,8 @@ def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_an
     wires = [record(sequence=sequence).wire for sequence in range(1, 60)]
     answered = sum(len(give(core, wire)) for wire in wires)
     assert answered <= ENDPOINT_RECORDS_BURST
-    assert core.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_BURST
-    assert core.endpoints == 1
+    assert core.state.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_BURST
+    assert len(core.state.endpoints) == 1
     assert responses(give(core, record(TWO).wire, TWO), TWO)[0].refused is None
 
 
@@ -217,10 +219,10 @@ def test_records_of_other_domains_do_not_displace_those_of_ones_own() -> None:
 def test_a_revoked_switch_is_forgotten_at_once() -> None:
     core, switch = rib(), node("gone")
     give(core, record(switch).wire, switch)
-    assert core.endpoints == 1
+    assert len(core.state.endpoints) == 1
     fingerprint = switch.member.fingerprint
     core.revoke(Revocation.make(SCHOOL.key, SCHOOL.root.subject, fingerprint, UNIX_S + 600), ONE.name, at(1.0))
-    assert core.endpoints == 0
+    assert len(core.state.endpoints) == 0
     (answer,) = responses(give(core, record(switch, 2).wire, switch, 1.0), switch)
     assert answer.refused is DropReason.REVOKED
 
@@ -232,7 +234,7 @@ def test_a_record_goes_to_the_other_ribs_of_the_domain_and_no_further() -> None:
     assert [each.kind for each in sent] == [Kind.RIB_REQUEST]
     out = give(two, sent[0].statement, RIB)
     assert [each for each in out if each.to == RIB.name] == []
-    assert two.endpoints == 1
+    assert len(two.state.endpoints) == 1
 
 
 def test_a_rib_that_has_just_started_fetches_what_its_peers_keep() -> None:
@@ -243,7 +245,7 @@ def test_a_rib_that_has_just_started_fetches_what_its_peers_keep() -> None:
     give(old, record(FOREIGN).wire, FOREIGN)
     new.connected(at(0.0))
     assert len(equalise(old, new)) > 4
-    assert new.endpoints == len(switches)
+    assert len(new.state.endpoints) == len(switches)
 
 
 def test_two_ribs_do_not_keep_a_record_alive_that_its_switch_does_not_renew() -> None:
@@ -251,8 +253,8 @@ def test_two_ribs_do_not_keep_a_record_alive_that_its_switch_does_not_renew() ->
     give(one, record().wire)
     for now_s in range(2 * int(ENDPOINT_LEASE_S)):
         equalise(one, two, now_s=float(now_s))
-        assert (one.endpoints, two.endpoints) == (1, 1) or now_s >= ENDPOINT_LEASE_S - 2
-    assert (one.endpoints, two.endpoints) == (0, 0)
+        assert (len(one.state.endpoints), len(two.state.endpoints)) == (1, 1) or now_s >= ENDPOINT_LEASE_S - 2
+    assert (len(one.state.endpoints), len(two.state.endpoints)) == (0, 0)
 
 
 def test_records_from_a_rib_of_another_domain_are_refused() -> None:
@@ -261,8 +263,8 @@ def test_records_from_a_rib_of_another_domain_are_refused() -> None:
     items = (item_of(record().wire, 60.0),)
     give(core, SyncMessage(of=ENDPOINTS, items=items).to_wire(by.name, by.key, by.membership), by)
     give(core, RelayedStatement(record().wire, (), by.membership).to_wire(by.name, by.key), by)
-    assert core.endpoints == 0
-    assert core.refusals == {DropReason.WRONG_DOMAIN: 1, DropReason.MALFORMED: 1}
+    assert len(core.state.endpoints) == 0
+    assert core.state.refusals == {DropReason.WRONG_DOMAIN: 1, DropReason.MALFORMED: 1}
 
 
 def test_a_query_is_answered_although_there_are_too_many_watches() -> None:
@@ -271,4 +273,4 @@ def test_a_query_is_answered_although_there_are_too_many_watches() -> None:
     give(core, wire)
     known = tuple((Name(bytes([number]) * 32), 0) for number in range(1, 9))
     assert records_for(give(core, query(TWO, *known, (ONE.name, 0)), TWO), TWO) == [wire]
-    assert core.refusals[DropReason.QUOTA] == 1
+    assert core.state.refusals[DropReason.QUOTA] == 1

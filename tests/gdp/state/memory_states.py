@@ -44,7 +44,7 @@ def switch_state(world: Simulation, label: str, *, begun_s: float | None = None)
 def rib_state(world: Simulation, label: str) -> RibState:
     """Return the state of a RIB, by its label in ``world.ribs``."""
     host, plane, now_s = world.ribs[label], plane_of(world, world.rib_node(label)), world.network.now.mono_s
-    return RibState(world.identities[f"rib:{label}"], host.rib._policy, plane, host, now_s)
+    return RibState(world.identities[f"rib:{label}"], host.rib.state.policy, plane, host, now_s)
 
 
 def member_state(world: Simulation, label: str) -> MemberState:

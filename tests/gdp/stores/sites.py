@@ -25,7 +25,9 @@ from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.outbox import OutgoingStatement
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
@@ -160,7 +162,7 @@ class SnapshotPair(Pair):
         writer = Snapshot(self._path)
         writer.start()
         assert self.memory.changes is not None
-        writer.write([(key, self.one.entry_of(key, now.mono_s)) for key in self.memory.changes], now.unix_s)
+        writer.write([(key, self.one.state.entry_of(key, now.mono_s)) for key in self.memory.changes], now.unix_s)
         self.memory.changes.clear()
         writer.close()
         for entries in Snapshot(self._path).load(now.unix_s):

@@ -30,7 +30,8 @@ from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
 from gdp.nodes.rib_cluster import ClusterUpkeep
 from gdp.nodes.rib_upkeep import MemoryUpkeep
-from gdp.rib.core import RibCore, RibSettings
+from gdp.rib.core import RibCore
+from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.stores.cluster_link import ClusterLink, _translated
@@ -127,10 +128,10 @@ def test_peers_forget_a_withdrawal_when_the_advertisement_can_be_proven_no_more(
     pair.give(pair.one, pair.site.relay("/a", 1))
     pair.give(pair.one, pair.site.withdrawal("/a", 2))
     pair.sync()
-    held = [rib._store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
+    held = [rib.state.store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
     for later_s in range(FORGOTTEN_S, FORGOTTEN_S + 4):
         pair.sync(later_s)  # neither learns it again from the other
-    left = [rib._store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
+    left = [rib.state.store.count_of(pair.site.switch.name) for rib in (pair.one, pair.two)]
     assert (held, left) == ([1, 1], [0, 0])
 
 
@@ -141,7 +142,7 @@ def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_advertise
     pair.sync()
     key = (pair.site.subject("/a").name, pair.site.robot.name)
     pair.give(pair.one, pair.site.withdrawal("/a", 2))
-    entry = pair.one.entry_of(key, pair.site.now().mono_s)
+    entry = pair.one.state.entry_of(key, pair.site.now().mono_s)
     assert entry is not None
     pair.two.load([replace(entry, until_unix_s=int(pair.site.unix_s) + 10)], pair.site.now())
     pair.two.handle_timer(pair.site.now(11.0))
@@ -306,7 +307,7 @@ def test_a_snapshot_that_cannot_be_written_is_reported_once(tmp_path: Path, capl
 
 def changes_of(pair: Pair, names: Sequence[str], rib: RibCore) -> list[tuple[Key, Entry | None]]:
     keys = [(pair.site.subject(name).name, pair.site.robot.name) for name in names]
-    return [(key, rib.entry_of(key, pair.site.now().mono_s)) for key in keys]
+    return [(key, rib.state.entry_of(key, pair.site.now().mono_s)) for key in keys]
 
 
 def test_what_could_not_be_written_is_written_when_the_disk_has_space_again(
@@ -427,7 +428,7 @@ def test_an_altered_entry_of_a_snapshot_is_not_believed(tmp_path: Path) -> None:
     pair.give(pair.one, pair.site.relay("/a", 1))
     pair.sync()
     other = Site()
-    rib = RibCore(other.ribs[0], other.policy(), MemoryStore(), pair.one._settings)
+    rib = RibCore(other.ribs[0], other.policy(), MemoryStore(), pair.one.state.settings)
     for entries in Snapshot(tmp_path / "rib.sqlite").load(other.unix_s):
         rib.load(entries, other.now())
-    assert (rib.names, rib.refusals) == (0, {DropReason.WRONG_DOMAIN: 1})
+    assert (rib.names, rib.state.refusals) == (0, {DropReason.WRONG_DOMAIN: 1})

@@ -374,9 +374,9 @@ def proxy_away(folder: Path) -> Stage:
 def quota(folder: Path) -> Stage:
     stage = Stage(folder)
     rib = stage.sites.world.ribs["line"].rib
-    rib._settings = replace(rib._settings, names_per_sender=2)
+    rib.state.settings = replace(rib.state.settings, names_per_sender=2)
     stage.add(into=CHATTER)
-    rib._settings = replace(rib._settings, names_per_sender=1)
+    rib.state.settings = replace(rib.state.settings, names_per_sender=1)
     stage.listen()
     stage.talk()
     stage.run(10)

@@ -28,7 +28,7 @@ from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.state.node_state import SwitchState
-from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state
+from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state, rib_facts
 from gdp.state.switch_facts import switch_facts
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.name_facts import proxy_facts
@@ -243,7 +243,7 @@ class Stage:
         return [port for port, (_, _, far) in ports.items() if "/" in far.node]
 
     def _rib(self, label: str, name: Name) -> RibFacts:
-        known = self.sites.world.ribs[label].rib.name_facts(name, self.sites.world.network.now)
+        known = rib_facts(self.sites.world.ribs[label].rib.state, name, self.sites.world.network.now)
         return from_fields(RibFacts, to_fields(known))
 
 

@@ -203,7 +203,7 @@ class _Network:
         state = rib_state(self.sites.world, label)
         node_log, _ = self._log(f"rib:{label}", state)
         sources = self.sources[f"rib:{label}"] = common_sources(node_log, rib_sources(state))
-        self.handlers[f"rib:{label}"] = rib_handlers(state, sources, state.host.rib._store)
+        self.handlers[f"rib:{label}"] = rib_handlers(state, sources, state.host.rib.state.store)
 
     def _add_proxy(self, machine: Machine) -> None:
         world, member = self.sites.world, machine.member
