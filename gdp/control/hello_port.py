@@ -133,9 +133,12 @@ class HelloPort:
         """Return the nodes that were heard, and have not echoed our nonce."""
         return [each for each in self.neighbours.values() if not each.is_proven]
 
-    def is_neighbour_at(self, mac: bytes) -> bool:
-        """Return whether a neighbour that is up has this address."""
-        return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
+    def neighbour_at(self, mac: bytes, *, is_up: bool = False) -> Neighbour | None:
+        """Return the neighbour with this address, or None; ``is_up``: no other one counts."""
+        for each in self.neighbours.values():
+            if each.mac == mac and (each.state is NeighbourState.UP or not is_up):
+                return each
+        return None
 
     def echoes(self) -> tuple[bytes, ...]:
         """Return the echoes that a hello carries: neighbours first, then candidates, the newest first."""

@@ -106,7 +106,7 @@ class HelloReception:
             raise FrameError(DropReason.BAD_PARTS, f"a hello in {header.parts} parts")
         if port is None or not port.is_up:
             return None
-        if port.is_neighbour_at(arrival.mac):
+        if port.neighbour_at(arrival.mac, is_up=True) is not None:
             return self._reassembler.add(header, arrival.frame, now_s, arrival.via)
         port.admission.check_quota(arrival.mac, now_s)
         return self._strangers_reassembler.add(header, arrival.frame, now_s, arrival.via)

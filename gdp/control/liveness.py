@@ -7,14 +7,15 @@ fail together. Time in which this node itself was not scheduled does not count a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Final
 
 from gdp.control.hello import Timing
 from gdp.control.hello_port import HelloPort
 from gdp.control.keepalive import KeepaliveSession, Slowness
-from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_table import NeighbourTable
 from gdp.control.settings import NodeSettings
 from gdp.limits import HELLO_IDLE
 from gdp.names import Name
@@ -32,7 +33,7 @@ class LivenessMonitor:
     """Liveness of the neighbours at all ports of one node.
 
     Args:
-        ports: those of the hello protocol, by index.
+        neighbours: those of the hello protocol.
         is_only_way: as of ``HelloProtocol``.
 
     Attributes:
@@ -40,9 +41,10 @@ class LivenessMonitor:
     """
 
     def __init__(
-        self, ports: Mapping[int, HelloPort], settings: NodeSettings, is_only_way: Callable[[Name], bool] | None
+        self, neighbours: NeighbourTable, settings: NodeSettings, is_only_way: Callable[[Name], bool] | None
     ) -> None:
-        self._ports = ports
+        self._neighbours = neighbours
+        self._ports = neighbours.ports
         self._hello_s = settings.hello_s
         self._dead_s = settings.dead_s
         self._is_only_way = is_only_way
@@ -165,12 +167,7 @@ class LivenessMonitor:
         """Return whether a neighbour is the only one on its port, and no other way leads to it."""
         if len(self._ports[neighbour.port].neighbours) > 1:  # whose frames come is not known
             return False
-        others = [
-            each
-            for port in self._ports.values()
-            for each in port.neighbours.values()
-            if each.state is NeighbourState.UP and each.port != neighbour.port
-        ]
+        others = [each for each in self._neighbours.all_up() if each.port != neighbour.port]
         if self._is_only_way is None:
             return not others
         return all(each.name != neighbour.name for each in others) and self._is_only_way(neighbour.name)

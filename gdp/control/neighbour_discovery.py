@@ -111,7 +111,7 @@ class HelloProtocol:
         self.neighbours = NeighbourTable()
         self.ports = self.neighbours.ports
         self.reception = HelloReception(identity, policy, fragmenter, settings, self.ports)
-        self.liveness = LivenessMonitor(self.ports, settings, is_only_way)
+        self.liveness = LivenessMonitor(self.neighbours, settings, is_only_way)
         self.preshared_keys = PresharedKeys(identity.name, settings.random_bytes)
 
     def set_timing(self, index: int, timing: Timing) -> None:

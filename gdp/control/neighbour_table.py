@@ -44,6 +44,11 @@ class NeighbourTable:
         found = on.neighbours.get(name) if on is not None else None
         return found if found is not None and found.state is NeighbourState.UP else None
 
+    def neighbour_at(self, index: int, mac: bytes, *, is_up: bool = False) -> Neighbour | None:
+        """Return the neighbour with an address at a port, as ``HelloPort.neighbour_at``."""
+        port = self.ports.get(index)
+        return None if port is None else port.neighbour_at(mac, is_up=is_up)
+
     def all_up(self) -> list[Neighbour]:
         """Return every neighbour that is up."""
         return [n for port in self.ports.values() for n in port.neighbours.values() if n.state is NeighbourState.UP]

@@ -116,11 +116,6 @@ class NodeState(ABC):
                 if each.state is NeighbourState.UP or not is_up:
                     yield self._row(each)
 
-    def neighbour_at(self, index: int, mac: bytes) -> Neighbour | None:
-        """Return the neighbour with an address at a port, or None."""
-        port = self.hello_protocol.ports.get(index)
-        return next((each for each in port.neighbours.values() if each.mac == mac), None) if port is not None else None
-
     def drops(self) -> Mapping[DropReason, int]:
         """Return what plane and core dropped, by reason."""
         plane = {reason: self.plane.counters.drops[reason] for reason in DropReason}

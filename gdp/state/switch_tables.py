@@ -120,6 +120,6 @@ def _listed(state: SwitchState, hops: Iterable[Downstream]) -> str:
 def _at(state: SwitchState, at: Downstream) -> str:
     """Return device and neighbour of a hop, such as ``eth1 nuc2``."""
     index, mac = at
-    neighbour = state.neighbour_at(index, mac)
+    neighbour = state.hello_protocol.neighbours.neighbour_at(index, mac)
     label = mac.hex(":") if neighbour is None or neighbour.member is None else neighbour.member.label
     return f"{state.ifname(index)} {label}"

@@ -396,11 +396,10 @@ class SwitchCore:
 
     def _sender(self, arrival: ReceivedFrame) -> Neighbour:
         """Return the neighbour with the sender's address. Raises ``FrameError``: UNKNOWN_SENDER, it is not up."""
-        port = self.hello_protocol.ports.get(arrival.port)
-        for neighbour in port.neighbours.values() if port is not None else ():
-            if neighbour.mac == arrival.mac and neighbour.state is NeighbourState.UP:
-                return neighbour
-        raise FrameError(DropReason.UNKNOWN_SENDER)
+        neighbour = self.state.neighbours.neighbour_at(arrival.port, arrival.mac, is_up=True)
+        if neighbour is None:
+            raise FrameError(DropReason.UNKNOWN_SENDER)
+        return neighbour
 
     def _take_own(self, header: Header, arrival: ReceivedFrame, now: Timestamps) -> bool:
         """Handle a frame that is for this switch; return False if it is a fragment whose statement is not complete."""

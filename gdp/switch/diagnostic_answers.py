@@ -10,7 +10,6 @@ from typing import Final
 
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.diagnostics import Diagnostics, Question
-from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.schema import NAME_OR_ZERO, Keyed
 from gdp.errors import DropReason, StatementError
@@ -116,7 +115,7 @@ class DiagnosticAnswers:
     def _link(self, port: int, mac: bytes) -> dict[str, object]:
         """Return the link to a neighbour: its device, and who is at the other end, as far as known."""
         link: dict[str, object] = {"port": self.port_name(port)}
-        neighbour = self._neighbour(port, mac)
+        neighbour = self._state.neighbours.neighbour_at(port, mac)
         if neighbour is not None:
             rtt_s = self._state.neighbours.ports[port].quality_of(neighbour.name).rtt.srtt_s
             link |= {"to": neighbour.name, "role": neighbour.role.value, "cost": neighbour.cost}
@@ -125,7 +124,3 @@ class DiagnosticAnswers:
             if rtt_s is not None:
                 link["rtt_us"] = round(1e6 * rtt_s)
         return link
-
-    def _neighbour(self, port: int, mac: bytes) -> Neighbour | None:
-        known = self._state.neighbours.ports.get(port)
-        return next((each for each in known.neighbours.values() if each.mac == mac), None) if known else None
