@@ -99,6 +99,8 @@ class Attachment:
         self._policy = policy
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
+        first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * settings.lease_s)
+        self._renewals = Backoff(first_s, settings.lease_s / 3)
         self._sequence = settings.first_sequence
         self.started = settings.first_sequence  # above the numbers of earlier incarnations here, as far as known
         self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
@@ -354,8 +356,7 @@ class Attachment:
         if not each.is_acknowledged:
             return _ADVERTISEMENT_AGAIN_S
         each.renewals += 1
-        first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * self._lease_s)
-        return Backoff(first_s, self._lease_s / 3).pause_s(each.renewals)
+        return self._renewals.pause_s(each.renewals)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""

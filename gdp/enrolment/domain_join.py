@@ -26,6 +26,7 @@ from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_conf
 from gdp.errors import LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.links.endpoint_files import own_record
+from gdp.requests import Backoff
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation, install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, REQUEST, load_node_keys
@@ -50,8 +51,7 @@ log = logging.getLogger(__name__)
 
 _UNUSED: Final = "the token was not used"
 _RETRY_S: Final = 30.0  # after a connection
-_PAUSE_MIN_S: Final = 0.2
-_PAUSE_MAX_S: Final = 5.0
+_REPEATS: Final = Backoff(0.2, 5.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,7 +171,7 @@ def _repeated(
 ) -> tuple[Message, Root, str]:
     """Send a request until a response comes."""
     token, patience_s = request.token, request.patience_s
-    begun_s, pause_s = time.monotonic(), _PAUSE_MIN_S
+    begun_s, tries = time.monotonic(), 0
     while True:
         try:
             with connect_any(token.servers, token.root) as channel:
@@ -181,8 +181,8 @@ def _repeated(
             if time.monotonic() >= begun_s + patience_s:
                 raise
             log.info("enrolment repeated reason=%s", error)
-            wait(pause_s)
-            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
+            tries += 1
+            wait(_REPEATS.pause_s(tries))
 
 
 def _install(

@@ -138,13 +138,14 @@ class LocalAdvertisements:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
         interval_s = min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
-        due = []
-        for name, advertiser in self._relays.poll_due(now_s):
+        repeats, due = Backoff(interval_s, interval_s), []
+        for key in self._relays.poll_due(now_s):
+            name, advertiser = key
             each = self._by_name[name][advertiser]
             each.is_slow = interval_s > RELAY_AGAIN_S
-            self._relays.sent((name, advertiser), now_s, Backoff(interval_s, interval_s))
-            if self._relays.tries((name, advertiser)) == RELAY_TRIES:
-                self._relays.cancel((name, advertiser))
+            self._relays.sent(key, now_s, repeats)
+            if self._relays.tries(key) == RELAY_TRIES:
+                self._relays.cancel(key)
             due.append(each)
         return due
 

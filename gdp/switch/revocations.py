@@ -19,7 +19,7 @@ from typing import Final
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
-from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
@@ -69,7 +69,7 @@ class RevocationHandler:
         self.sync = RevocationSync(
             state.identity, self._revoked, state.neighbours, self._send_to_reconcile, first_sequence
         )
-        self._handed_in: dict[bytes, bytes] = {}  # statements of owners that the operator submitted, by fingerprint
+        self._handed_in: dict[bytes, tuple[Revocation, bytes]] = {}  # of owners, with the wire form, by fingerprint
         self._requests = Requests[bytes]()  # to the RIB, by fingerprint
         self._next_send_s = float("-inf")
         self._sent_to: Name | None = None  # the RIB that received the operator's revocations
@@ -101,7 +101,7 @@ class RevocationHandler:
         revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._state.dependents.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
-            self._handed_in[statement.fingerprint] = statement.wire
+            self._handed_in[statement.fingerprint] = issued, statement.wire
             if statement.fingerprint not in self._requests:
                 self._requests.start(statement.fingerprint, now.mono_s)
         if revocation is not None:
@@ -121,8 +121,7 @@ class RevocationHandler:
         wires = []
         for fingerprint in self._requests.poll_due(now_s, _PER_TICK):
             self._next_send_s = now_s + _TICK_S
-            wire = self._handed_in[fingerprint]
-            revocation = Revocation.from_fields(parse(wire).fields)
+            revocation, wire = self._handed_in[fingerprint]
             if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
                 self._requests.sent(fingerprint, now_s, _SUBMITTED)
                 wires.append(wire)
