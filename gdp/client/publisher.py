@@ -219,8 +219,9 @@ class Publisher:
         if depth == self.queue.depth:
             return
         self.queue.set_depth(depth)
-        if not self.confirms:
-            self.acknowledgements.release_window()
+        if not self.confirms:  # the window is no longer used
+            for name in self.matched.names():
+                self._window.drop_reader(name)
         self._heartbeats.wanted = True
         self.published(self)
 

@@ -91,6 +91,7 @@ class SwitchCore:
             lease_s=settings.lease_s,
         )
         self.state = state
+        self.name = state.me
         self.table = table
         self.attached = state.attached
         self.resolver = state.resolver
@@ -152,11 +153,6 @@ class SwitchCore:
             Kind.REDIRECT: self._locations.receive_redirect,
             Kind.WHERE: self._locations.answer_query,
         }
-
-    @property
-    def name(self) -> Name:
-        """Return the switch's name."""
-        return self.state.me
 
     @property
     def rib(self) -> Name | None:
