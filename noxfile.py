@@ -66,7 +66,7 @@ def pages(session: nox.Session) -> None:
 
 @nox.session(python=False)
 def coverage(session: nox.Session) -> None:
-    """Measure branch coverage of gdp, proxy and fog; fails below the limit in pyproject.toml.
+    """Measure branch coverage of gdp, proxy, fog and gdp_extensions; fails below the limit in pyproject.toml.
 
     Arguments replace the folders of tests. Nodes in namespaces count only as root; without root less is covered.
     """
@@ -92,8 +92,8 @@ def pythons(session: nox.Session, version: str) -> None:
     python = str(folder / "bin" / "python")
     session.run(found, "-m", "venv", "--clear", str(folder), external=True)
     session.run(python, "-m", "pip", "install", "--quiet", "-e", ".[aws,cluster,fog,scapy]", *TEST_TOOLS, external=True)
-    session.run(python, "-m", "compileall", "-q", "-f", "gdp", "proxy", "fog", external=True)
-    session.run(python, "scripts/import_all.py", "gdp", "proxy", "fog", external=True)
+    session.run(python, "-m", "compileall", "-q", "-f", "gdp", "proxy", "fog", "gdp_extensions", external=True)
+    session.run(python, "scripts/import_all.py", "gdp", "proxy", "fog", "gdp_extensions", external=True)
     session.run(python, "-m", "pytest", "-x", *FAST_TESTS, external=True)
 
 

@@ -38,7 +38,8 @@ from gdp.crypto.statements import StatementType
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = ROOT / "scripts" / "readability.json"
 RAISED = ROOT / "scripts" / "raised_limits.yaml"
-PRODUCT = ("gdp", "proxy", "fog")
+CORE = ("gdp", "proxy", "fog")
+PRODUCT = (*CORE, "gdp_extensions")
 SCANNED = frozenset({".cff", ".in", ".lua", ".md", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"})
 HIGHER_IS_BETTER = frozenset({"tests"})
 
@@ -249,17 +250,18 @@ def broken_import_rules(root: Path) -> int:
     return int(match[1])
 
 
-def line_counts(files: Iterable[Path], root: Path) -> tuple[int, int]:
-    """Return the lines of the product, and those of scripts and of the test beds of ``netns_tests``."""
-    product = beds = 0
+def line_counts(files: Iterable[Path], root: Path) -> tuple[int, int, int]:
+    """Return the lines of the product, of its core, and those of scripts and of the test beds of ``netns_tests``."""
+    product = core = beds = 0
     for file in files:
         folder = file.relative_to(root).parts[0]
         if file.suffix not in (".py", ".sh", ".lua"):
             continue
         count = len(file.read_text().splitlines())
         product += count * (folder in PRODUCT)
+        core += count * (folder in CORE)
         beds += count * (folder == "scripts" or (folder == "netns_tests" and not file.name.startswith("test_")))
-    return product, beds
+    return product, core, beds
 
 
 def shape_counts(trees: Iterable[ast.Module]) -> dict[str, float]:
@@ -312,7 +314,7 @@ def measure(root: Path, settings: Settings) -> Report:
     longest = lengths[: max(1, len(lengths) // 10)]
     bare = undocumented(trees)
     names, circles = shared_names(trees, settings.protocol_names), import_circles()
-    product, beds = line_counts(files, root)
+    product, core, beds = line_counts(files, root)
     figures: dict[str, float] = {
         "listed words": len(words),
         "words a sentence": round(sum(lengths) / max(1, len(lengths)), 1),
@@ -322,6 +324,7 @@ def measure(root: Path, settings: Settings) -> Report:
         "broken import rules": broken_import_rules(root),
         "packages that define one method name": names[0][0] if names else 0,
         "product lines": product,
+        "core lines": core,
         "lines of scripts and test beds": beds,
         **shape_counts(tree for path, tree in trees.items() if path.split("/", 1)[0] in PRODUCT),
         "signed statement types": len(StatementType),

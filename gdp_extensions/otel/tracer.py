@@ -219,14 +219,12 @@ class OtelTracer(CallTracer):
                 span.end()
 
 
-def open_tracer(traces: Traces | None, node: Name, label: str) -> CallTracer:
+def open_tracer(traces: Traces, node: Name, label: str) -> CallTracer:
     """Return the tracer that a configuration asks for.
 
     Raises:
-        MissingExtraError: it asks for one, and the extra ``otel`` is not installed.
+        MissingExtraError: the extra ``otel`` is not installed.
     """
-    if traces is None:
-        return CallTracer()
     require_extra("otel", ["opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"], "traces")
     from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
     from opentelemetry.sdk.trace.export import BatchSpanProcessor

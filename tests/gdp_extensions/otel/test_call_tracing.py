@@ -20,9 +20,10 @@ from pydantic import ValidationError
 
 from gdp.names import Name
 from gdp.service.frames import Request
+from gdp_extensions.otel.tracer import CALLS_MAX, OtelTracer, open_tracer
 from proxy.bridge.call_tracer import CallKey, CallTracer, trace_ids
 from proxy.config.config import Traces
-from proxy.node.otel_tracer import CALLS_MAX, OtelTracer, open_tracer
+from proxy.node import bridge_node
 from tests.proxy.bridge.known import switch, switched
 from tests.proxy.bridge.sites import Machine, Sites
 from tests.proxy.bridge.test_replicas import replicas
@@ -173,7 +174,7 @@ def test_spans_reach_a_collector_by_otlp() -> None:
 
 
 def test_tracing_is_off_unless_it_is_asked_for() -> None:
-    assert type(open_tracer(None, KEY.client, "robot")) is CallTracer
+    assert type(bridge_node.open_tracer(None, KEY.client, "robot")) is CallTracer
 
 
 def test_an_endpoint_that_is_no_url_is_refused() -> None:
