@@ -17,7 +17,7 @@ from unittest import mock
 import pytest
 from scapy.utils import RawPcapReader
 
-from gdp.client.capture_opener import Outcome
+from gdp_extensions.dissector.capture_opener import Outcome
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
@@ -29,7 +29,7 @@ from lab.process import calling
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.recordings.reader import BagReader
 from ring import cli
-from tests.tshark import assert_same, needs_tshark, shown_by_tshark, tshark
+from tests.gdp_extensions.dissector.tshark import assert_same, needs_tshark, shown_by_tshark, tshark
 
 pytestmark = pytest.mark.netns
 

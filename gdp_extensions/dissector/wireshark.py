@@ -45,7 +45,7 @@ def wireshark(
       tshark -i eth0 -X lua_script:gdp.lua -Y 'gdp.kind == 0x80'
     """
     require_extra("scapy", ("scapy",), "gdp wireshark")
-    from gdp.frame.wireshark import FIRST_LINE, dissector
+    from gdp_extensions.dissector.dissector import FIRST_LINE, dissector
 
     text = dissector()
     if install and out is not None:

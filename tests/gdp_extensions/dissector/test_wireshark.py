@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp.cli.wireshark import _plugin_folder
-from gdp.frame.wireshark import dissector
-from tests.tshark import needs_tshark
+from gdp_extensions.dissector.wireshark import _plugin_folder
+from gdp_extensions.dissector.dissector import dissector
+from tests.gdp_extensions.dissector.tshark import needs_tshark
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import show
-from gdp.client.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
+from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.frame.codec import ETHER_BYTES
@@ -28,7 +28,7 @@ from gdp.stores.keyring import DELEGATIONS, load_delegations, load_identity, loa
 from gdp.terminal import echo
 
 if TYPE_CHECKING:
-    from gdp.ports.pcap_files import CapturedFrame
+    from gdp_extensions.dissector.pcap_files import CapturedFrame
 
 __all__ = ["decrypt_pcap"]
 
@@ -115,7 +115,7 @@ def _keys(nodes: Sequence[Path], owners: Sequence[Path]) -> tuple[CaptureKeys, d
 
 def _frames(path: Path) -> Iterator[tuple[CapturedFrame, bytes | None]]:
     """Yield each captured frame, and from its header on where it is one of ours."""
-    from gdp.ports.pcap_files import ETHERNET, read_capture
+    from gdp_extensions.dissector.pcap_files import ETHERNET, read_capture
 
     for captured in read_capture(path):
         at = ETHER_BYTES - 2
@@ -127,7 +127,7 @@ def _frames(path: Path) -> Iterator[tuple[CapturedFrame, bytes | None]]:
 
 def _write(capture: Path, out: Path, opener: CaptureOpener) -> tuple[int, int]:
     """Write the file, whole or not at all; return how many messages it has, and how many of them are cut."""
-    from gdp.ports.pcap_files import PcapngWriter
+    from gdp_extensions.dissector.pcap_files import PcapngWriter
 
     written = cut = 0
     try:
@@ -152,7 +152,7 @@ def _write(capture: Path, out: Path, opener: CaptureOpener) -> tuple[int, int]:
 
 
 def _to_wire(opened: OpenedMessage) -> bytes:
-    from gdp.frame.opened import ENCODINGS, OpenedFrame
+    from gdp_extensions.dissector.opened import ENCODINGS, OpenedFrame
 
     header, numbers = opened.header, {text: number for number, text in ENCODINGS.items()}
     head = OpenedFrame(

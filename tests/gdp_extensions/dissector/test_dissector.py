@@ -17,8 +17,8 @@ from gdp.errors import FrameError, LocalError
 from gdp.frame.codec import HEADER_BYTES, decode, ethernet
 from gdp.frame.kinds import Flag, Kind
 from gdp.frame.layers import GDP, PAYLOADS, STATEMENTS, Statement, least_bytes
-from gdp.frame.wireshark import _field, dissector
-from tests.tshark import assert_same, needs_tshark, shown_by_tshark, write_pcap
+from gdp_extensions.dissector.dissector import _field, dissector
+from tests.gdp_extensions.dissector.tshark import assert_same, needs_tshark, shown_by_tshark, write_pcap
 
 ETHER: Final = ethernet(b"\x02\0\0\0\0\x01", b"\x02\0\0\0\0\x02")
 VECTORS: Final = json.loads((Path(__file__).parents[2] / "vectors" / "frames.json").read_text())["frames"]

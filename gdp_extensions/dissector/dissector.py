@@ -42,7 +42,7 @@ from gdp.frame.layers import (
     Statement,
     least_bytes,
 )
-from gdp.frame.opened import BODIES, OpenedFrame
+from gdp_extensions.dissector.opened import BODIES, OpenedFrame
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES, PARTS_MAX
 
 __all__ = ["FIRST_LINE", "dissector", "prefix_of"]

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gdp.errors import LocalError
-from gdp.ports.pcap_files import ETHERNET, CapturedFrame, PcapngWriter, read_capture
+from gdp_extensions.dissector.pcap_files import ETHERNET, CapturedFrame, PcapngWriter, read_capture
 
 BOUND_BYTES = 40 << 20
 SECTION = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)

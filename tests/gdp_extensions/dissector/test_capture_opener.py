@@ -10,7 +10,7 @@ from itertools import count
 import cbor2
 import pytest
 
-from gdp.client.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
+from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
 from gdp.client.unicast_stream import PeerIncarnation, private_incarnation, private_name
 from gdp.crypto.control_seal import ControlSealer, control_key
 from gdp.crypto.envelope import Sealer, seal_key

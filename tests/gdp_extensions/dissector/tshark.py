@@ -18,7 +18,7 @@ from scapy.utils import PcapWriter
 
 from gdp.frame.codec import HOPS_MASK, SECOND_PATH
 from gdp.frame.layers import GDP, PAYLOADS, CborBytesField, HopsField, Statement
-from gdp.frame.wireshark import dissector, prefix_of
+from gdp_extensions.dissector.dissector import dissector, prefix_of
 
 needs_tshark: Final = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 Shown = dict[str, str | int]
