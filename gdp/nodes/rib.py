@@ -98,7 +98,7 @@ def _settings(config: RibConfig) -> RibSettings:
 def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     if config.store == "memory":
         return MemoryUpkeep(config.snapshot)
-    from gdp.nodes.rib_cluster import ClusterUpkeep  # the client library is an optional extra
+    from gdp_extensions.cluster.upkeep import ClusterUpkeep  # the client library is an optional extra
 
     return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
 

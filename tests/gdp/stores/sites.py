@@ -30,8 +30,8 @@ from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
-from gdp.stores.cluster import ClusterStore, load_functions
-from gdp.stores.cluster_link import ClusterLink
+from gdp_extensions.cluster.store import ClusterStore, load_functions
+from gdp_extensions.cluster.link import ClusterLink
 from gdp.stores.snapshot import Snapshot
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy

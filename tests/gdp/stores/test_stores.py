@@ -28,13 +28,13 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StoreError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
-from gdp.nodes.rib_cluster import ClusterUpkeep
+from gdp_extensions.cluster.upkeep import ClusterUpkeep
 from gdp.nodes.rib_upkeep import MemoryUpkeep
 from gdp.rib.core import RibCore
 from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
-from gdp.stores.cluster_link import ClusterLink, _translated
+from gdp_extensions.cluster.link import ClusterLink, _translated
 from gdp.stores.snapshot import SLICE, Snapshot
 from gdp.trust.rtcert import RtCert
 from tests.gdp.stores.sites import (
@@ -226,7 +226,7 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     upkeep.begin(rib, site.now())
     password = (servers.parent / "admin.password").read_text().strip()
     with monkeypatch.context() as patient:
-        patient.setattr("gdp.stores.cluster_link._TIMEOUT_S", 30.0)  # a busy server flushes late
+        patient.setattr("gdp_extensions.cluster.link._TIMEOUT_S", 30.0)  # a busy server flushes late
         for client in (link := ClusterLink(config.address())).primaries():
             client.execute_command("AUTH", "admin", password)
             client.execute_command("FUNCTION FLUSH")

@@ -27,7 +27,7 @@ from gdp.errors import DropReason, LocalError, RemoteError, StatementError, Stor
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
-from gdp.stores.cluster_link import ClusterLink, Command, tag_of
+from gdp_extensions.cluster.link import ClusterLink, Command, tag_of
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.verifier import AdvertisementVerifier
 
