@@ -16,7 +16,7 @@ from gdp.errors import LocalError
 from gdp.stores.keyring import storage, store_again
 from gdp.stores.passphrase import FILE_VARIABLE, VARIABLE, new_passphrase
 from gdp.stores.private_keys import Storage
-from gdp.stores.token import TokenKey, generate_token_key, open_token_key
+from gdp_extensions.pkcs11.token import TokenKey, generate_token_key, open_token_key
 
 __all__ = ["app", "asked_passphrase", "token_key"]
 

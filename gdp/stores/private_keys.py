@@ -23,7 +23,7 @@ from gdp.crypto.pbes2 import KEY_LABEL, RANDOM_BYTES, SECRET_LABEL, is_own_form,
 from gdp.errors import GdpError, LocalError
 from gdp.stores.files import NewFile, private, read_private
 from gdp.stores.passphrase import passphrase_for
-from gdp.stores.token import SCHEME, open_token_key
+from gdp_extensions.pkcs11.token import SCHEME, open_token_key
 
 __all__ = ["Storage", "key_file", "read_secret", "read_signing_key", "secret_file", "storage_of"]
 

@@ -19,7 +19,7 @@ from gdp.config.config import SwitchConfig
 from gdp.config.yaml_source import read_yaml
 from gdp.crypto.pbes2 import SECRET_LABEL, _parts, protect
 from gdp.errors import ConfigError, LocalError, RemoteError, StoreError
-from gdp.stores.token_uri import TokenUri
+from gdp_extensions.pkcs11.token_uri import TokenUri
 from proxy.config.config import ProxyConfig
 from proxy.recordings.channels import offered_qos
 from proxy.recordings.decoder import BagDecoder

@@ -17,9 +17,9 @@ from gdp.stores.files import private, write_all
 from gdp.stores.issue import admit_node, make_domain, make_node_keys, make_owner
 from gdp.stores.keyring import load_domain, load_identity, load_owner, storage
 from gdp.stores.private_keys import Storage
-from gdp.stores.token import TokenKey, generate_token_key, open_token_key
-from gdp.stores.token_uri import TokenUri
-from tests.gdp.stores.tokens import PIN, SoftToken, soft_token
+from gdp_extensions.pkcs11.token import TokenKey, generate_token_key, open_token_key
+from gdp_extensions.pkcs11.token_uri import TokenUri
+from tests.gdp_extensions.pkcs11.tokens import PIN, SoftToken, soft_token
 
 NOW = 1_800_000_000.0
 

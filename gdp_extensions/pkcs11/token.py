@@ -19,7 +19,7 @@ from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.stores.files import read_private
 from gdp.stores.passphrase import passphrase_for
-from gdp.stores.token_uri import SCHEME, TokenUri
+from gdp_extensions.pkcs11.token_uri import SCHEME, TokenUri
 
 if TYPE_CHECKING:
     import pkcs11
