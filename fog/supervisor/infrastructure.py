@@ -58,7 +58,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
 
             return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
         case "skypilot":
-            from fog.providers.skypilot.provider import SkyPilotProvider
+            from gdp_extensions.skypilot.provider import SkyPilotProvider
 
             return SkyPilotProvider(site.skypilot)
 

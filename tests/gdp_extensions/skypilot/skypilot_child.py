@@ -22,8 +22,8 @@ from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineReques
 from fog.hardware import Hardware
 from fog.machine import MachineSpec
 from fog.offer import Offer
-from fog.providers.skypilot.config import SkyPilotConfig
-from fog.providers.skypilot.provider import SkyPilotProvider
+from fog.providers.skypilot_config import SkyPilotConfig
+from gdp_extensions.skypilot.provider import SkyPilotProvider
 from gdp.errors import GdpError
 from gdp.trust.join_token import JoinRole, JoinToken
 

@@ -21,9 +21,9 @@ from pydantic import ValidationError
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
-from fog.providers.skypilot.config import SkyPilotConfig
-from fog.providers.skypilot.provider import SkyPilotProvider
-from fog.providers.skypilot.record import cluster_name, labels_of
+from fog.providers.skypilot_config import SkyPilotConfig
+from gdp_extensions.skypilot.provider import SkyPilotProvider
+from gdp_extensions.skypilot.record import cluster_name, labels_of
 from gdp.errors import LocalError, StoreError
 
 EAST = "aws/us-east-1"
@@ -271,7 +271,7 @@ def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     }
     try:
         done = subprocess.run(
-            [PYTHON, "-m", "tests.fog.providers.skypilot_child"],
+            [PYTHON, "-m", "tests.gdp_extensions.skypilot.skypilot_child"],
             env=environment,
             cwd=home,
             capture_output=True,
