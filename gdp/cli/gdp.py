@@ -39,7 +39,7 @@ _KNOWN: Final = {
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
     "show": LazyCommand("gdp.cli.show_tables:show_table"),
-    "dashboard": LazyCommand("gdp.cli.dashboard:dashboard", no_args_is_help=False),
+    "dashboard": LazyCommand("gdp_extensions.dashboard.command:dashboard", no_args_is_help=False),
     "wireshark": LazyCommand("gdp_extensions.dissector.wireshark:wireshark", no_args_is_help=False),
     "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
     "decrypt-pcap": LazyCommand("gdp_extensions.dissector.decrypt_pcap:decrypt_pcap"),

@@ -22,8 +22,8 @@ from unittest import mock
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gdp.crypto.keys import SoftwareKey
-from gdp.dashboard.core.readings import Reading
-from gdp.dashboard.core.scene import Scene
+from gdp_extensions.dashboard.core.readings import Reading
+from gdp_extensions.dashboard.core.scene import Scene
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
 from gdp.nodes.data_plane import Chosen

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.dashboard.core.readings import Reading, flag_of, items_of, map_of, number_of, rows_of, text_of
+from gdp_extensions.dashboard.core.readings import Reading, flag_of, items_of, map_of, number_of, rows_of, text_of
 
 __all__ = ["Graph", "Link", "NameEntry", "Node", "ServerSeen", "merge_readings"]
 

@@ -11,9 +11,9 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from gdp.dashboard.core.graph import Graph, Link, NameEntry, merge_readings
-from gdp.dashboard.core.readings import Reading, number_of, text_of
-from gdp.dashboard.core.series import SeriesStore
+from gdp_extensions.dashboard.core.graph import Graph, Link, NameEntry, merge_readings
+from gdp_extensions.dashboard.core.readings import Reading, number_of, text_of
+from gdp_extensions.dashboard.core.series import SeriesStore
 
 __all__ = ["EVENTS_MAX", "Scene"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from gdp.dashboard.core.graph import merge_readings
-from gdp.dashboard.core.readings import Reading
-from gdp.dashboard.core.scene import Scene
-from gdp.dashboard.core.series import SAMPLES, SeriesStore
-from tests.gdp.dashboard.synthetic_nodes import SyntheticNetwork
+from gdp_extensions.dashboard.core.graph import merge_readings
+from gdp_extensions.dashboard.core.readings import Reading
+from gdp_extensions.dashboard.core.scene import Scene
+from gdp_extensions.dashboard.core.series import SAMPLES, SeriesStore
+from tests.gdp_extensions.dashboard.synthetic_nodes import SyntheticNetwork
 
 
 def switch(node: str, *links: dict[str, object], **more: object) -> Reading:

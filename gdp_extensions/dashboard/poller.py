@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gdp.dashboard.core.readings import Fields, Reading, text_of
+from gdp_extensions.dashboard.core.readings import Fields, Reading, text_of
 from gdp.errors import GdpError
 from gdp.management.control_client import (
     NodeConnection,

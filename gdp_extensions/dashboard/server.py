@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Final
 import orjson
 
 from gdp.access_token import is_access_token, new_access_token
-from gdp.dashboard.core.scene import Scene
-from gdp.dashboard.poller import Poller
+from gdp_extensions.dashboard.core.scene import Scene
+from gdp_extensions.dashboard.poller import Poller
 from gdp.errors import LocalError
 from gdp.extras import require_extra
 
@@ -54,7 +54,7 @@ _HEADERS: Final = {
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Return the page's files by name: media type and bytes."""
     found = {}
-    for each in files("gdp.dashboard").joinpath("page").iterdir():
+    for each in files("gdp_extensions.dashboard").joinpath("page").iterdir():
         suffix = each.name[each.name.rfind(".") :]
         if suffix in _TYPES:
             found[each.name] = (_TYPES[suffix], each.read_bytes())

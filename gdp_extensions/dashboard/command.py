@@ -47,8 +47,8 @@ def dashboard(node: Nodes = None, state: States = None, port: Port = 0, as_json:
 
 
 async def _serve(nodes: tuple[Path, ...], states: tuple[Path, ...], port: int, *, as_json: bool) -> None:
-    from gdp.dashboard.poller import Poller
-    from gdp.dashboard.server import DashboardServer
+    from gdp_extensions.dashboard.poller import Poller
+    from gdp_extensions.dashboard.server import DashboardServer
 
     server = DashboardServer(Poller(nodes, states), port)
     stop = asyncio.Event()
