@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("gdp_extensions.pkcs11")
+
 from gdp.crypto.certificates import Role
 from gdp.stores.issue import admit_node, make_node_keys
 from gdp.stores.keyring import store_again

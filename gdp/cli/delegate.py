@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 from gdp.cli import options
 from gdp.cli.delegations import described, ls, show_file
-from gdp.cli.doors import rules_of_proxies
 from gdp.cli.extension import ANY_ARGUMENTS
 from gdp.cli.output import (
     epochs_from_text,
@@ -22,6 +21,7 @@ from gdp.cli.output import (
     show,
     span,
 )
+from gdp.cli.placeholders import rules_of_proxies
 from gdp.cli.program import Program
 from gdp.cli.rights_file import delegate_rights
 from gdp.crypto.statements import parse

@@ -8,16 +8,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
-from gdp.cli import extension
-from gdp.cli.extension import ExtendedGroup
+from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup
 from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.program import Program
 from gdp.cli.version import Version
 
 __all__ = ["app", "main"]
 
-_DOORS: Final = ("foxglove", "rosbridge", "recording", "rule", "service", "watch")  # of the package proxy
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
+
+
+def _elsewhere(name: str) -> LazyCommand:
+    """Return the placeholder of a command of another package or of an extension."""
+    return LazyCommand(f"gdp.cli.placeholders:{name}", no_args_is_help=False, settings=ANY_ARGUMENTS)
+
+
 _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
     "lab": LazyCommand("gdp.cli.lab:lab"),
@@ -32,17 +37,19 @@ _KNOWN: Final = {
     "status": LazyCommand("gdp.cli.control:status"),
     "drain": LazyCommand("gdp.cli.control:drain"),
     "explain": LazyCommand("gdp.cli.explain:explain"),
-    **{
-        door: LazyCommand(f"gdp.cli.doors:{door}", no_args_is_help=False, settings=extension.ANY_ARGUMENTS)
-        for door in _DOORS
-    },
+    "foxglove": _elsewhere("foxglove"),
+    "rosbridge": _elsewhere("rosbridge"),
+    "recording": _elsewhere("recording"),
+    "rule": _elsewhere("rule"),
+    "service": _elsewhere("service"),
+    "watch": _elsewhere("watch"),
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
     "show": LazyCommand("gdp.cli.show_tables:show_table"),
-    "dashboard": LazyCommand("gdp_extensions.dashboard.command:dashboard", no_args_is_help=False),
-    "wireshark": LazyCommand("gdp_extensions.dissector.wireshark:wireshark", no_args_is_help=False),
+    "dashboard": _elsewhere("dashboard"),
+    "wireshark": _elsewhere("wireshark"),
     "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
-    "decrypt-pcap": LazyCommand("gdp_extensions.dissector.decrypt_pcap:decrypt_pcap"),
+    "decrypt-pcap": _elsewhere("decrypt_pcap"),
     "top": LazyCommand("gdp.cli.top:top", no_args_is_help=False),
     "completion": LazyCommand("gdp.cli.completion:completion"),
     "keygen": LazyCommand("gdp.cli.keygen:app"),
@@ -58,7 +65,9 @@ _KNOWN: Final = {
 
 
 class _Commands(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {each: each for each in _DOORS}
+    extensions: ClassVar[Mapping[str, str]] = {
+        name: name for name, each in _KNOWN.items() if each.target.startswith("gdp.cli.placeholders:")
+    }
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

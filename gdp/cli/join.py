@@ -16,7 +16,6 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
-from gdp.cli.doors import suggest_rules
 from gdp.cli.machine import (
     BORDER_SEEN_S,
     AtDirectory,
@@ -30,6 +29,7 @@ from gdp.cli.machine import (
 )
 from gdp.cli.node import set_up_logging
 from gdp.cli.output import show
+from gdp.cli.placeholders import suggest_rules
 from gdp.cli.secret import PROMPT, Secret
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any

@@ -27,13 +27,13 @@ from gdp.errors import DropReason, LocalError, RemoteError, StatementError, Stor
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
-from gdp_extensions.cluster.link import ClusterLink, Command, tag_of
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp_extensions.cluster.link import ClusterLink, Command, tag_of
 
 __all__ = ["ClusterStore", "load_functions"]
 
-FUNCTIONS: Final = Path(__file__).with_name("cluster_functions.lua")
+FUNCTIONS: Final = Path(__file__).with_name("functions.lua")
 CACHE_MAX: Final = 65_536  # names
 CONTEXTS_MAX: Final = 16_384
 _ID_BYTES: Final = 16

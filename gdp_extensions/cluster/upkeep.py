@@ -12,11 +12,11 @@ from gdp.errors import LocalError
 from gdp.nodes.rib_upkeep import Upkeep
 from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
-from gdp_extensions.cluster.store import ClusterStore, load_functions
 from gdp.stores.cluster_address import ClusterAddress
-from gdp_extensions.cluster.link import ClusterLink
 from gdp.trust.domain import Policy
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp_extensions.cluster.link import ClusterLink
+from gdp_extensions.cluster.store import ClusterStore, load_functions
 
 __all__ = ["ClusterUpkeep"]
 

@@ -1,4 +1,4 @@
-"""``gdp dashboard``: a live view of the nodes of this machine, as a page on the loopback address.
+"""Command ``gdp dashboard``: a live view of the nodes of this machine, as a page on the loopback address.
 
 I/O.
 """
@@ -14,8 +14,11 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.node import failing_clearly, report
+from gdp.cli.program import Program
 
-__all__ = ["dashboard"]
+__all__ = ["app"]
+
+app = Program("gdp dashboard")
 
 _PORT_MAX: Final = 65_535
 
@@ -30,6 +33,7 @@ States = Annotated[
 Port = Annotated[int, typer.Option(min=0, max=_PORT_MAX, help="Port of 127.0.0.1; 0: the system chooses.")]
 
 
+@app.command()
 def dashboard(node: Nodes = None, state: States = None, port: Port = 0, as_json: options.Json = False) -> None:
     """Show domains, switches, links, names, replicas, drops and events live, on one page, until Ctrl-C.
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gdp_extensions.dashboard.core.readings import Fields, Reading, text_of
 from gdp.errors import GdpError
 from gdp.management.control_client import (
     NodeConnection,
@@ -26,6 +25,7 @@ from gdp.management.control_client import (
 )
 from gdp.management.control_socket import CONTROL_SOCKET
 from gdp.state.control_protocol import Command, Request
+from gdp_extensions.dashboard.core.readings import Fields, Reading, text_of
 
 __all__ = ["Poller", "found_sockets", "supervisor_state"]
 

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Final
 import orjson
 
 from gdp.access_token import is_access_token, new_access_token
-from gdp_extensions.dashboard.core.scene import Scene
-from gdp_extensions.dashboard.poller import Poller
 from gdp.errors import LocalError
 from gdp.extras import require_extra
+from gdp_extensions.dashboard.core.scene import Scene
+from gdp_extensions.dashboard.poller import Poller
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

@@ -1,4 +1,4 @@
-"""``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names.
+"""Command ``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names.
 
 I/O.
 """
@@ -17,7 +17,7 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import show
-from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
+from gdp.cli.program import Program
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.frame.codec import ETHER_BYTES
@@ -26,11 +26,14 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.keyring import DELEGATIONS, load_delegations, load_identity, load_owner
 from gdp.terminal import echo
+from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
 
 if TYPE_CHECKING:
     from gdp_extensions.dissector.pcap_files import CapturedFrame
 
-__all__ = ["decrypt_pcap"]
+__all__ = ["app"]
+
+app = Program("gdp decrypt-pcap")
 
 _OPENED_PROTOCOL: Final = "gdp_opened"  # as the dissector registers it
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
@@ -43,6 +46,7 @@ Nodes = Annotated[list[Path], typer.Option("--node", metavar="DIR", help="a node
 Owners = Annotated[list[Path], typer.Option("--owner", metavar="DIR", help="an owner of names")]
 
 
+@app.command(no_args_is_help=True)
 def decrypt_pcap(
     capture: Capture,
     out: Output,

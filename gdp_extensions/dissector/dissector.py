@@ -42,8 +42,8 @@ from gdp.frame.layers import (
     Statement,
     least_bytes,
 )
-from gdp_extensions.dissector.opened import BODIES, OpenedFrame
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES, PARTS_MAX
+from gdp_extensions.dissector.opened import BODIES, OpenedFrame
 
 __all__ = ["FIRST_LINE", "dissector", "prefix_of"]
 

@@ -1,4 +1,4 @@
-"""``gdp wireshark``: the dissector for Wireshark and tshark.
+"""Command ``gdp wireshark``: the dissector for Wireshark and tshark.
 
 I/O.
 """
@@ -14,11 +14,14 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.cli.program import Program
 from gdp.errors import LocalError
 from gdp.extras import require_extra
 from gdp.stores.files import public, read_public, write_all
 
-__all__ = ["wireshark"]
+__all__ = ["app"]
+
+app = Program("gdp wireshark")
 
 _FILE: Final = "gdp.lua"
 _DEFAULT_FOLDER: Final = Path("~/.local/lib/wireshark/plugins")  # Wireshark User's Guide, appendix B.4
@@ -28,6 +31,7 @@ _PATIENCE_S: Final = 10.0
 Install = Annotated[bool, typer.Option("--install", help="write it to Wireshark's folder for your own plugins")]
 
 
+@app.command()
 def wireshark(
     install: Install = False,
     out: options.Out = None,

@@ -19,12 +19,12 @@ from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.stores.files import read_private
 from gdp.stores.passphrase import passphrase_for
-from gdp_extensions.pkcs11.token_uri import SCHEME, TokenUri
+from gdp_extensions.pkcs11.token_uri import TokenUri
 
 if TYPE_CHECKING:
     import pkcs11
 
-__all__ = ["SCHEME", "TokenKey", "generate_token_key", "open_token_key"]
+__all__ = ["TokenKey", "generate_token_key", "open_token_key"]
 
 _DIGEST_BYTES: Final = 32
 _POINT_BYTES: Final = 65

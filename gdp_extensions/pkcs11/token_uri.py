@@ -14,10 +14,10 @@ from typing import Final
 from urllib.parse import unquote, unquote_to_bytes, urlsplit
 
 from gdp.errors import LocalError
+from gdp.stores.private_keys import SCHEME
 
-__all__ = ["SCHEME", "TokenUri"]
+__all__ = ["TokenUri"]
 
-SCHEME: Final = "pkcs11:"
 _EXAMPLE: Final = "pkcs11:token=robot;object=node?module-path=/usr/lib/softhsm/libsofthsm2.so"
 
 

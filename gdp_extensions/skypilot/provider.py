@@ -21,9 +21,9 @@ from fog.machine import Machine, MachineBundle, MachineSpec
 from fog.offer import Offer
 from fog.providers.cloud_init import lines_of, shell_script
 from fog.providers.skypilot_config import SkyPilotConfig
-from gdp_extensions.skypilot.record import being_made, cluster_name, labels_of, machine_of
 from gdp.errors import LocalError, StoreError
 from gdp.extras import install_command
+from gdp_extensions.skypilot.record import being_made, cluster_name, labels_of, machine_of
 
 __all__ = ["SkyPilotProvider"]
 

@@ -17,7 +17,7 @@ from gdp.cli.gdp import main
 try:
     main(["name", "--help"])
 finally:
-    print(*sorted(each for each in sys.modules if each.startswith("gdp.")), file=sys.stderr)
+    print(*sorted(each for each in sys.modules if each.startswith("gdp")), file=sys.stderr)
 """
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from gdp_extensions.dashboard.server import POLL_S, DashboardServer
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp_extensions.dashboard.server import POLL_S, DashboardServer
 from tests.browser import console_errors, needs_browser, open_browser, save_picture
 from tests.gdp_extensions.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 from tests.gdp_extensions.dashboard.test_server import running

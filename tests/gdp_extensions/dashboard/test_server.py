@@ -17,13 +17,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from gdp_extensions.dashboard.poller import Poller, found_sockets
-from gdp_extensions.dashboard.server import DashboardServer
 from gdp.errors import LocalError
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import CONTROL_SOCKET
 from gdp.names import Name
 from gdp.state.control_protocol import Response, encode_response
+from gdp_extensions.dashboard.poller import Poller, found_sockets
+from gdp_extensions.dashboard.server import DashboardServer
 from tests.gdp_extensions.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 
 

@@ -10,7 +10,6 @@ from itertools import count
 import cbor2
 import pytest
 
-from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
 from gdp.client.unicast_stream import PeerIncarnation, private_incarnation, private_name
 from gdp.crypto.control_seal import ControlSealer, control_key
 from gdp.crypto.envelope import Sealer, seal_key
@@ -24,6 +23,7 @@ from gdp.message.heartbeat import Heartbeat
 from gdp.message.parity import Parity, blocks_of, shard_of, span_of
 from gdp.names import Name
 from gdp.trust.grants import topic_secret
+from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, OpenedMessage, Outcome
 
 TOPIC, OTHER = Name(b"t" * 32), Name(b"o" * 32)
 WRITER, READER = PeerIncarnation(Name(b"w" * 32), 7), PeerIncarnation(Name(b"r" * 32), 9)

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp_extensions.dissector.capture_opener import Outcome
 from gdp.crypto.certificates import Role
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.keys import SigningKey
@@ -21,6 +20,7 @@ from gdp.stores.issue import delegate, install_delegation, make_domain, make_nod
 from gdp.stores.keyring import CARD, load_card, load_owner
 from gdp.trust.grants import topic_secret
 from gdp.trust.right import Right
+from gdp_extensions.dissector.capture_opener import Outcome
 from tests.gdp_extensions.dissector.tshark import needs_tshark, tshark, write_pcap
 
 META = Metadata({"kind": "topic", "name": "/camera", "type": "std_msgs/msg/String"})

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp_extensions.dissector.wireshark import _plugin_folder
 from gdp_extensions.dissector.dissector import dissector
+from gdp_extensions.dissector.wireshark import _plugin_folder
 from tests.gdp_extensions.dissector.tshark import needs_tshark
 
 

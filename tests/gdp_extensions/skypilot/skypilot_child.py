@@ -23,9 +23,9 @@ from fog.hardware import Hardware
 from fog.machine import MachineSpec
 from fog.offer import Offer
 from fog.providers.skypilot_config import SkyPilotConfig
-from gdp_extensions.skypilot.provider import SkyPilotProvider
 from gdp.errors import GdpError
 from gdp.trust.join_token import JoinRole, JoinToken
+from gdp_extensions.skypilot.provider import SkyPilotProvider
 
 ECHO = ExportedInterface("service", "/echo", "std_srvs/srv/SetBool")
 PLAN = ClusterPlan("a-demo", (CloudNode("p", "e"),), (MachineRequest(Hardware(cpus=1)),), (ECHO,))

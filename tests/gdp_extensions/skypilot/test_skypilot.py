@@ -22,9 +22,9 @@ from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.skypilot_config import SkyPilotConfig
+from gdp.errors import LocalError, StoreError
 from gdp_extensions.skypilot.provider import SkyPilotProvider
 from gdp_extensions.skypilot.record import cluster_name, labels_of
-from gdp.errors import LocalError, StoreError
 
 EAST = "aws/us-east-1"
 OFFER = Offer("skypilot", EAST, "g4dn.xlarge", Hardware(4, 16.0, "T4", 1), is_spot=True, usd_per_hour=0.16)
