@@ -69,7 +69,7 @@ class Seam(Generic[T]):
     group: str
     extras: Mapping[str, str] = field(default_factory=dict)
 
-    def load(self, name: str, user: str) -> T:
+    def get(self, name: str, user: str) -> T:
         """Return an extension; the first call imports it.
 
         Args:

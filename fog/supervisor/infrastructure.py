@@ -61,7 +61,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
 
             return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
         case "skypilot":
-            return _PROVIDERS.load("skypilot", "provider skypilot")(site.skypilot)
+            return _PROVIDERS.get("skypilot", "provider skypilot")(site.skypilot)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:

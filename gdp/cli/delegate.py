@@ -14,14 +14,13 @@ from typer.core import TyperGroup
 
 from gdp.cli import options
 from gdp.cli.delegations import described, ls, show_file
-from gdp.cli.extension import ANY_ARGUMENTS
+from gdp.cli.extension import ANY_ARGUMENTS, load_command
 from gdp.cli.output import (
     epochs_from_text,
     rights_from_text,
     show,
     span,
 )
-from gdp.cli.placeholders import rules_of_proxies
 from gdp.cli.program import Program
 from gdp.cli.rights_file import delegate_rights
 from gdp.crypto.statements import parse
@@ -73,7 +72,12 @@ OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="wher
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]
 
 
-app.command(_RULES, context_settings=ANY_ARGUMENTS)(rules_of_proxies)
+@app.command(_RULES, context_settings=ANY_ARGUMENTS)
+def rules_of_proxies(context: typer.Context) -> None:
+    """Give each proxy the delegations that the rules of its file need."""
+    load_command("delegate")(context.args)
+
+
 app.command("rights", no_args_is_help=True)(delegate_rights)
 app.command("ls", no_args_is_help=True)(ls)
 app.command("show", no_args_is_help=True)(show_file)

@@ -31,8 +31,9 @@ _COMMANDS: Final[Seam[Any]] = Seam("gdp.command", _EXTRAS)
 
 
 def placeholder(context: typer.Context) -> None:
-    """Run a command whose extension is not installed, or lacks a package."""
-    load_command("topic", user=context.command_path)
+    """Run a command that comes from elsewhere, where it or a package that it needs is not installed."""
+    group: Any = context.parent and context.parent.command
+    load_command(group.extensions[context.info_name], user=context.command_path)
 
 
 def load_command(name: str, *, user: str = "") -> Any:
@@ -44,7 +45,7 @@ def load_command(name: str, *, user: str = "") -> Any:
     Raises:
         MissingExtraError: its package, or an extra of it, is not installed.
     """
-    return _COMMANDS.load(name, user or f"gdp {name}")
+    return _COMMANDS.get(name, user or f"gdp {name}")
 
 
 class ExtendedGroup(TyperGroup):

@@ -18,9 +18,9 @@ __all__ = ["app", "main"]
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 
-def _elsewhere(name: str) -> LazyCommand:
+def _elsewhere(text: str) -> LazyCommand:
     """Return the placeholder of a command of another package or of an extension."""
-    return LazyCommand(f"gdp.cli.placeholders:{name}", no_args_is_help=False, settings=ANY_ARGUMENTS)
+    return LazyCommand("gdp.cli.extension:placeholder", no_args_is_help=False, settings=ANY_ARGUMENTS, help=text)
 
 
 _KNOWN: Final = {
@@ -37,19 +37,29 @@ _KNOWN: Final = {
     "status": LazyCommand("gdp.cli.control:status"),
     "drain": LazyCommand("gdp.cli.control:drain"),
     "explain": LazyCommand("gdp.cli.explain:explain"),
-    "foxglove": _elsewhere("foxglove"),
-    "rosbridge": _elsewhere("rosbridge"),
-    "recording": _elsewhere("recording"),
-    "rule": _elsewhere("rule"),
-    "service": _elsewhere("service"),
-    "watch": _elsewhere("watch"),
+    "foxglove": _elsewhere(
+        "Let Foxglove see what a node's delegations allow, through a WebSocket server on this machine."
+    ),
+    "rosbridge": _elsewhere(
+        "Let rosbridge clients use what a node's delegations allow, through a WebSocket server on this machine."
+    ),
+    "recording": _elsewhere("Complete a recording whose writer was killed."),
+    "rule": _elsewhere("Add, remove and list rules of a proxy while it runs."),
+    "service": _elsewhere("Call a service through the overlay, as a member."),
+    "watch": _elsewhere("Print events when publishers, readers and servers of a name appear, go or are silent."),
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
     "show": LazyCommand("gdp.cli.show_tables:show_table"),
-    "dashboard": _elsewhere("dashboard"),
-    "wireshark": _elsewhere("wireshark"),
+    "dashboard": _elsewhere(
+        "Show domains, switches, links, names, replicas, drops and events live, on one page, until Ctrl-C."
+    ),
+    "wireshark": _elsewhere(
+        "Print a Wireshark dissector for our frames, in Lua, made from the Scapy layers; --install puts it in place."
+    ),
     "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
-    "decrypt-pcap": _elsewhere("decrypt_pcap"),
+    "decrypt-pcap": _elsewhere(
+        "Write a capture with the messages that the given keys open, for Wireshark with the dissector of gdp wireshark."
+    ),
     "top": LazyCommand("gdp.cli.top:top", no_args_is_help=False),
     "completion": LazyCommand("gdp.cli.completion:completion"),
     "keygen": LazyCommand("gdp.cli.keygen:app"),
@@ -65,9 +75,7 @@ _KNOWN: Final = {
 
 
 class _Commands(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {
-        name: name for name, each in _KNOWN.items() if each.target.startswith("gdp.cli.placeholders:")
-    }
+    extensions: ClassVar[Mapping[str, str]] = {name: name for name, each in _KNOWN.items() if each.help}
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

@@ -16,6 +16,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
+from gdp.cli.extension import load_command
 from gdp.cli.machine import (
     BORDER_SEEN_S,
     AtDirectory,
@@ -29,7 +30,6 @@ from gdp.cli.machine import (
 )
 from gdp.cli.node import set_up_logging
 from gdp.cli.output import show
-from gdp.cli.placeholders import suggest_rules
 from gdp.cli.secret import PROMPT, Secret
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
@@ -143,7 +143,7 @@ def up(
     """
     machine = read_machine(path)
     if suggest or _lacks_proxy_file(machine):
-        suggest_rules(machine.directory)
+        load_command("suggest", user="gdp up --suggest")(machine.directory)
         if suggest:
             return
         machine = read_machine(path)

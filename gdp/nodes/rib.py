@@ -72,7 +72,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         stack.callback(upkeep.close)
         rib = RibCore(identity, policy, upkeep.store, _settings(config))
         host = RibHost(identity, policy, rib, fresh_settings(config.lease_s))
-        upkeep.begin(rib, now())
+        upkeep.start(rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
@@ -110,7 +110,7 @@ def _settings(config: RibConfig) -> RibSettings:
 def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     if config.store == "memory":
         return MemoryUpkeep(config.snapshot)
-    open_store = _STORES.load("cluster", "store: cluster")
+    open_store = _STORES.get("cluster", "store: cluster")
     return open_store(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
 
 

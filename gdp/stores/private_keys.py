@@ -56,7 +56,7 @@ _TOKEN_KEYS: Final[Seam[TokenKeys]] = Seam("gdp.token_keys")
 
 def token_keys() -> TokenKeys:
     """Return what opens and makes keys in tokens. Raises ``MissingExtraError``: the extra is not installed."""
-    return _TOKEN_KEYS.load("pkcs11", "a key in a token")
+    return _TOKEN_KEYS.get("pkcs11", "a key in a token")
 
 
 class Storage(str, Enum):

@@ -51,7 +51,7 @@ class ClusterUpkeep(Upkeep):
         self._rib: RibCore | None = None
         self._failures = 0
 
-    def begin(self, rib: RibCore, now: Timestamps) -> None:
+    def start(self, rib: RibCore, now: Timestamps) -> None:
         """Listen for changes."""
         self._rib = rib
         self.work(now)

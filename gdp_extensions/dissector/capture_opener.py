@@ -73,7 +73,7 @@ class CaptureKeys:
     secrets: Mapping[Name, Mapping[int, bytes]] = field(default_factory=dict, repr=False)
     masters: tuple[bytes, ...] = field(default=(), repr=False)
 
-    def of(self, name: Name, epoch: int) -> Iterator[bytes]:
+    def secrets_of(self, name: Name, epoch: int) -> Iterator[bytes]:
         """Yield each secret that may be that of a name's epoch."""
         known = self.secrets.get(name, {}).get(epoch)
         if known is not None:
@@ -189,7 +189,7 @@ class CaptureOpener:
         if (place, header.part) in self._seen:
             return stream.topic, Outcome.REPEATED
         outcome = Outcome.NO_EPOCH if stream.topic in self._keys.secrets else Outcome.NO_KEY
-        for secret in self._keys.of(stream.topic, header.epoch):
+        for secret in self._keys.secrets_of(stream.topic, header.epoch):
             try:
                 if header.kind == Kind.PARITY:
                     opened += self._open_parity(header, frame, stream, secret, now_s)
@@ -237,7 +237,7 @@ class CaptureOpener:
         if header.kind == Kind.ACKNACK:
             return topic, Outcome.ACK_NACK
         outcome = Outcome.NO_EPOCH if topic in self._keys.secrets else Outcome.NO_KEY
-        for secret in self._keys.of(topic, header.epoch):
+        for secret in self._keys.secrets_of(topic, header.epoch):
             key = seal_key(secret, Kind.INTRODUCTION, header.source, header.incarnation, header.destination)
             incarnations = self._incarnations[header.destination]
             for incarnation in incarnations:

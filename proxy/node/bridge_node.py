@@ -101,7 +101,7 @@ def open_tracer(traces: Traces | None, node: Name, label: str) -> CallTracer:
     """
     if traces is None:
         return CallTracer()
-    return _TRACERS.load("otel", "traces")(traces, node, label)
+    return _TRACERS.get("otel", "traces")(traces, node, label)
 
 
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:

@@ -46,7 +46,7 @@ def test_gdp_shows_its_help_without_extensions() -> None:
 def test_a_missing_extension_names_what_installs_it() -> None:
     tracers: Seam[object] = Seam("gdp.tracer")
     with pytest.raises(MissingExtraError, match=r"traces needs the extension absent \(run: .*\[absent\]'\)"):
-        tracers.load("absent", "traces")
+        tracers.get("absent", "traces")
 
 
 @pytest.mark.parametrize(("name", "target"), _TARGETS)

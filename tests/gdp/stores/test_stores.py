@@ -181,7 +181,7 @@ def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, m
     site, folder = Site(), tmp_path / "disk"
     upkeep = MemoryUpkeep(folder / "rib.sqlite")
     rib = RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings())
-    upkeep.begin(rib, site.now())
+    upkeep.start(rib, site.now())
     waiting = upkeep._memory.changes
     assert waiting is not None
     for number in range(100):

@@ -94,7 +94,7 @@ def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_late
         upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
         was_complete = upkeep.is_complete
     at = site.now()
-    upkeep.begin(RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
+    upkeep.start(RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
     deadline_s = time.monotonic() + 60
     while not upkeep.is_complete and time.monotonic() < deadline_s:
         at = Timestamps(at.mono_s + 1.0, at.unix_s + 1.0)
@@ -110,7 +110,7 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     site, config = Site(), config_of(servers)
     upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
     rib = RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings())
-    upkeep.begin(rib, site.now())
+    upkeep.start(rib, site.now())
     password = (servers.parent / "admin.password").read_text().strip()
     with monkeypatch.context() as patient:
         patient.setattr("gdp_extensions.cluster.link._TIMEOUT_S", 30.0)  # a busy server flushes late
