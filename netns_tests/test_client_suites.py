@@ -32,13 +32,13 @@ from lab.process import calling
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
 from proxy.bridge.bridge import Bridge
 from proxy.config.rule import Rule
-from proxy.doors.rules import DoorRules
+from proxy.bridge.core.delegated_rules import DoorRules
 from proxy.endpoints.core.qos import default
-from proxy.node.door import door_config
+from gdp_extensions.doors.node import door_config
 from proxy.node.node import run_node
 from tests.pages import ROOT
 from tests.proxy.bridge import known
-from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES, STATUS
+from tests.gdp_extensions.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES, STATUS
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph, Publication
 
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:

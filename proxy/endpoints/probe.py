@@ -10,7 +10,7 @@ from collections.abc import Callable
 from itertools import count
 
 from gdp.errors import LocalError
-from proxy.doors.types import known_channel
+from gdp_extensions.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, RequestReceived, Role
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos

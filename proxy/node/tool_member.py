@@ -23,9 +23,9 @@ from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.doors.rules import DoorRules, rules_of
+from proxy.bridge.core.delegated_rules import DoorRules, rules_of
 from proxy.endpoints.probe import Probe
-from proxy.node.door import door_config
+from gdp_extensions.doors.node import door_config
 from proxy.node.node import run_node
 
 __all__ = ["ATTACH_S", "Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]

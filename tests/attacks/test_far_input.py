@@ -16,7 +16,7 @@ from gdp.errors import RemoteError
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.expander import MessageExpander
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.doors.rosbridge_json import RosbridgeCodec
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.reduce.compression import BodyDecompressor
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
@@ -310,8 +310,8 @@ def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_ge
 ) -> None:
     pytest.importorskip("websockets")
     from lab.process import until
-    from proxy.doors.foxglove_session import FoxgloveSession
-    from tests.proxy.doors.test_foxglove_door import (
+    from gdp_extensions.doors.foxglove_session import FoxgloveSession
+    from tests.gdp_extensions.doors.test_foxglove_door import (
         advertised,
         client,
         door_of,

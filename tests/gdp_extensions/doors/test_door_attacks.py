@@ -23,19 +23,19 @@ from websockets.sync.client import ClientConnection, connect
 from gdp.errors import GdpError, LocalError
 from gdp.ports.socket_owners import SocketOwners
 from lab.process import until
-from proxy.cli.door_token import door_token
-from proxy.doors.arrivals import Arrivals
-from proxy.doors.client_queue import ClientQueue
-from proxy.doors.foxglove_session import FoxgloveSession
-from proxy.doors.hub import Hub
-from proxy.doors.parameters import GET, LIST, SET
-from proxy.doors.rosbridge_session import IDS_MAX, RosbridgeSession
-from proxy.doors.types import known_channel
+from gdp_extensions.doors.token import door_token
+from gdp_extensions.doors.arrivals import Arrivals
+from gdp_extensions.doors.client_queue import ClientQueue
+from gdp_extensions.doors.foxglove_session import FoxgloveSession
+from gdp_extensions.doors.hub import Hub
+from gdp_extensions.doors.parameters import GET, LIST, SET
+from gdp_extensions.doors.rosbridge_session import IDS_MAX, RosbridgeSession
+from gdp_extensions.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event
-from proxy.endpoints.door import DoorEndpoint, DoorSettings
-from tests.proxy.doors.rights import Everything, goal_id
-from tests.proxy.doors.test_foxglove_door import free_port
-from tests.proxy.doors.test_parameters import service
+from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+from tests.gdp_extensions.doors.rights import Everything, goal_id
+from tests.gdp_extensions.doors.test_foxglove_door import free_port
+from tests.gdp_extensions.doors.test_parameters import service
 
 PATIENCE_S = 20.0
 TOKEN = "t&ken of 24 characters/+"
@@ -316,7 +316,7 @@ def test_z03_of_messages_on_their_way_the_one_that_began_first_gives_way() -> No
 def test_z03_what_waits_for_all_clients_is_bounded_and_the_one_with_most_gives_way(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("proxy.endpoints.door.WAITING_MAX_BYTES", 1_000)
+    monkeypatch.setattr("gdp_extensions.doors.endpoint.WAITING_MAX_BYTES", 1_000)
     with door_of() as door, connect(door.url) as first, connect(door.url) as second:
         assert is_served(first)
         assert is_served(second)

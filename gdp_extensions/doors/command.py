@@ -14,11 +14,11 @@ import typer
 from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json
 from gdp.links.uplink import wait_for_device
-from proxy.cli.door_token import NoToken, TokenFile, door_token
+from gdp_extensions.doors.token import NoToken, TokenFile, door_token
 from proxy.cli.node_options import Delegations, Iface
 
 if TYPE_CHECKING:
-    from proxy.endpoints.door import NewSession
+    from gdp_extensions.doors.endpoint import NewSession
 
 __all__ = ["DoorNode", "DoorOptions", "Listen", "serve_door"]
 
@@ -57,8 +57,8 @@ def serve_door(
     Raises:
         LocalError: keys, delegations, the token, the device or the address are not as stated.
     """
-    from proxy.endpoints.door import DoorEndpoint, DoorSettings
-    from proxy.node.door import door_config, run_door
+    from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+    from gdp_extensions.doors.node import door_config, run_door
 
     config, _ = door_config(node, options.iface, options.delegations)
     token = door_token(options.token_file, no_token=options.no_token)

@@ -11,7 +11,7 @@ import typer
 
 from gdp.cli.node import Logs, running
 from gdp.cli.program import Program
-from proxy.cli.door_command import DoorNode, DoorOptions, Listen, serve_door
+from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, serve_door
 
 __all__ = ["app"]
 
@@ -43,8 +43,8 @@ def foxglove(
     Topics that it may read are channels, services that it may call are services. Clients publish what it may publish.
     """
     with running(logs):
-        from proxy.doors.foxglove_protocol import SUBPROTOCOLS
-        from proxy.doors.foxglove_session import FoxgloveSession
+        from gdp_extensions.doors.foxglove_protocol import SUBPROTOCOLS
+        from gdp_extensions.doors.foxglove_session import FoxgloveSession
 
         serve_door(
             "foxglove",

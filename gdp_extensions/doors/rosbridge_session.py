@@ -16,12 +16,12 @@ import orjson
 
 from gdp.errors import GdpError, LocalError
 from gdp.ros_names import resolved
-from proxy.doors.client_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
-from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.doors.hub import REASON_MAX, Hub, Publication, TopicType
-from proxy.doors.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
-from proxy.doors.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
-from proxy.doors.throttle import Throttle
+from gdp_extensions.doors.client_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
+from gdp_extensions.doors.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.hub import REASON_MAX, Hub, Publication, TopicType
+from gdp_extensions.doors.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
+from proxy.serial.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
+from gdp_extensions.doors.throttle import Throttle
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 

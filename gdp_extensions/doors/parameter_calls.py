@@ -13,9 +13,9 @@ from typing import Final, TypeAlias
 import orjson
 
 from gdp.errors import GdpError
-from proxy.doors.hub import DoorSession, Hub
-from proxy.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
-from proxy.doors.rosbridge_json import RosbridgeCodec
+from gdp_extensions.doors.hub import DoorSession, Hub
+from gdp_extensions.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
 
 __all__ = ["ParameterCall", "ParameterCalls"]

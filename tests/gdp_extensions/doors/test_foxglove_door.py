@@ -26,17 +26,17 @@ from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
-from proxy.doors.foxglove_protocol import SUBPROTOCOLS
-from proxy.doors.foxglove_session import FoxgloveSession
-from proxy.doors.hub import Rights
-from proxy.doors.rules import rules_of
-from proxy.doors.types import known_channel
+from gdp_extensions.doors.foxglove_protocol import SUBPROTOCOLS
+from gdp_extensions.doors.foxglove_session import FoxgloveSession
+from gdp_extensions.doors.hub import Rights
+from proxy.bridge.core.delegated_rules import rules_of
+from gdp_extensions.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
-from proxy.endpoints.door import DoorEndpoint, DoorSettings
+from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
 from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
-from tests.proxy.doors.rights import Everything
+from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 
 PATIENCE_S = 20.0

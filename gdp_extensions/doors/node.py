@@ -23,9 +23,9 @@ from gdp.session.settings import SessionConfig, settings_of
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
 from proxy.config.config import ProxyConfig
-from proxy.doors.hub import Rights
-from proxy.doors.rules import DoorRules, rules_of
-from proxy.endpoints.door import DoorEndpoint
+from gdp_extensions.doors.hub import Rights
+from proxy.bridge.core.delegated_rules import DoorRules, rules_of
+from gdp_extensions.doors.endpoint import DoorEndpoint
 from proxy.node.node import ProxyNode, run_node
 
 __all__ = ["OpenDoor", "door_config", "run_door"]

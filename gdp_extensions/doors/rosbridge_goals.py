@@ -14,10 +14,10 @@ import orjson
 
 from gdp.errors import GdpError, LocalError
 from gdp.ros_names import ACTION_INFIX, resolved
-from proxy.doors.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
-from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.doors.hub import REASON_MAX, DoorSession, Hub, Publication
-from proxy.doors.rosbridge_json import codec_of
+from gdp_extensions.doors.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
+from gdp_extensions.doors.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.hub import REASON_MAX, DoorSession, Hub, Publication
+from proxy.serial.rosbridge_json import codec_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 

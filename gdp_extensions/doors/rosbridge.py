@@ -13,7 +13,7 @@ import typer
 
 from gdp.cli.node import Logs, running
 from gdp.cli.program import Program
-from proxy.cli.door_command import DoorNode, DoorOptions, Listen, serve_door
+from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, serve_door
 
 __all__ = ["app"]
 
@@ -45,7 +45,7 @@ def rosbridge(
     Clients subscribe to what it may read, call what it may call, and publish what it may publish.
     """
     with running(logs):
-        from proxy.doors.rosbridge_session import RosbridgeSession
+        from gdp_extensions.doors.rosbridge_session import RosbridgeSession
 
         serve_door(
             "rosbridge",
