@@ -25,7 +25,7 @@ def open_endpoint(end: RosGraphConfig, node: str) -> RosEndpoint:
 
         return Ros1Endpoint(end.master_uri, node)
     if end.endpoint == "dds":
-        from proxy.endpoints.dds import DdsEndpoint
+        from gdp_extensions.dds import DdsEndpoint
 
         return DdsEndpoint(end.domain_id, node)
     from proxy.endpoints.ros2 import Ros2Endpoint

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from proxy.serial.rosbridge_json import RosbridgeCodec
-from proxy.endpoints.dds.types import known_channel
+from gdp_extensions.dds.types import known_channel
 from proxy.recordings.channels import from_ros2
 from proxy.serial.channel import EMPTY_MD5, Channel, ros1_format
 from proxy.serial.converter import MessageConverter, translated_channel

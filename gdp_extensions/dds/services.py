@@ -15,10 +15,10 @@ from typing import Final, NamedTuple
 
 from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
 from proxy.endpoints.core.qos import default
-from proxy.endpoints.dds import library
-from proxy.endpoints.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
-from proxy.endpoints.dds.node import EntityContext, Sample
-from proxy.endpoints.dds.profile import offered, requested
+from gdp_extensions.dds import library
+from gdp_extensions.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
+from gdp_extensions.dds.node import EntityContext, Sample
+from gdp_extensions.dds.profile import offered, requested
 from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 

@@ -10,7 +10,7 @@ from gdp.errors import LocalError
 from gdp.extras import install_command
 
 try:
-    from proxy.endpoints.dds.endpoint import DdsEndpoint
+    from gdp_extensions.dds.endpoint import DdsEndpoint
 except ModuleNotFoundError as error:
     if not (error.name or "").startswith("cyclonedds"):
         raise

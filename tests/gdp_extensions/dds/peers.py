@@ -21,7 +21,7 @@ from lab.process import until
 from proxy.endpoints.core.endpoint import Event, GraphEntity, Role
 
 if TYPE_CHECKING:
-    from proxy.endpoints.dds import DdsEndpoint
+    from gdp_extensions.dds import DdsEndpoint
 
 __all__ = ["CYCLONE", "Ears", "Peer", "digest", "peer"]
 
@@ -140,7 +140,7 @@ def peer(kind: str, domain: int) -> Iterator[Peer]:
         "CYCLONEDDS_URI": CYCLONE,
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.proxy.endpoints.dds_peers", kind, str(domain)],
+        [sys.executable, "-m", "tests.gdp_extensions.dds.peers", kind, str(domain)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env=environment,
@@ -246,7 +246,7 @@ def _rclpy_peer() -> None:
 
 def _dds_peer(domain: int) -> None:
     from proxy.endpoints.core.endpoint import CallFailed, RequestReceived, ResponseReceived
-    from proxy.endpoints.dds import DdsEndpoint
+    from gdp_extensions.dds import DdsEndpoint
     from proxy.serial.channel import Channel
     from proxy.serial.service import Service
 

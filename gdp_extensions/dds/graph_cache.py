@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
-from proxy.endpoints.dds.naming import Named
-from proxy.endpoints.dds.node_info import NodeInfo
+from gdp_extensions.dds.naming import Named
+from gdp_extensions.dds.node_info import NodeInfo
 from proxy.serial.channel import Qos
 
 __all__ = ["GraphCache", "Peer"]

@@ -21,14 +21,14 @@ from cyclonedds.sub import DataReader, Subscriber
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.core.qos import default
-from proxy.endpoints.dds import library
-from proxy.endpoints.dds.discovery_range import with_discovery_range
-from proxy.endpoints.dds.graph_cache import GraphCache
-from proxy.endpoints.dds.naming import user_data
-from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
-from proxy.endpoints.dds.opaque import OpaqueTopic
-from proxy.endpoints.dds.profile import offered
-from proxy.endpoints.dds.wait_thread import News, WaitThread
+from gdp_extensions.dds import library
+from gdp_extensions.dds.discovery_range import with_discovery_range
+from gdp_extensions.dds.graph_cache import GraphCache
+from gdp_extensions.dds.naming import user_data
+from gdp_extensions.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
+from gdp_extensions.dds.opaque import OpaqueTopic
+from gdp_extensions.dds.profile import offered
+from gdp_extensions.dds.wait_thread import News, WaitThread
 
 __all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
 

@@ -14,10 +14,10 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
-from proxy.endpoints.dds import DdsEndpoint
+from gdp_extensions.dds import DdsEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
-from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, peer
+from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, peer
 
 SET = "std_srvs/srv/SetBool"
 SERVICE = Service("/set", SET, "", Channel("/set", f"{SET}_Request", 2), Channel("/set", f"{SET}_Response", 2))

@@ -19,13 +19,13 @@ from cyclonedds.core import InstanceState, ReadCondition
 from cyclonedds.internal import SampleInfo
 
 from proxy.endpoints.core.qos import default
-from proxy.endpoints.dds.graph_cache import GraphCache, Peer
-from proxy.endpoints.dds.naming import hash_in, identity_in, named, user_data
-from proxy.endpoints.dds.node import ANY_STATE, Node, Sample
-from proxy.endpoints.dds.node_info import INFO_HASH, INFO_TOPIC, INFO_TYPE, read_info
-from proxy.endpoints.dds.policies import Announced, announced
-from proxy.endpoints.dds.profile import requested
-from proxy.endpoints.dds.wait_thread import News
+from gdp_extensions.dds.graph_cache import GraphCache, Peer
+from gdp_extensions.dds.naming import hash_in, identity_in, named, user_data
+from gdp_extensions.dds.node import ANY_STATE, Node, Sample
+from gdp_extensions.dds.node_info import INFO_HASH, INFO_TOPIC, INFO_TYPE, read_info
+from gdp_extensions.dds.policies import Announced, announced
+from gdp_extensions.dds.profile import requested
+from gdp_extensions.dds.wait_thread import News
 
 __all__ = ["Discovery"]
 

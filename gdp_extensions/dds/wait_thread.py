@@ -17,7 +17,7 @@ from typing import Final, TypeAlias
 from cyclonedds.core import GuardCondition
 from cyclonedds.domain import DomainParticipant
 
-from proxy.endpoints.dds.library import WaitSet
+from gdp_extensions.dds.library import WaitSet
 
 __all__ = ["Drain", "News", "WaitThread"]
 

@@ -14,9 +14,9 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 from gdp.extras import install_command
 from proxy.endpoints.core.endpoint import Role
 from proxy.endpoints.core.qos import default
-from proxy.endpoints.dds.graph_cache import GraphCache, Peer
-from proxy.endpoints.dds.naming import Named, dds_type, hash_in, identity, identity_in, named, user_data
-from proxy.endpoints.dds.node_info import NodeInfo, read_info, write_info
+from gdp_extensions.dds.graph_cache import GraphCache, Peer
+from gdp_extensions.dds.naming import Named, dds_type, hash_in, identity, identity_in, named, user_data
+from gdp_extensions.dds.node_info import NodeInfo, read_info, write_info
 
 ME = bytes(range(16))
 READER, WRITER = bytes([1] * 16), bytes([2] * 16)
@@ -88,7 +88,7 @@ def test_without_the_binding_one_sentence_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['cyclonedds'] = None\n"
         "from gdp.errors import LocalError\n"
-        "try:\n    import proxy.endpoints.dds\n"
+        "try:\n    import gdp_extensions.dds\n"
         "except LocalError as error:\n    print(error)\n"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

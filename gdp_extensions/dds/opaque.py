@@ -20,7 +20,7 @@ from cyclonedds.idl import types as idl
 from cyclonedds.topic import Topic
 
 from gdp.errors import LocalError
-from proxy.endpoints.dds.library import sertype_of
+from gdp_extensions.dds.library import sertype_of
 
 __all__ = ["OpaqueTopic"]
 

@@ -22,10 +22,10 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.core.qos import default, unmatched
-from proxy.endpoints.dds import DdsEndpoint
+from gdp_extensions.dds import DdsEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
-from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, digest, peer
+from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, digest, peer
 
 STRING = "std_msgs/msg/String"
 HELLO = b"\x00\x01\x00\x00\x06\x00\x00\x00hello\x00\x00\x00"

@@ -13,12 +13,12 @@ from typing import Final, TypeVar
 from gdp.errors import LocalError
 from gdp.ros_names import ACTION_INFIX
 from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
-from proxy.endpoints.dds.discovery import Discovery
-from proxy.endpoints.dds.graph_cache import GraphCache
-from proxy.endpoints.dds.node import EntityContext, Node
-from proxy.endpoints.dds.services import Client, Server
-from proxy.endpoints.dds.topics import Publication, Subscription
-from proxy.endpoints.dds.types import hash_of, known_channel
+from gdp_extensions.dds.discovery import Discovery
+from gdp_extensions.dds.graph_cache import GraphCache
+from gdp_extensions.dds.node import EntityContext, Node
+from gdp_extensions.dds.services import Client, Server
+from gdp_extensions.dds.topics import Publication, Subscription
+from gdp_extensions.dds.types import hash_of, known_channel
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
