@@ -85,4 +85,5 @@ class Seam(Generic[T]):
         try:
             return cast("T", point.load())
         except ModuleNotFoundError as error:
-            raise MissingExtraError(f"{user} needs {error.name} (run: {command})") from error
+            package = str(error.name).partition(".")[0]
+            raise MissingExtraError(f"{user} needs {package} (run: {command})") from error

@@ -36,7 +36,7 @@ _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
 _COMPUTED: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.FloorDiv, ast.FloorDiv: ast.Mult,
 }  # fmt: skip
-_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp")
+_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp", "tests/gdp_extensions")
 _TEST_S: Final = 2_400.0  # a mutant that hangs counts as killed
 
 

@@ -5,15 +5,3 @@
 be opened. ``library``, ``opaque``, ``policies`` and ``profile`` wrap parts of Cyclone. ``naming`` and ``node_info``
 implement ROS's conventions in DDS.
 """
-
-from gdp.errors import LocalError
-from gdp.extras import install_command
-
-try:
-    from gdp_extensions.dds.endpoint import DdsEndpoint
-except ModuleNotFoundError as error:
-    if not (error.name or "").startswith("cyclonedds"):
-        raise
-    raise LocalError(f"endpoint dds needs Cyclone DDS's Python binding: {install_command('dds')}") from error
-
-__all__ = ["DdsEndpoint"]

@@ -18,7 +18,6 @@ from cyclonedds.builtin import (
 from cyclonedds.core import InstanceState, ReadCondition
 from cyclonedds.internal import SampleInfo
 
-from proxy.endpoints.core.qos import default
 from gdp_extensions.dds.graph_cache import GraphCache, Peer
 from gdp_extensions.dds.naming import hash_in, identity_in, named, user_data
 from gdp_extensions.dds.node import ANY_STATE, Node, Sample
@@ -26,6 +25,7 @@ from gdp_extensions.dds.node_info import INFO_HASH, INFO_TOPIC, INFO_TYPE, read_
 from gdp_extensions.dds.policies import Announced, announced
 from gdp_extensions.dds.profile import requested
 from gdp_extensions.dds.wait_thread import News
+from proxy.endpoints.core.qos import default
 
 __all__ = ["Discovery"]
 

@@ -12,13 +12,13 @@ from typing import Final, TypeVar
 
 from gdp.errors import LocalError
 from gdp.ros_names import ACTION_INFIX
-from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
 from gdp_extensions.dds.discovery import Discovery
 from gdp_extensions.dds.graph_cache import GraphCache
 from gdp_extensions.dds.node import EntityContext, Node
 from gdp_extensions.dds.services import Client, Server
 from gdp_extensions.dds.topics import Publication, Subscription
 from gdp_extensions.dds.types import hash_of, known_channel
+from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from gdp_extensions.dds.naming import Named
 from gdp_extensions.dds.node_info import NodeInfo
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.serial.channel import Qos
 
 __all__ = ["GraphCache", "Peer"]

@@ -19,8 +19,6 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
-from proxy.endpoints.core.endpoint import Event
-from proxy.endpoints.core.qos import default
 from gdp_extensions.dds import library
 from gdp_extensions.dds.discovery_range import with_discovery_range
 from gdp_extensions.dds.graph_cache import GraphCache
@@ -29,6 +27,8 @@ from gdp_extensions.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_
 from gdp_extensions.dds.opaque import OpaqueTopic
 from gdp_extensions.dds.profile import offered
 from gdp_extensions.dds.wait_thread import News, WaitThread
+from proxy.endpoints.core.endpoint import Event
+from proxy.endpoints.core.qos import default
 
 __all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
 

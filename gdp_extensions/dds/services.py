@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
-from proxy.endpoints.core.qos import default
 from gdp_extensions.dds import library
 from gdp_extensions.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
 from gdp_extensions.dds.node import EntityContext, Sample
 from gdp_extensions.dds.profile import offered, requested
+from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.core.qos import default
 from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import LocalError
-from proxy.endpoints.core.endpoint import EndpointError, MessageReceived, Role, TypeResolved
-from proxy.endpoints.core.qos import default
 from gdp_extensions.dds import library
 from gdp_extensions.dds.naming import dds_type, user_data
 from gdp_extensions.dds.node import EntityContext, Sample
 from gdp_extensions.dds.profile import offered, requested
 from gdp_extensions.dds.types import known_channel
+from proxy.endpoints.core.endpoint import EndpointError, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Publication", "Subscription"]

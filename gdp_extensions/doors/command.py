@@ -58,9 +58,10 @@ def serve_door(
         LocalError: keys, delegations, the token, the device or the address are not as stated.
     """
     from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
-    from gdp_extensions.doors.node import door_config, run_door
+    from gdp_extensions.doors.node import run_door
+    from proxy.node.member_config import member_config
 
-    config, _ = door_config(node, options.iface, options.delegations)
+    config, _ = member_config(node, options.iface, options.delegations)
     token = door_token(options.token_file, no_token=options.no_token)
     settings = DoorSettings(label=label, listen=listen, origins=tuple(origins), subprotocols=subprotocols, token=token)
     wait_for_device(config.iface, options.await_iface)

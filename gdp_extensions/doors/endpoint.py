@@ -28,13 +28,13 @@ from gdp.extras import require_extra
 from gdp.host_port import split_host_port
 from gdp.ports.listening import listen_tcp
 from gdp.ports.socket_owners import SocketOwners
-from gdp_extensions.doors.arrivals import Arrivals
-from gdp_extensions.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
-from gdp_extensions.doors.hub import DoorSession, Hub, Rights
-from gdp_extensions.doors.types import known_channel
+from gdp_extensions.doors.core.arrivals import Arrivals
+from gdp_extensions.doors.core.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
+from gdp_extensions.doors.core.hub import DoorSession, Hub, Rights
 from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos
+from proxy.serial.known_types import known_channel
 from proxy.serial.service import Service
 
 if TYPE_CHECKING:

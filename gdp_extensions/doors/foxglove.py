@@ -43,8 +43,8 @@ def foxglove(
     Topics that it may read are channels, services that it may call are services. Clients publish what it may publish.
     """
     with running(logs):
-        from gdp_extensions.doors.foxglove_protocol import SUBPROTOCOLS
-        from gdp_extensions.doors.foxglove_session import FoxgloveSession
+        from gdp_extensions.doors.core.foxglove_protocol import SUBPROTOCOLS
+        from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
 
         serve_door(
             "foxglove",

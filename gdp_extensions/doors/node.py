@@ -6,29 +6,21 @@ I/O.
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
-import orjson
-from pydantic import ValidationError
-
 from gdp.cli.node import emit, emit_wait, report
-from gdp.config.schema import first_fault
-from gdp.errors import LocalError
 from gdp.nodes.delegation_store import DelegationStore
-from gdp.session.settings import SessionConfig, settings_of
 from gdp.terminal import echo
-from proxy.bridge.bridge import Bridge
-from proxy.config.config import ProxyConfig
-from gdp_extensions.doors.hub import Rights
-from proxy.bridge.core.delegated_rules import DoorRules, rules_of
+from gdp_extensions.doors.core.hub import Rights
 from gdp_extensions.doors.endpoint import DoorEndpoint
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
+from proxy.config.config import ProxyConfig
 from proxy.node.node import ProxyNode, run_node
 
-__all__ = ["OpenDoor", "door_config", "run_door"]
+__all__ = ["OpenDoor", "run_door"]
 
 log = logging.getLogger(__name__)
 
@@ -36,42 +28,6 @@ OpenDoor = Callable[[Callable[[], Rights]], DoorEndpoint]
 
 _TICK_S: Final = 0.5
 _TURN_S: Final = 0.0002  # longest wait of the server's thread for the interpreter; Python's default is 5 ms
-
-
-def door_config(node: Path, iface: str | None, delegations: Path | None) -> tuple[ProxyConfig, Path]:
-    """Return the configuration of a door's member, and the directory of its delegations.
-
-    Args:
-        node: its directory, or its configuration file; rules and graphs in that are not used.
-
-    Raises:
-        LocalError: the node does not exist, or its files are wrong.
-    """
-    settings = settings_of(node, iface=iface, delegations=delegations)
-    directory = settings.delegation_directory
-    if not directory.is_dir():
-        raise LocalError(f"{directory}: no delegations; install one with 'gdp delegate install FILE --node {node}'")
-    try:
-        return ProxyConfig.model_validate_json(orjson.dumps(_values(settings, directory), default=os.fspath)), directory
-    except ValidationError as error:
-        raise LocalError(f"{node}: {first_fault(error)}") from error
-
-
-def _values(settings: SessionConfig, directory: Path) -> dict[str, object]:
-    domain = settings.domain
-    return {
-        "identity": settings.identity,
-        "domain": {
-            "root": domain.root,
-            "trusts": list(domain.trusts),
-            "transit": None if domain.transit is None else list(domain.transit),
-        },
-        "iface": settings.iface,
-        "delegations": directory,
-        "state": settings.state,
-        "lease_s": settings.lease_s,
-        "busy_poll_us": settings.busy_poll_us,
-    }
 
 
 def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
@@ -110,7 +66,7 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
         report("done", text, json=json, **totals, faults=dict(node.state.context.faults.counts))
 
 
-def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorRules], *, json: bool) -> None:
+def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DelegatedRules], *, json: bool) -> None:
     is_ready = False
     tick_at_s = 0.0
     while not node.runtime.is_stopped:
@@ -123,7 +79,7 @@ def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorR
             _tell_ready(node, door, state[0], json=json)
 
 
-def _tell_ready(node: ProxyNode, door: DoorEndpoint, rules: DoorRules, *, json: bool) -> None:
+def _tell_ready(node: ProxyNode, door: DoorEndpoint, rules: DelegatedRules, *, json: bool) -> None:
     if json:
         host, port = door.address
         reads, writes = [each.name for each in rules.imports], [each.name for each in rules.expose]

@@ -45,7 +45,7 @@ def rosbridge(
     Clients subscribe to what it may read, call what it may call, and publish what it may publish.
     """
     with running(logs):
-        from gdp_extensions.doors.rosbridge_session import RosbridgeSession
+        from gdp_extensions.doors.core.rosbridge_session import RosbridgeSession
 
         serve_door(
             "rosbridge",

@@ -1,6 +1,6 @@
-"""Rules of a door: one for each name that its own delegations let it read, call or publish.
+"""Rules of a member without configured ones: each name that its delegations let it read, call or publish.
 
-Sans-I/O. A door has no configuration of what crosses: the owners' delegations say it.
+Sans-I/O. Doors and tools have no configuration of what crosses: the owners' delegations say it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from gdp.errors import GdpError
 from gdp.trust.right import Right
 from proxy.config.rule import Rule
 
-__all__ = ["DoorRules", "rules_of"]
+__all__ = ["DelegatedRules", "rules_of"]
 
 _OWN_KEYS = ("kind", "name", "type")
 
 
 @dataclass(frozen=True, slots=True)
-class DoorRules:
-    """Rules of the one endpoint of a door.
+class DelegatedRules:
+    """Rules of the one endpoint of such a member.
 
     Attributes:
         left_out: names of delegations that no ROS name fits, with the reason.
@@ -69,7 +69,7 @@ def _missing(rules: Sequence[Rule], right: str, kind: str, name: str, type_name:
     )
 
 
-def rules_of(held: Sequence[Topic]) -> DoorRules:
+def rules_of(held: Sequence[Topic]) -> DelegatedRules:
     """Return the rules that delegations with metadata give; every other one names its reason."""
     expose, imports, left_out = list[Rule](), list[Rule](), list[tuple[str, str]]()
     for topic in held:
@@ -96,4 +96,4 @@ def rules_of(held: Sequence[Topic]) -> DoorRules:
             expose.append(rule)
         if Right.READ in rights if rule.kind == "topic" else Right.CALL in rights:
             imports.append(rule)
-    return DoorRules(expose, imports, left_out)
+    return DelegatedRules(expose, imports, left_out)

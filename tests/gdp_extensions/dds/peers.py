@@ -21,7 +21,7 @@ from lab.process import until
 from proxy.endpoints.core.endpoint import Event, GraphEntity, Role
 
 if TYPE_CHECKING:
-    from gdp_extensions.dds import DdsEndpoint
+    from gdp_extensions.dds.endpoint import DdsEndpoint
 
 __all__ = ["CYCLONE", "Ears", "Peer", "digest", "peer"]
 
@@ -245,8 +245,8 @@ def _rclpy_peer() -> None:
 
 
 def _dds_peer(domain: int) -> None:
+    from gdp_extensions.dds.endpoint import DdsEndpoint
     from proxy.endpoints.core.endpoint import CallFailed, RequestReceived, ResponseReceived
-    from gdp_extensions.dds import DdsEndpoint
     from proxy.serial.channel import Channel
     from proxy.serial.service import Service
 

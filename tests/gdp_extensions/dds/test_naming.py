@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
 from gdp.extras import install_command
-from proxy.endpoints.core.endpoint import Role
-from proxy.endpoints.core.qos import default
 from gdp_extensions.dds.graph_cache import GraphCache, Peer
 from gdp_extensions.dds.naming import Named, dds_type, hash_in, identity, identity_in, named, user_data
 from gdp_extensions.dds.node_info import NodeInfo, read_info, write_info
+from proxy.endpoints.core.endpoint import Role
+from proxy.endpoints.core.qos import default
 
 ME = bytes(range(16))
 READER, WRITER = bytes([1] * 16), bytes([2] * 16)
@@ -88,8 +88,10 @@ def test_without_the_binding_one_sentence_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['cyclonedds'] = None\n"
         "from gdp.errors import LocalError\n"
-        "try:\n    import gdp_extensions.dds\n"
+        "from proxy.config.graph import RosGraphConfig\n"
+        "from proxy.endpoints.live import open_endpoint\n"
+        "try:\n    open_endpoint(RosGraphConfig(endpoint='dds'), 'n')\n"
         "except LocalError as error:\n    print(error)\n"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said == f"endpoint dds needs Cyclone DDS's Python binding: {install_command('dds')}\n"
+    assert said == f"endpoint dds needs cyclonedds (run: {install_command('dds')})\n"

@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
 from gdp.errors import LocalError
+from gdp_extensions.dds.endpoint import DdsEndpoint
 from proxy.endpoints.core.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
-from gdp_extensions.dds import DdsEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, peer

@@ -12,6 +12,7 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from gdp.errors import LocalError
+from gdp_extensions.dds.endpoint import DdsEndpoint
 from proxy.endpoints.core.endpoint import (
     EndpointError,
     Event,
@@ -22,7 +23,6 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.core.qos import default, unmatched
-from gdp_extensions.dds import DdsEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, digest, peer

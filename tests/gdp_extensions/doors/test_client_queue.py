@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gdp_extensions.doors.client_queue import CONTROL_MAX_BYTES, ClientQueue, Pending
+from gdp_extensions.doors.core.client_queue import CONTROL_MAX_BYTES, ClientQueue, Pending
 
 
 def drained(queue: ClientQueue) -> list[tuple[int, bytes]]:

@@ -8,6 +8,7 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -22,20 +23,22 @@ from websockets.sync.client import ClientConnection, connect
 
 from gdp.errors import GdpError, LocalError
 from gdp.ports.socket_owners import SocketOwners
-from lab.process import until
-from gdp_extensions.doors.token import door_token
-from gdp_extensions.doors.arrivals import Arrivals
-from gdp_extensions.doors.client_queue import ClientQueue
-from gdp_extensions.doors.foxglove_session import FoxgloveSession
-from gdp_extensions.doors.hub import Hub
-from gdp_extensions.doors.parameters import GET, LIST, SET
-from gdp_extensions.doors.rosbridge_session import IDS_MAX, RosbridgeSession
-from gdp_extensions.doors.types import known_channel
-from proxy.endpoints.core.endpoint import Event
+from gdp_extensions.doors.core.arrivals import Arrivals
+from gdp_extensions.doors.core.client_queue import ClientQueue
+from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
+from gdp_extensions.doors.core.hub import Hub
+from gdp_extensions.doors.core.parameters import GET, LIST, SET
+from gdp_extensions.doors.core.rosbridge_session import IDS_MAX, RosbridgeSession
 from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+from gdp_extensions.doors.token import door_token
+from lab.process import until
+from proxy.endpoints.core.endpoint import Event
+from proxy.serial.known_types import known_channel
+from tests.gdp_extensions.doors import test_foxglove_door as foxglove
 from tests.gdp_extensions.doors.rights import Everything, goal_id
 from tests.gdp_extensions.doors.test_foxglove_door import free_port
 from tests.gdp_extensions.doors.test_parameters import service
+from tests.proxy.bridge import known
 
 PATIENCE_S = 20.0
 TOKEN = "t&ken of 24 characters/+"
@@ -331,3 +334,27 @@ def test_z03_what_waits_for_all_clients_is_bounded_and_the_one_with_most_gives_w
             hear_all(second)
         first.recv(PATIENCE_S)
         assert is_served(first)
+
+
+def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_gets_the_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    encode = FoxgloveSession.encode
+    monkeypatch.setattr(
+        FoxgloveSession, "encode", lambda self, item: 1 / 0 if item.raw == b"bad" else encode(self, item)
+    )
+    door = foxglove.door_of()
+    try:
+        with foxglove.client(door) as listener:
+            handle = door.advertise(replace(known.channel(known.STRING), topic="/chatter"))
+            foxglove.subscribe(listener, 7, foxglove.advertised(listener))
+            until(lambda: bool(foxglove.readers(door)))
+            for raw in (b"bad", b"good"):
+                door.publish(handle, raw)
+            status = foxglove.heard(listener)
+            assert (status["op"], status["level"]) == ("status", 2)
+            assert "ZeroDivisionError" in str(status["message"])
+            assert foxglove.message(listener) == (7, b"good")
+            assert door.dropped == 1
+    finally:
+        door.shut_down()

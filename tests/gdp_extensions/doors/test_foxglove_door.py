@@ -21,22 +21,22 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from gdp.errors import LocalError
+from gdp_extensions.doors.core.foxglove_protocol import SUBPROTOCOLS
+from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
+from gdp_extensions.doors.core.hub import Rights
+from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
 from lab.process import until
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.delegated_rules import rules_of
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
-from gdp_extensions.doors.foxglove_protocol import SUBPROTOCOLS
-from gdp_extensions.doors.foxglove_session import FoxgloveSession
-from gdp_extensions.doors.hub import Rights
-from proxy.bridge.core.delegated_rules import rules_of
-from gdp_extensions.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
-from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+from proxy.serial.known_types import known_channel
+from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
-from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 
 PATIENCE_S = 20.0

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
-from gdp_extensions.doors import foxglove_protocol as protocol
-from gdp_extensions.doors.types import known_channel
+from gdp_extensions.doors.core import foxglove_protocol as protocol
+from proxy.serial.known_types import known_channel
 from tests.proxy.bridge import known
 
 CHANNEL = known_channel("/chat", known.STRING)

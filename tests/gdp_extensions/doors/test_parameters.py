@@ -8,16 +8,16 @@ from dataclasses import replace
 import pytest
 
 from gdp.errors import RemoteError
-from gdp_extensions.doors.client_queue import ClientQueue
-from gdp_extensions.doors.foxglove_session import FoxgloveSession
-from gdp_extensions.doors.hub import Hub, Rights
-from gdp_extensions.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
-from proxy.serial.rosbridge_json import RosbridgeCodec
+from gdp_extensions.doors.core.client_queue import ClientQueue
+from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
+from gdp_extensions.doors.core.hub import Hub, Rights
+from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, node_and_name, to_value
 from proxy.bridge.core.delegated_rules import rules_of
 from proxy.endpoints.core.endpoint import Event, RequestReceived
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
-from tests.proxy.bridge import known
 from tests.gdp_extensions.doors.rights import Everything
+from tests.proxy.bridge import known
 
 _LINE = "=" * 80 + "\n"
 _VALUE = (

@@ -14,17 +14,17 @@ import cbor2
 import pytest
 
 from gdp.errors import GdpError, RemoteError
-from gdp_extensions.doors.client_queue import ClientQueue, Pending
-from gdp_extensions.doors.hub import Hub, Rights
-from proxy.serial.rosbridge_json import RosbridgeCodec
-from gdp_extensions.doors.rosbridge_session import RosbridgeSession
+from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.core.hub import Hub, Rights
+from gdp_extensions.doors.core.rosbridge_session import RosbridgeSession
+from gdp_extensions.doors.core.throttle import Throttle
 from proxy.bridge.core.delegated_rules import rules_of
-from gdp_extensions.doors.throttle import Throttle
-from gdp_extensions.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
-from tests.proxy.bridge import known
+from proxy.serial.known_types import known_channel
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from tests.gdp_extensions.doors.rights import Everything, goal_id
+from tests.proxy.bridge import known
 
 NUMBERS = known.custom("own_msgs/msg/Numbers", "float64 x\nfloat32[] y\nuint8[] octets\nint64 big\nbool on\nstring s\n")
 

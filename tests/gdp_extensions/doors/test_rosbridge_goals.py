@@ -9,15 +9,15 @@ from typing import Final
 
 import pytest
 
-from gdp_extensions.doors.rosbridge_goals import GOALS_MAX
-from proxy.serial.rosbridge_json import RosbridgeCodec
+from gdp_extensions.doors.core.rosbridge_goals import GOALS_MAX
 from proxy.bridge.core.delegated_rules import rules_of
 from proxy.endpoints.core.endpoint import RequestReceived
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
-from tests.proxy.bridge import known
 from tests.gdp_extensions.doors.fibonacci import FEEDBACK, FIBONACCI, ID, RULE, SERVICES, TIME
 from tests.gdp_extensions.doors.rights import goal_id
 from tests.gdp_extensions.doors.test_rosbridge import Site
+from tests.proxy.bridge import known
 
 AT: Final = "/fibonacci/_action/"
 UUID: Final = {"uuid": list(goal_id())}

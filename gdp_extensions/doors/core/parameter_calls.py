@@ -13,8 +13,8 @@ from typing import Final, TypeAlias
 import orjson
 
 from gdp.errors import GdpError
-from gdp_extensions.doors.hub import DoorSession, Hub
-from gdp_extensions.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
+from gdp_extensions.doors.core.hub import DoorSession, Hub
+from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, node_and_name, to_value
 from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
 

@@ -1,4 +1,4 @@
-"""Types that a door knows: the standard messages of ROS 2 Jazzy. Sans-I/O.
+"""Types that doors and tools know: the standard messages of ROS 2 Jazzy. Sans-I/O.
 
 Other types come with the definitions of their publishers and servers.
 """

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Final, Literal, Protocol, TypeAlias
 
-from gdp_extensions.doors.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
 from proxy.endpoints.core.endpoint import (
     Event,
     Graph,

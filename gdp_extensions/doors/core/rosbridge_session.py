@@ -16,13 +16,13 @@ import orjson
 
 from gdp.errors import GdpError, LocalError
 from gdp.ros_names import resolved
-from gdp_extensions.doors.client_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
-from gdp_extensions.doors.client_queue import ClientQueue, Pending
-from gdp_extensions.doors.hub import REASON_MAX, Hub, Publication, TopicType
-from gdp_extensions.doors.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
-from proxy.serial.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
-from gdp_extensions.doors.throttle import Throttle
+from gdp_extensions.doors.core.client_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
+from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.core.hub import REASON_MAX, Hub, Publication, TopicType
+from gdp_extensions.doors.core.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
+from gdp_extensions.doors.core.throttle import Throttle
 from proxy.serial.channel import Channel
+from proxy.serial.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
 from proxy.serial.service import Service
 
 __all__ = ["RosbridgeSession"]

@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 import orjson
 
 from gdp.ros_names import resolved
-from gdp_extensions.doors.client_fields import word, wrong
+from gdp_extensions.doors.core.client_fields import word, wrong
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason, RemoteError
-from gdp_extensions.doors import foxglove_protocol as protocol
-from gdp_extensions.doors.client_queue import ClientQueue, Pending
-from gdp_extensions.doors.hub import REASON_MAX, Hub, Publication, TopicType
-from gdp_extensions.doors.parameter_calls import ParameterCall, ParameterCalls
+from gdp_extensions.doors.core import foxglove_protocol as protocol
+from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.core.hub import REASON_MAX, Hub, Publication, TopicType
+from gdp_extensions.doors.core.parameter_calls import ParameterCall, ParameterCalls
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 

@@ -14,11 +14,11 @@ import orjson
 
 from gdp.errors import GdpError, LocalError
 from gdp.ros_names import ACTION_INFIX, resolved
-from gdp_extensions.doors.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
-from gdp_extensions.doors.client_queue import ClientQueue, Pending
-from gdp_extensions.doors.hub import REASON_MAX, DoorSession, Hub, Publication
-from proxy.serial.rosbridge_json import codec_of
+from gdp_extensions.doors.core.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
+from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
+from gdp_extensions.doors.core.hub import REASON_MAX, DoorSession, Hub, Publication
 from proxy.serial.channel import Channel
+from proxy.serial.rosbridge_json import codec_of
 from proxy.serial.service import Service
 
 __all__ = ["SENDS", "GoalStep", "RosbridgeGoals"]
