@@ -1,6 +1,7 @@
-"""Sessions of nox: fast, full, docs, pages, bench, coverage, and an import test for each supported Python.
+"""Sessions of nox: fast, core, full, docs, pages, bench, coverage, and an import test for each supported Python.
 
     nox -s fast           static checks and tests without root, under 60 s
+    nox -s core           tests without the extensions
     nox -s full           everything that CI runs, as root
     nox -s coverage       branch coverage of the product code
     nox -s docs           the documentation as a site
@@ -38,6 +39,13 @@ def fast(session: nox.Session) -> None:
     session.run(".venv/bin/ruff", "check", ".", external=True)
     session.run(".venv/bin/lint-imports", external=True)
     session.run(PYTHON, "-m", "pytest", "-x", *(session.posargs or FAST_TESTS), external=True)
+
+
+@nox.session(python=False)
+def core(session: nox.Session) -> None:
+    """Run the tests of the core where no extension can be imported; arguments replace the folders."""
+    session.env["GDP_WITHOUT_EXTENSIONS"] = "1"
+    session.run(PYTHON, "-m", "pytest", *(session.posargs or ("tests",)), external=True)
 
 
 @nox.session(python=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Generic, TypeVar, cast
@@ -49,8 +50,9 @@ def install_command(extras: str) -> str:
     return f"pip install 'gdp-ros[{extras}]'"
 
 
+@cache
 def find_entry_point(group: str, name: str) -> EntryPoint | None:
-    """Return an entry point whose package is there; None: none is."""
+    """Return an entry point whose package is there; None: none is. The answer stays the same in this process."""
     from importlib.metadata import entry_points  # slow, and most commands need none
 
     found = entry_points(group=group, name=name)

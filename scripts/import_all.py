@@ -1,9 +1,8 @@
 #!/usr/bin/env python3
 """Import test of every module of the named packages.
 
-    scripts/import_all.py gdp      base installation; skips modules that need an extra
-    scripts/import_all.py gdp proxy fog gdp_extensions
-                                   with the extras proxy and fog; skips modules that need ROS, DDS or a cloud
+    scripts/import_all.py gdp                 base installation; skips modules that need an extra
+    scripts/import_all.py gdp proxy fog       with the extras proxy and fog; skips modules that need ROS, DDS or a cloud
 
 Exit status: 0 all imported or skipped, 1 an import failed.
 """

@@ -21,7 +21,7 @@ import json
 import re
 import subprocess
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -252,16 +252,13 @@ def broken_import_rules(root: Path) -> int:
 
 def line_counts(files: Iterable[Path], root: Path) -> tuple[int, int, int]:
     """Return the lines of the product, of its core, and those of scripts and of the test beds of ``netns_tests``."""
-    product = core = beds = 0
+    lines = Counter[str]()
     for file in files:
         folder = file.relative_to(root).parts[0]
-        if file.suffix not in (".py", ".sh", ".lua"):
-            continue
-        count = len(file.read_text().splitlines())
-        product += count * (folder in PRODUCT)
-        core += count * (folder in CORE)
-        beds += count * (folder == "scripts" or (folder == "netns_tests" and not file.name.startswith("test_")))
-    return product, core, beds
+        if file.suffix in (".py", ".sh", ".lua") and not (folder == "netns_tests" and file.name.startswith("test_")):
+            lines[folder] += len(file.read_text().splitlines())
+    core = sum(lines[each] for each in CORE)
+    return core + lines["gdp_extensions"], core, lines["scripts"] + lines["netns_tests"]
 
 
 def shape_counts(trees: Iterable[ast.Module]) -> dict[str, float]:

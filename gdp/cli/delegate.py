@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from gdp.cli import options
 from gdp.cli.delegations import described, ls, show_file
-from gdp.cli.extension import ANY_ARGUMENTS, load_command
+from gdp.cli.extension import ANY_ARGUMENTS, COMMANDS
 from gdp.cli.output import (
     epochs_from_text,
     rights_from_text,
@@ -75,7 +75,7 @@ NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's
 @app.command(_RULES, context_settings=ANY_ARGUMENTS)
 def rules_of_proxies(context: typer.Context) -> None:
     """Give each proxy the delegations that the rules of its file need."""
-    load_command("delegate")(context.args)
+    COMMANDS.get("delegate", "gdp delegate rules")(context.args)
 
 
 app.command("rights", no_args_is_help=True)(delegate_rights)

@@ -18,7 +18,7 @@ from gdp.extras import MissingExtraError, Seam, find_entry_point
 if TYPE_CHECKING:
     from typer import Context
 
-__all__ = ["ANY_ARGUMENTS", "ExtendedGroup", "load_command", "placeholder"]
+__all__ = ["ANY_ARGUMENTS", "COMMANDS", "ExtendedGroup", "placeholder"]
 
 ANY_ARGUMENTS = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": list[str]()}
 _EXTRAS: Final = {
@@ -27,25 +27,13 @@ _EXTRAS: Final = {
     **dict.fromkeys(("decrypt-pcap", "wireshark"), "scapy"),
     "suggest": "proxy,dds",
 }
-_COMMANDS: Final[Seam[Any]] = Seam("gdp.command", _EXTRAS)
+COMMANDS: Final[Seam[Any]] = Seam("gdp.command", _EXTRAS)
 
 
 def placeholder(context: typer.Context) -> None:
     """Run a command that comes from elsewhere, where it or a package that it needs is not installed."""
     group: Any = context.parent and context.parent.command
-    load_command(group.extensions[context.info_name], user=context.command_path)
-
-
-def load_command(name: str, *, user: str = "") -> Any:
-    """Return what an entry point of the group ``gdp.command`` refers to.
-
-    Args:
-        user: what needs it, for the error.
-
-    Raises:
-        MissingExtraError: its package, or an extra of it, is not installed.
-    """
-    return _COMMANDS.get(name, user or f"gdp {name}")
+    COMMANDS.get(group.extensions[context.info_name], context.command_path)
 
 
 class ExtendedGroup(TyperGroup):

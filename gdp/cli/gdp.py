@@ -37,29 +37,19 @@ _KNOWN: Final = {
     "status": LazyCommand("gdp.cli.control:status"),
     "drain": LazyCommand("gdp.cli.control:drain"),
     "explain": LazyCommand("gdp.cli.explain:explain"),
-    "foxglove": _elsewhere(
-        "Let Foxglove see what a node's delegations allow, through a WebSocket server on this machine."
-    ),
-    "rosbridge": _elsewhere(
-        "Let rosbridge clients use what a node's delegations allow, through a WebSocket server on this machine."
-    ),
+    "foxglove": _elsewhere("Let Foxglove see what a node's delegations allow."),
+    "rosbridge": _elsewhere("Let rosbridge clients use what a node's delegations allow."),
     "recording": _elsewhere("Complete a recording whose writer was killed."),
     "rule": _elsewhere("Add, remove and list rules of a proxy while it runs."),
     "service": _elsewhere("Call a service through the overlay, as a member."),
-    "watch": _elsewhere("Print events when publishers, readers and servers of a name appear, go or are silent."),
+    "watch": _elsewhere("Print events when publishers, readers and servers of a name appear or go."),
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
     "show": LazyCommand("gdp.cli.show_tables:show_table"),
-    "dashboard": _elsewhere(
-        "Show domains, switches, links, names, replicas, drops and events live, on one page, until Ctrl-C."
-    ),
-    "wireshark": _elsewhere(
-        "Print a Wireshark dissector for our frames, in Lua, made from the Scapy layers; --install puts it in place."
-    ),
+    "dashboard": _elsewhere("Show domains, links, names, replicas, drops and events live, on one page."),
+    "wireshark": _elsewhere("Print or install a Wireshark dissector for our frames."),
     "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
-    "decrypt-pcap": _elsewhere(
-        "Write a capture with the messages that the given keys open, for Wireshark with the dissector of gdp wireshark."
-    ),
+    "decrypt-pcap": _elsewhere("Write a capture with the messages that the given keys open."),
     "top": LazyCommand("gdp.cli.top:top", no_args_is_help=False),
     "completion": LazyCommand("gdp.cli.completion:completion"),
     "keygen": LazyCommand("gdp.cli.keygen:app"),

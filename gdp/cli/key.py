@@ -16,7 +16,7 @@ from gdp.crypto.keys import SigningKey
 from gdp.errors import LocalError
 from gdp.stores.keyring import storage, store_again
 from gdp.stores.passphrase import FILE_VARIABLE, VARIABLE, new_passphrase
-from gdp.stores.private_keys import Storage, token_keys
+from gdp.stores.private_keys import TOKEN_KEYS, Storage
 
 __all__ = ["app", "asked_passphrase", "token_key"]
 
@@ -82,7 +82,7 @@ def generate(
     Example:
       gdp key generate 'pkcs11:token=roof;object=node?module-path=/usr/lib/softhsm/libsofthsm2.so'
     """
-    made = token_keys().generate_token_key(uri)
+    made = TOKEN_KEYS.get("pkcs11", uri).generate_token_key(uri)
     show({"public": made.public.compressed.hex(), "key": uri}, as_json=as_json)
 
 
@@ -101,7 +101,7 @@ def token_key(uri: str | None) -> SigningKey | None:
     Raises:
         LocalError: there is no such key.
     """
-    return None if uri is None else token_keys().open_token_key(uri, Path(uri))
+    return None if uri is None else TOKEN_KEYS.get("pkcs11", uri).open_token_key(uri, Path(uri))
 
 
 def _report(found: dict[Path, Storage], *, as_json: bool) -> None:

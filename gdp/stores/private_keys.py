@@ -28,6 +28,7 @@ from gdp.stores.passphrase import passphrase_for
 
 __all__ = [
     "SCHEME",
+    "TOKEN_KEYS",
     "Storage",
     "TokenKeys",
     "key_file",
@@ -35,7 +36,6 @@ __all__ = [
     "read_signing_key",
     "secret_file",
     "storage_of",
-    "token_keys",
 ]
 
 SCHEME: Final = "pkcs11:"  # RFC 7512
@@ -51,12 +51,7 @@ class TokenKeys(Protocol):
         """Make the key that a URI describes."""
 
 
-_TOKEN_KEYS: Final[Seam[TokenKeys]] = Seam("gdp.token_keys")
-
-
-def token_keys() -> TokenKeys:
-    """Return what opens and makes keys in tokens. Raises ``MissingExtraError``: the extra is not installed."""
-    return _TOKEN_KEYS.get("pkcs11", "a key in a token")
+TOKEN_KEYS: Final[Seam[TokenKeys]] = Seam("gdp.token_keys")
 
 
 class Storage(str, Enum):
@@ -78,7 +73,7 @@ def read_signing_key(path: Path) -> SigningKey:
     storage = _storage(data)
     try:
         if storage is Storage.TOKEN:
-            return token_keys().open_token_key(data.decode("utf-8", "replace").strip(), path)
+            return TOKEN_KEYS.get("pkcs11", str(path)).open_token_key(data.decode("utf-8", "replace").strip(), path)
         if storage is Storage.PASSPHRASE and is_own_form(data):
             return _opened_key(open_secret(data, passphrase_for(path)))
         return SigningKey.from_pem(data, passphrase_for(path) if storage is Storage.PASSPHRASE else None)

@@ -20,13 +20,16 @@ from proxy.cli.node_options import Delegations, Iface
 if TYPE_CHECKING:
     from gdp_extensions.doors.endpoint import NewSession
 
-__all__ = ["DoorNode", "DoorOptions", "Listen", "serve_door"]
+__all__ = ["DoorNode", "DoorOptions", "Listen", "Origins", "serve_door"]
 
 DoorNode = Annotated[
     Path,
     typer.Argument(
         metavar="NODE", autocompletion=complete_node, help="The door's own node: its directory, or its proxy.yaml."
     ),
+]
+Origins = Annotated[
+    list[str], typer.Option("--origin", metavar="URL", help="Let pages of this origin connect, as in the example.")
 ]
 Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where clients connect.")]
 

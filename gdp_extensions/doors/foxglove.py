@@ -1,32 +1,19 @@
 """Command ``gdp foxglove``.
 
-I/O; ``gdp`` starts it, since the package ``gdp`` does not know ``proxy``.
+I/O.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import typer
-
 from gdp.cli.node import Logs, running
 from gdp.cli.program import Program
-from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, serve_door
+from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, Origins, serve_door
 
 __all__ = ["app"]
 
 app = Program("gdp foxglove")
 
 LISTEN = "127.0.0.1:8765"
-
-Origins = Annotated[
-    list[str],
-    typer.Option(
-        "--origin",
-        metavar="URL",
-        help="Let pages of this origin connect, such as https://app.foxglove.dev.",
-    ),
-]
 
 
 @app.command(epilog="Example: gdp foxglove keys/viewer --origin https://app.foxglove.dev")

@@ -1,34 +1,22 @@
 """Command ``gdp rosbridge``.
 
-I/O; ``gdp`` starts it, since the package ``gdp`` does not know ``proxy``.
+I/O.
 """
 
 from __future__ import annotations
 
 import secrets
 import time
-from typing import Annotated
-
-import typer
 
 from gdp.cli.node import Logs, running
 from gdp.cli.program import Program
-from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, serve_door
+from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, Origins, serve_door
 
 __all__ = ["app"]
 
 app = Program("gdp rosbridge")
 
 LISTEN = "127.0.0.1:9090"
-
-Origins = Annotated[
-    list[str],
-    typer.Option(
-        "--origin",
-        metavar="URL",
-        help="Let pages of this origin connect, such as http://localhost:8000.",
-    ),
-]
 
 
 @app.command(epilog="Example: gdp rosbridge keys/viewer --origin http://localhost:8000")

@@ -15,18 +15,20 @@ import logging
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from gdp.extras import require_extra
+from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+from opentelemetry.sdk.resources import Resource
+from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace.export import BatchSpanProcessor
+from opentelemetry.sdk.trace.id_generator import RandomIdGenerator
+from opentelemetry.trace import NonRecordingSpan, Span, SpanContext, SpanKind, TraceFlags, set_span_in_context
+from opentelemetry.trace.status import Status, StatusCode
+
 from gdp.names import Name
 from gdp.state.snapshot import short_id
 from proxy.bridge.call_tracer import CallKey, CallTracer, trace_ids
-
-if TYPE_CHECKING:
-    from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
-    from opentelemetry.trace import Span
-
-    from proxy.config.config import Traces
+from proxy.config.config import Traces
 
 __all__ = ["OtelTracer", "open_tracer"]
 
@@ -44,6 +46,20 @@ class _Call:
     is_ended: bool = False
 
 
+class _Ids(RandomIdGenerator):
+    """Random ids, except for those that are set for the next span."""
+
+    given: tuple[int, int] | None = None
+
+    def generate_trace_id(self) -> int:
+        """Return the trace id of the next span."""
+        return super().generate_trace_id() if self.given is None else self.given[0]
+
+    def generate_span_id(self) -> int:
+        """Return the id of the next span."""
+        return super().generate_span_id() if self.given is None else self.given[1]
+
+
 class OtelTracer(CallTracer):
     """Spans of one proxy.
 
@@ -56,24 +72,7 @@ class OtelTracer(CallTracer):
     """
 
     def __init__(self, processor: SpanProcessor, *, node: Name, label: str, ratio: float = 1.0) -> None:
-        from opentelemetry.sdk.resources import Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.id_generator import RandomIdGenerator
-
-        class Ids(RandomIdGenerator):
-            """Random ids, except for those that are set for the next span."""
-
-            given: tuple[int, int] | None = None
-
-            def generate_trace_id(self) -> int:
-                """Return the trace id of the next span."""
-                return super().generate_trace_id() if self.given is None else self.given[0]
-
-            def generate_span_id(self) -> int:
-                """Return the id of the next span."""
-                return super().generate_span_id() if self.given is None else self.given[1]
-
-        self._ids = Ids()
+        self._ids = _Ids()
         resource = Resource.create({"service.name": "gdp-proxy", "service.instance.id": f"{label} {short_id(node)}"})
         self._provider: TracerProvider = TracerProvider(
             resource=resource, id_generator=self._ids, shutdown_on_exit=False
@@ -88,8 +87,6 @@ class OtelTracer(CallTracer):
 
     def begun(self, key: CallKey, local: str) -> None:
         """Begin the root span."""
-        from opentelemetry.trace import SpanKind
-
         self._end_late()
         if not self._is_traced(key, len(self._calls)):
             return
@@ -103,8 +100,6 @@ class OtelTracer(CallTracer):
 
     def asked(self, key: CallKey, servers: Iterable[Name]) -> None:
         """Begin a span for each server."""
-        from opentelemetry.trace import set_span_in_context
-
         call = self._calls.get(key)
         if call is None:
             return
@@ -118,8 +113,6 @@ class OtelTracer(CallTracer):
 
     def responded(self, key: CallKey, server: Name, error: str = "") -> None:
         """End the span of a server."""
-        from opentelemetry.trace import Status, StatusCode
-
         call = self._calls.get(key)
         span = None if call is None else call.replicas.pop(server, None)
         if call is None or span is None:
@@ -142,8 +135,6 @@ class OtelTracer(CallTracer):
 
     def failed(self, key: CallKey, reason: str) -> None:
         """End the root span as an error."""
-        from opentelemetry.trace import Status, StatusCode
-
         call = self._calls.get(key)
         if call is None:
             return
@@ -152,8 +143,6 @@ class OtelTracer(CallTracer):
 
     def serving(self, key: CallKey, local: str) -> None:
         """Begin the span of the server's side, below the client's root span."""
-        from opentelemetry.trace import NonRecordingSpan, SpanContext, SpanKind, TraceFlags, set_span_in_context
-
         if key in self._served or not self._is_traced(key, len(self._served)):
             return
         ids = trace_ids(key)
@@ -167,8 +156,6 @@ class OtelTracer(CallTracer):
 
     def served(self, key: CallKey, error: str = "") -> None:
         """End the span of the server's side."""
-        from opentelemetry.trace import Status, StatusCode
-
         span = self._served.pop(key, None)
         if span is None:
             return
@@ -220,15 +207,7 @@ class OtelTracer(CallTracer):
 
 
 def open_tracer(traces: Traces, node: Name, label: str) -> CallTracer:
-    """Return the tracer that a configuration asks for.
-
-    Raises:
-        MissingExtraError: the extra ``otel`` is not installed.
-    """
-    require_extra("otel", ["opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"], "traces")
-    from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-    from opentelemetry.sdk.trace.export import BatchSpanProcessor
-
+    """Return the tracer that a configuration asks for."""
     processor = BatchSpanProcessor(OTLPSpanExporter(endpoint=traces.endpoint, timeout=traces.timeout_s))
     return OtelTracer(processor, node=node, label=label, ratio=traces.ratio)
 

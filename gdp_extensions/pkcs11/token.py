@@ -11,8 +11,10 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import Final, Protocol, cast
 
+import pkcs11
+import pkcs11.util.ec
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
@@ -21,15 +23,11 @@ from gdp.stores.files import read_private
 from gdp.stores.passphrase import passphrase_for
 from gdp_extensions.pkcs11.token_uri import TokenUri
 
-if TYPE_CHECKING:
-    import pkcs11
-
 __all__ = ["TokenKey", "generate_token_key", "open_token_key"]
 
 _DIGEST_BYTES: Final = 32
 _POINT_BYTES: Final = 65
 _TRIAL: Final = b"gdp-token-trial-1"  # no statement begins with these bytes
-_MISSING: Final = "keys in tokens need the package python-pkcs11: pip install 'gdp-ros[pkcs11]'"
 
 
 class _PrivateKey(Protocol):
@@ -69,14 +67,13 @@ class TokenKey(SigningKey):
         """
         if len(digest) != _DIGEST_BYTES:
             raise LocalError("a SHA-256 digest has 32 bytes")
-        library = _library()
         try:
             signature = self._ask(digest)
-        except library.PKCS11Error:
+        except pkcs11.PKCS11Error:
             try:
                 self._key = self._open()
                 signature = self._ask(digest)
-            except library.PKCS11Error as error:
+            except pkcs11.PKCS11Error as error:
                 raise LocalError(f"the token does not sign ({_said(error)}): {self.uri}") from error
         if len(signature) != SIGNATURE_BYTES:
             raise LocalError(f"the token's signature has {len(signature)} bytes, not {SIGNATURE_BYTES}")
@@ -88,7 +85,7 @@ class TokenKey(SigningKey):
         return self.uri.encode() + b"\n"
 
     def _ask(self, digest: bytes) -> bytes:
-        return self._key.sign(digest, mechanism=_library().Mechanism.ECDSA)
+        return self._key.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
 
 
 def open_token_key(text: str, file: Path) -> TokenKey:
@@ -103,12 +100,11 @@ def open_token_key(text: str, file: Path) -> TokenKey:
     """
     uri = TokenUri.from_text(text)
     pin = _pin(uri, file)
-    library = _library()
 
     def opened() -> _PrivateKey:
         """Return the private key in a new session."""
         session = _session(uri, pin)
-        wanted = {**_attributes(uri), library.Attribute.CLASS: library.ObjectClass.PRIVATE_KEY}
+        wanted = {**_attributes(uri), pkcs11.Attribute.CLASS: pkcs11.ObjectClass.PRIVATE_KEY}
         found = list(session.get_objects(wanted))
         if len(found) != 1:
             raise LocalError(f"{len(found)} private keys in the token fit, not one: {text}")
@@ -117,7 +113,7 @@ def open_token_key(text: str, file: Path) -> TokenKey:
     try:
         key = opened()
         made = TokenKey(text, _public_key(uri, key), opened, key)
-    except library.PKCS11Error as error:
+    except pkcs11.PKCS11Error as error:
         raise LocalError(f"the token does not open the key ({_said(error)}): {text}") from error
     try:  # before the confinement of rights: a library may read files at its first signature
         made.public.verify(made.sign(_TRIAL), _TRIAL)
@@ -135,24 +131,23 @@ def generate_token_key(text: str) -> TokenKey:
     uri = TokenUri.from_text(text)
     if not uri.label:
         raise LocalError("the URI of a new key names it by object=LABEL")
-    library = _library()
     pin = _pin(uri, Path(text))
     try:
         with _session(uri, pin, is_writing=True) as session:
-            wanted = {**_attributes(uri), library.Attribute.CLASS: library.ObjectClass.PRIVATE_KEY}
+            wanted = {**_attributes(uri), pkcs11.Attribute.CLASS: pkcs11.ObjectClass.PRIVATE_KEY}
             if any(True for _ in session.get_objects(wanted)):
                 raise LocalError(f"a private key of this label is in the token already: {text}")
-            curve = library.util.ec.encode_named_curve_parameters("secp256r1")
-            kind = library.KeyType.EC
-            parameters = session.create_domain_parameters(kind, {library.Attribute.EC_PARAMS: curve}, local=True)
-            private = {library.Attribute.SENSITIVE: True, library.Attribute.EXTRACTABLE: False}
+            curve = pkcs11.util.ec.encode_named_curve_parameters("secp256r1")
+            kind = pkcs11.KeyType.EC
+            parameters = session.create_domain_parameters(kind, {pkcs11.Attribute.EC_PARAMS: curve}, local=True)
+            private = {pkcs11.Attribute.SENSITIVE: True, pkcs11.Attribute.EXTRACTABLE: False}
             parameters.generate_keypair(
                 id=uri.key_id or hashlib.sha256(uri.label.encode()).digest()[:8],
                 label=uri.label,
                 store=True,
                 private_template=private,
             )
-    except library.PKCS11Error as error:
+    except pkcs11.PKCS11Error as error:
         raise LocalError(f"the token makes no key ({_said(error)}): {text}") from error
     return open_token_key(text, Path(text))
 
@@ -166,11 +161,10 @@ def _pin(uri: TokenUri, file: Path) -> str:
 
 
 def _token(uri: TokenUri) -> pkcs11.Token:
-    library = _library()
     try:
-        module = library.lib(str(uri.module))
+        module = pkcs11.lib(str(uri.module))
         slots = module.get_slots(token_present=True)
-    except (RuntimeError, library.PKCS11Error) as error:
+    except (RuntimeError, pkcs11.PKCS11Error) as error:
         raise LocalError(f"{uri.module}: no library of PKCS #11 that works: {_said(error)}") from error
     tokens = [slot.get_token() for slot in slots]
     fitting = [
@@ -179,10 +173,10 @@ def _token(uri: TokenUri) -> pkcs11.Token:
         if (not uri.token or token.label == uri.token) and (not uri.serial or token.serial.decode() == uri.serial)
     ]
     if not uri.token and not uri.serial:
-        fitting = [token for token in fitting if library.TokenFlag.TOKEN_INITIALIZED in token.flags]
+        fitting = [token for token in fitting if pkcs11.TokenFlag.TOKEN_INITIALIZED in token.flags]
     if len(fitting) != 1:
         raise LocalError(f"{len(fitting)} tokens fit, not one (token {uri.token!r}, serial {uri.serial!r})")
-    return cast("pkcs11.Token", fitting[0])
+    return fitting[0]
 
 
 def _session(uri: TokenUri, pin: str, *, is_writing: bool = False) -> pkcs11.Session:
@@ -190,12 +184,12 @@ def _session(uri: TokenUri, pin: str, *, is_writing: bool = False) -> pkcs11.Ses
     token = _token(uri)
     try:
         return token.open(rw=is_writing, user_pin=pin)
-    except _library().UserAlreadyLoggedIn:
+    except pkcs11.UserAlreadyLoggedIn:
         return token.open(rw=is_writing)
 
 
 def _attributes(uri: TokenUri) -> dict[pkcs11.Attribute, object]:
-    names = _library().Attribute
+    names = pkcs11.Attribute
     attributes: dict[pkcs11.Attribute, object] = {}
     if uri.label:
         attributes[names.LABEL] = uri.label
@@ -206,10 +200,9 @@ def _attributes(uri: TokenUri) -> dict[pkcs11.Attribute, object]:
 
 def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
     """Return the public key that the token stores with the private one, under the same id or label."""
-    library = _library()
-    names = library.Attribute
+    names = pkcs11.Attribute
     key_attributes = {names.ID: key.id} if key.id else {names.LABEL: key.label}
-    found = list(key.session.get_objects({**key_attributes, names.CLASS: library.ObjectClass.PUBLIC_KEY}))
+    found = list(key.session.get_objects({**key_attributes, names.CLASS: pkcs11.ObjectClass.PUBLIC_KEY}))
     if len(found) != 1:
         raise LocalError(f"{len(found)} public keys match the private key in the token, not one: {uri.label!r}")
     encoded = bytes(found[0][names.EC_POINT])
@@ -222,12 +215,3 @@ def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
 
 def _said(error: Exception) -> str:
     return f"{type(error).__name__} {error}".strip()
-
-
-def _library() -> Any:
-    try:
-        import pkcs11
-        import pkcs11.util.ec
-    except ImportError as error:
-        raise LocalError(_MISSING) from error
-    return pkcs11
