@@ -140,7 +140,7 @@ class Publisher:
         """Send nothing more of a message, and repair nothing; bundled ones are small, and leave."""
         number = self.queue.ledger.number_of(sequence)
         if number is not None and self._window.cancel(number):
-            self.protection.cancel(number)
+            self.protection.parity.cancel(number)
             self.acknowledgements.lose_ended([number])
             self.published(self)
 

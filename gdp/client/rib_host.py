@@ -162,10 +162,6 @@ class RibHost:
             if outgoing.kind is Kind.RIB_REQUEST:
                 self._channels.send_query(outgoing.to, outgoing.statement, self._now_s)
             elif not self._channels.send_response(outgoing.to, outgoing.statement):
-                self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
+                self.attachment.say(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
         for each in self._channels.records_to_send():
-            self._send(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)
-
-    def _send(self, kind: Kind, statement: bytes, to: Name) -> None:
-        attachment = self.attachment
-        attachment.send(attachment.fragmenter.split(kind, statement, attachment.mtu, to))
+            self.attachment.say(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)

@@ -83,6 +83,11 @@ class ReaderPositions:
         """Return every position, active ones first."""
         return [*self.active.values(), *self.suspended.values()]
 
+    def is_ahead(self, reader: bytes, number: int) -> bool:
+        """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
+        position = self.active.get(reader)
+        return position is not None and position.next_number > number
+
     def acked_at(self, otherwise: int) -> int:
         """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
         return min([each.acked_at for each in self.active.values()], default=otherwise)

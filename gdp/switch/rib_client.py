@@ -113,7 +113,7 @@ class RibClient:
 
     def _rib_for(self, name: Name, now_s: float) -> Name | None:
         """Return the RIB to query for a name."""
-        passed_over = self._state.resolver.passed_over(name)
+        passed_over = self._state.resolver.queries.passed_over(name)
         left = [rib for rib in self._others if rib.name not in passed_over] or self._others
         if not left:
             return self.rib
@@ -155,7 +155,7 @@ class RibClient:
         self._avoided[silent] = self._review_s = now_s + _AVOID_S
         self._owed.pop(silent, None)
         if silent == self.rib:
-            self._state.resolver.serve_stale(now_s, stale=True)
+            self._state.resolver.cache.serve_stale(True, now_s)
             if [rib.name for rib in self._reached(now_s)[:1]] != [silent]:
                 self.links_changed(now_s)
 
@@ -257,7 +257,7 @@ class RibClient:
         self._avoided.pop(rib, None)
         self._owed.pop(rib, None)
         if rib == self.rib:
-            self._state.resolver.serve_stale(now_s, stale=False)
+            self._state.resolver.cache.serve_stale(False, now_s)
 
     def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
@@ -315,7 +315,7 @@ class RibClient:
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
         times = [
             self._state.attached.next_event(),
-            self._state.resolver.next_query(),
+            self._state.resolver.queries.next_due(),
             owed_s,
             self._review_s,
             self.endpoints.get_timer(),
