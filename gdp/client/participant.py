@@ -35,6 +35,7 @@ from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.statements import Statement, StatementType
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -414,7 +415,7 @@ class Participant:
         times = [self.attachment.get_timer(), self.diagnostics.get_timer()]
         if self.attachment.switch is not None:  # without a switch nothing can be sent: hellos alone are due
             times += [self._publications.next_due(), self._writer_proxies_due.next_due()]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

@@ -28,6 +28,7 @@ from gdp.client.send_options import RELIABLE, PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
@@ -335,7 +336,7 @@ class Publisher:
         times += [self._awaits_until_s] if self._awaits_until_s < _NEVER else []
         if self.matched and self.queue.mtu is not None:
             times += [self._heartbeats.get_timer(), self.protection.copies.get_timer()]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.

@@ -28,6 +28,7 @@ from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
@@ -321,4 +322,4 @@ class RibClient:
             self.endpoints.get_timer(),
             self._channels.get_timer(),
         ]
-        return None if self.rib is None else min((time for time in times if time is not None), default=None)
+        return None if self.rib is None else earliest(*times)

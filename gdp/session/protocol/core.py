@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.client.participant import Message as MemberMessage
 from gdp.client.participant import Participant, ServiceOptions, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import NAME_BYTES, Name
@@ -250,7 +251,7 @@ class SessionCore:
         if not self._services:
             return None
         times = [service.get_timer() for service in self._services]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
 
 def replication_of(value: str | int | Replication) -> Replication:
