@@ -412,10 +412,10 @@ class Participant:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer(), self.diagnostics.get_timer()]
-        if self.attachment.switch is not None:  # without a switch nothing can be sent: hellos alone are due
-            times += [self._publications.next_due(), self._writer_proxies_due.next_due()]
-        return earliest(*times)
+        due_s = earliest(self.attachment.get_timer(), self.diagnostics.get_timer())
+        if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
+            return due_s
+        return earliest(due_s, self._publications.next_due(), self._writer_proxies_due.next_due())
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

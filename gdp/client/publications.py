@@ -230,9 +230,10 @@ class Publications:
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due()]
-        times += [requests.get_timer() for requests in self._requests.values()]
-        return earliest(*times)
+        due_s = earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due())
+        if self._requests:
+            due_s = earliest(due_s, *(requests.get_timer() for requests in self._requests.values()))
+        return due_s
 
     def _stream_to(self, service: Name, party: Name, now_s: float) -> Publisher:
         """Return the unicast stream to a party of a service.

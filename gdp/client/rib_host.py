@@ -97,9 +97,8 @@ class RibHost:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer(), self.rib.get_timer(), self._channels.get_timer()]
-        times.append(self.diagnostics.get_timer())
-        return earliest(*times)
+        of_channels = earliest(self._channels.get_timer(), self.diagnostics.get_timer())
+        return earliest(self.attachment.get_timer(), self.rib.get_timer(), of_channels)
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

@@ -129,9 +129,10 @@ class RibCore:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         state = self.state
-        times = [state.store.next_expiry(), state.upstream_queries.next_due(), state.upstream.next_due()]
-        times += [state.exchange.get_timer(), state.endpoints.get_timer()]
-        return earliest(*times)
+        of_tier_above = earliest(state.upstream_queries.next_due(), state.upstream.next_due())
+        return earliest(
+            state.store.next_expiry(), of_tier_above, state.exchange.get_timer(), state.endpoints.get_timer()
+        )
 
     def statements_to_send(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""

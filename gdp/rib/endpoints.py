@@ -220,8 +220,7 @@ class RibEndpoints:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._changes.next_due(), self._ends.next_due()]
-        return earliest(*times)
+        return earliest(self._changes.next_due(), self._ends.next_due())
 
     def poll_statements(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""

@@ -199,8 +199,7 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        times = [self._machine.get_timer(), *(each.due_s for each in self._periodic)]
-        return earliest(*times)
+        return earliest(self._machine.get_timer(), *(each.due_s for each in self._periodic))
 
     def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""

@@ -258,9 +258,8 @@ class Dispatch(Generic[A]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._calls.get_timer(), self._hedges.next_due()]
-        times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
-        return earliest(*times)
+        stop_at_s = next(iter(self._ended.values())).stop_at_s if self._ended else None
+        return earliest(self._calls.get_timer(), self._hedges.next_due(), stop_at_s)
 
     def fail_all(self, reason: str) -> None:
         """End every call, because no server is asked any more."""

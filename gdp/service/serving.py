@@ -235,8 +235,7 @@ class Serving(Generic[R]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timeout of a call, or of a stall, or None."""
-        times = [self._calls.get_timer(), None if self._window is None else self._window.get_timer()]
-        return earliest(*times)
+        return earliest(self._calls.get_timer(), None if self._window is None else self._window.get_timer())
 
     def fail_all(self) -> list[Asked]:
         """End every call; return them."""

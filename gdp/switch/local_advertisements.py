@@ -156,8 +156,7 @@ class LocalAdvertisements:
 
     def next_event(self) -> float | None:
         """Return the monotonic second of the next relay or lease end, or None."""
-        times = self._relays.next_due(), self._ends.next_due()
-        return earliest(*times)
+        return earliest(self._relays.next_due(), self._ends.next_due())
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next lease end, or None."""

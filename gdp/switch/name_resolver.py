@@ -241,8 +241,7 @@ class NameResolver:
 
     def next_expiry(self) -> float | None:
         """Return a monotonic second that is no later than the next expiry, or None."""
-        times = (self._pending.next_expiry(), self.cache.next_expiry())
-        return earliest(*times)
+        return earliest(self._pending.next_expiry(), self.cache.next_expiry())
 
     def next_query(self) -> float | None:
         """Return a monotonic second that is no later than the next query, or None."""

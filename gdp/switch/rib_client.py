@@ -313,13 +313,7 @@ class RibClient:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
+        of_names = earliest(self._state.attached.next_event(), self._state.resolver.next_query(), self._review_s)
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
-        times = [
-            self._state.attached.next_event(),
-            self._state.resolver.next_query(),
-            owed_s,
-            self._review_s,
-            self.endpoints.get_timer(),
-            self._channels.get_timer(),
-        ]
-        return None if self.rib is None else earliest(*times)
+        due_s = earliest(of_names, owed_s, self.endpoints.get_timer(), self._channels.get_timer())
+        return None if self.rib is None else due_s

@@ -328,8 +328,7 @@ class Bridge:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
         times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._probed)]
-        times += [self._tick_at_s] if has_ticks else []
-        return earliest(*times)
+        return earliest(*times, self._tick_at_s if has_ticks else None)
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""

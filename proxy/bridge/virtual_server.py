@@ -87,8 +87,7 @@ class VirtualServer:
 
     def get_timer(self, now_s: float) -> float | None:
         """Return the monotonic second at which ``flush`` has something to do, or None."""
-        times = [self._responses.get_timer(now_s), self._ends_s]
-        return earliest(*times)
+        return earliest(self._responses.get_timer(now_s), self._ends_s)
 
     def _end_closing(self) -> None:
         self._responses.flush_all()

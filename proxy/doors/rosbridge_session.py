@@ -161,8 +161,7 @@ class RosbridgeSession:
 
     def get_timer(self) -> float | None:
         """Return when a throttled message is due."""
-        times = (each.throttle.get_timer() for each in self._subscriptions.values())
-        return earliest(*times)
+        return earliest(*(each.throttle.get_timer() for each in self._subscriptions.values()))
 
     def handle_timer(self, now_s: float) -> None:
         """Queue the throttled messages whose turn has come."""

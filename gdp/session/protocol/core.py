@@ -248,10 +248,7 @@ class SessionCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer beyond the participant's own, or None."""
-        if not self._services:
-            return None
-        times = [service.get_timer() for service in self._services]
-        return earliest(*times)
+        return earliest(*[service.get_timer() for service in self._services]) if self._services else None
 
 
 def replication_of(value: str | int | Replication) -> Replication:

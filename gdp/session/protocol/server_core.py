@@ -138,8 +138,7 @@ class ServerCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._serving.get_timer(), self._check_at_s]
-        return earliest(*times)
+        return earliest(self._serving.get_timer(), self._check_at_s)
 
     def _begin(self, client: Name, frame: Request, now_s: float) -> None:
         asked = Asked(client, _PART, frame.call)
