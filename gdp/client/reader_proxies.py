@@ -138,7 +138,11 @@ class ReaderProxies:
         return self._readers[name]
 
     def __iter__(self) -> Iterator[bytes]:
-        return iter(list(self._readers))
+        return iter(self.reading())
+
+    def reading(self) -> list[bytes]:
+        """Return the names of those that are not suspended."""
+        return [*self._readers]
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""

@@ -95,8 +95,7 @@ class ReaderPositions:
         """Return the lowest message number that an active reader lacks."""
         least = _BEYOND_ALL
         for each in self.active.values():
-            if each.next_number < least:
-                least = each.next_number
+            least = min(least, each.next_number)
         return least
 
     def most_active(self) -> int:
