@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,10 @@ from fog.machine import MachineState
 from fog.providers.local.netlinks import delete
 from fog.providers.local.spawn import spawn_detached
 from fog.providers.provider import AccountProvider, Provider
+from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
+from gdp.extras import Seam
 from gdp.host.run_registry import RunRegistry
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ log = logging.getLogger(__name__)
 
 _OWN_SPACE: Final = Path("/proc/self/ns/net")
 _GATEWAY_DAYS: Final = 3_650.0
+_PROVIDERS: Final[Seam[Callable[[SkyPilotConfig], Provider]]] = Seam("fog.provider")
 _BOOT_S: Final = 60.0
 _STEP_S: Final = 0.05
 
@@ -58,9 +61,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
 
             return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
         case "skypilot":
-            from fog.providers.skypilot.provider import SkyPilotProvider
-
-            return SkyPilotProvider(site.skypilot)
+            return _PROVIDERS.get("skypilot", "provider skypilot")(site.skypilot)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:

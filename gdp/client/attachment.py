@@ -31,6 +31,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
@@ -343,10 +344,12 @@ class Attachment:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [time for time in (self.hello_protocol.get_timer(), self._sync.get_timer()) if time is not None]
+        due_s = earliest(self.hello_protocol.get_timer(), self._sync.get_timer())
         if self.switch is not None:
-            times += [each.advertisement_at_s for each in self._due_advertisements()]
-        return min(times) if times else None
+            for each in self._due_advertisements():
+                if due_s is None or each.advertisement_at_s < due_s:
+                    due_s = each.advertisement_at_s
+        return due_s
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""

@@ -205,7 +205,8 @@ class Delivery:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next ``handle_timer``; infinity: none."""
-        return min(self._gap_until_s, self._held[0][0] if self._held else _NEVER)
+        held_s = self._held[0][0] if self._held else _NEVER
+        return held_s if held_s < self._gap_until_s else self._gap_until_s
 
     def finish(self) -> None:
         """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""

@@ -223,7 +223,7 @@ class GoverningPaths:
     def _present(self) -> list[bytes]:
         """Return the readers whose nodes have not started again since they began to read. Without any, return all."""
         readers, is_former = self._readers, self._paths.is_former
-        everyone = list(readers)
+        everyone = readers.reading()
         if len(everyone) < 2:
             return everyone
         return [name for name in everyone if not is_former(name, readers[name].incarnation_id.started)] or everyone

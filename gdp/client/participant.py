@@ -35,6 +35,7 @@ from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.statements import Statement, StatementType
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -274,10 +275,10 @@ class Participant:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer(), self.diagnostics.get_timer()]
-        if self.attachment.switch is not None:  # without a switch nothing can be sent: hellos alone are due
-            times += [self.publications.next_due(), self._reception.timers.next_due()]
-        return min((time for time in times if time is not None), default=None)
+        due_s = earliest(self.attachment.get_timer(), self.diagnostics.get_timer())
+        if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
+            return due_s
+        return earliest(due_s, self.publications.next_due(), self._reception.timers.next_due())
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

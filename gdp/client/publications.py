@@ -25,6 +25,7 @@ from gdp.client.unicast_stream import Party, PeerIncarnation
 from gdp.client.unicast_streams import UnicastStreams
 from gdp.control.join import Join
 from gdp.crypto.control_seal import topic_of
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header
 from gdp.message.loss import LossReason
@@ -226,9 +227,10 @@ class Publications:
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due()]
-        times += [requests.get_timer() for requests in self._requests.values()]
-        return min((time for time in times if time is not None), default=None)
+        due_s = earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due())
+        if self._requests:
+            due_s = earliest(due_s, *(requests.get_timer() for requests in self._requests.values()))
+        return due_s
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

@@ -16,6 +16,7 @@ from gdp.control.fragments import ControlReassembler
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -91,9 +92,8 @@ class RibHost:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer(), self.rib.get_timer(), self._channels.get_timer()]
-        times.append(self.diagnostics.get_timer())
-        return min((time for time in times if time is not None), default=None)
+        of_channels = earliest(self._channels.get_timer(), self.diagnostics.get_timer())
+        return earliest(self.attachment.get_timer(), self.rib.get_timer(), of_channels)
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

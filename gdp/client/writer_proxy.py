@@ -215,9 +215,11 @@ class WriterProxy:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
-        expiries = [self._status.next_expiry(), self._data.next_expiry()]
         due_s = min(self.schedule.due_s, self.delivery.get_timer(), self._late.get_timer(), self.recovery.next_expiry())
-        return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
+        for expiry in (self._status.next_expiry(), self._data.next_expiry()):
+            if expiry is not None and expiry < due_s:
+                due_s = expiry
+        return due_s
 
     def is_report_due(self, now_s: float) -> bool:
         """Return whether ``control_to_send`` has a report now."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
 
-from gdp.due_queue import DueQueue
+from gdp.due_queue import DueQueue, earliest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.budget import HedgeBudget
@@ -254,9 +254,8 @@ class Dispatch(Generic[A]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._calls.get_timer(), self._hedges.next_due()]
-        times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
-        return min((time for time in times if time is not None), default=None)
+        stop_at_s = next(iter(self._ended.values())).stop_at_s if self._ended else None
+        return earliest(self._calls.get_timer(), self._hedges.next_due(), stop_at_s)
 
     def fail_all(self, reason: str) -> None:
         """End every call, because no server is asked any more."""

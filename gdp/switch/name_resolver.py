@@ -20,6 +20,7 @@ from collections.abc import Set as AbstractSet
 from typing import Final, NamedTuple
 
 from gdp.control.neighbour import Neighbour
+from gdp.due_queue import earliest
 from gdp.errors import DropReason
 from gdp.limits import (
     ADVERTISEMENT_LEASE_S,
@@ -209,5 +210,4 @@ class NameResolver:
 
     def next_expiry(self) -> float | None:
         """Return a monotonic second that is no later than the next expiry, or None."""
-        times = (self.pending.next_expiry(), self.cache.next_expiry())
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self.pending.next_expiry(), self.cache.next_expiry())

@@ -28,6 +28,7 @@ from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
@@ -312,13 +313,7 @@ class RibClient:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
+        of_names = earliest(self._state.attached.next_event(), self._state.resolver.queries.next_due(), self._review_s)
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
-        times = [
-            self._state.attached.next_event(),
-            self._state.resolver.queries.next_due(),
-            owed_s,
-            self._review_s,
-            self.endpoints.get_timer(),
-            self._channels.get_timer(),
-        ]
-        return None if self.rib is None else min((time for time in times if time is not None), default=None)
+        due_s = earliest(of_names, owed_s, self.endpoints.get_timer(), self._channels.get_timer())
+        return None if self.rib is None else due_s

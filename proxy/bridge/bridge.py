@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gdp.client.participant import Message, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
@@ -317,8 +318,7 @@ class Bridge:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
         times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._probed)]
-        times += [self._tick_at_s] if has_ticks else []
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times, self._tick_at_s if has_ticks else None)
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""

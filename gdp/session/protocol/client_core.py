@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
@@ -143,7 +144,7 @@ class ClientCore:
         times += [call.deadline_s for call in self._unasked]
         if not self.is_idle or self._for_all:
             times.append(self._follow_at_s)
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
     def close(self) -> None:
         """Stop calling the name; active calls fail."""

@@ -10,6 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.frames import Answer, Outcome, Request
@@ -125,8 +126,7 @@ class ServerCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._serving.get_timer(), self._check_at_s]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self._serving.get_timer(), self._check_at_s)
 
     def _begin(self, client: Name, frame: Request, now_s: float) -> None:
         asked = Asked(client, _PART, frame.call)
