@@ -355,7 +355,8 @@ class Publisher:
         self.sent_frames.count()
         self.has_more = False
         if mtu is None or not self.matched:
-            self.protection.clear()
+            self.protection.copies.clear()
+            self.protection.parity.clear()
             if not self.matched:
                 queue.drop_unread()
             return []

@@ -254,7 +254,7 @@ class SwitchCore:
         self._reassembler.drop_expired(now_s)
         self._locations.expire(now_s)
         for key in self.table.expire(now_s):
-            self.unicast.expired(key)
+            self.unicast.entry_removed(key)
         for attachment in self.attached.expire(now_s):
             self.unicast.remove(attachment.advertisement.name)
         for topic in self.multicast.handle_timer(now_s):
