@@ -209,10 +209,8 @@ class Attachment:
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
         if self._advertisements.pop((name, right), None) is not None and self.switch is not None:
-            self.say(
-                Kind.WITHDRAW,
-                Withdrawal(name, right, self._next_sequence()).to_wire(self._identity.name, self._identity.key),
-            )
+            withdrawal = Withdrawal(name, right, self._next_sequence())
+            self.say(Kind.WITHDRAW, withdrawal.to_wire(self._identity.name, self._identity.key))
 
     def withdraw_all(self) -> None:
         """Leave: withdraw every advertisement."""
@@ -376,9 +374,8 @@ class Attachment:
             if best.name != self._last:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
-            advertisement_at_s = (
-                echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s
-            )  # frames before our echo are dropped
+            # frames before our echo are dropped
+            advertisement_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s
             for each in self._advertisements.values():
                 # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
                 # first.
