@@ -5,10 +5,9 @@ I/O. Exit codes: 0 done, 1 the replay differs, 2 wrong input, 3 no node runs the
 
 from __future__ import annotations
 
-import base64
 import time
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 
@@ -16,12 +15,10 @@ from gdp.cli import options
 from gdp.cli.local_nodes import connect
 from gdp.cli.output import show
 from gdp.cli.tables import print_table, select_columns
-from gdp.crypto.cbor import decode
 from gdp.errors import LocalError
 from gdp.journal.incident import Incident
 from gdp.journal.replay import Replay
 from gdp.journal.summary import summary
-from gdp.state.control_protocol import Command, Request
 from gdp.stores.files import private, write_all
 from gdp.stores.keyring import load_node_keys
 from gdp.terminal import echo
@@ -51,20 +48,11 @@ def save(
     Example:
       gdp incident save robot/switch -o /tmp/robot.incident
     """
-    head: dict[str, Any] = {}
-    wires: list[bytes] = []
     with connect(node) as connection:
-        asked: dict[str, object] = {}
-        while not asked or asked["from"] < asked["until"]:  # type: ignore[operator]
-            connection.send_request(Request(Command.INCIDENT, asked))
-            page: Any = connection.read_result()
-            head = head or decode(base64.b64decode(page["head"]))  # type: ignore[assignment]
-            wires += map(base64.b64decode, page["entries"])
-            asked = {"from": page["next"], "until": page["until"]}
-    path = output or Path(f"{head['label']}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}.incident")
-    data = Incident.of(head, wires).sealed().to_bytes()
-    write_all(path.parent, {path.name: private(data)}, force=force)
-    echo(f"{path}: {len(wires)} entries, {len(data)} bytes; gdp incident show {path}")
+        incident = Incident.of(*connection.journal()).sealed()
+    path = output or Path(f"{incident.head['label']}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}.incident")
+    write_all(path.parent, {path.name: private(incident.to_bytes())}, force=force)
+    echo(f"{path}: {len(incident.entries)} entries; gdp incident show {path}")
 
 
 @app.command("show")

@@ -21,6 +21,7 @@ from typing import Any, Final
 from gdp.crypto.cbor import decode, encode
 from gdp.crypto.kem import KemPrivateKey, KemPublicKey
 from gdp.errors import LocalError, RemoteError
+from gdp.journal.journal import LENGTH
 
 __all__ = ["Incident", "well_formed"]
 
@@ -29,7 +30,6 @@ _VERSION: Final = 1
 _DIGEST_BYTES: Final = 32
 _BODY_MAX_BYTES: Final = 1 << 30
 _ITEM_MAX_BYTES: Final = 1 << 24
-_LENGTH: Final = struct.Struct("!I")
 _INFO: Final = b"gdp incident 1"
 
 
@@ -46,10 +46,10 @@ class Incident:
     entries: list[list[Any]]
 
     @classmethod
-    def of(cls, head: Mapping[str, Any], wires: Iterable[bytes]) -> Incident:
-        """Return the incident of a journal's entries."""
+    def of(cls, head: Mapping[str, Any], blocks: Iterable[bytes]) -> Incident:
+        """Return the incident of a journal. Raises ``LocalError``: a block is of the wrong form."""
         with well_formed("journal"):
-            return cls(head, [_entry(wire) for wire in wires])
+            return cls(head, [_entry(item) for block in blocks for item in _items(block)])
 
     def sealed(self) -> Incident:
         """Return this incident as only the node itself can replay it."""
@@ -71,7 +71,7 @@ class Incident:
     def to_bytes(self) -> bytes:
         """Return the content of a file."""
         items = (encode(self.head), *map(encode, self.entries))
-        body = zlib.compress(b"".join(_LENGTH.pack(len(item)) + item for item in items))
+        body = zlib.compress(b"".join(LENGTH.pack(len(item)) + item for item in items))
         data = _MAGIC + bytes([_VERSION]) + body
         return data + hashlib.sha256(data).digest()
 
@@ -86,19 +86,21 @@ class Incident:
         if hashlib.sha256(content).digest() != digest:
             raise LocalError("a damaged incident: its checksum is another; save or copy it again")
         with well_formed("body"):
-            inflater = zlib.decompressobj()
-            body = inflater.decompress(content[len(_MAGIC) + 1 :], _BODY_MAX_BYTES)
-            head, *entries = _items(body)
-            if not inflater.eof or not isinstance(fields := decode(head, _ITEM_MAX_BYTES), dict):
-                raise ValueError("more than its bound, or no head")
+            head, *entries = _items(content[len(_MAGIC) + 1 :])
+            if not isinstance(fields := decode(head, _ITEM_MAX_BYTES), dict):
+                raise ValueError("no head")
             return cls(fields, [_entry(each) for each in entries])
 
 
-def _items(body: bytes) -> Iterator[bytes]:
+def _items(block: bytes) -> Iterator[bytes]:
+    inflater = zlib.decompressobj()
+    body = inflater.decompress(block, _BODY_MAX_BYTES)
+    if not inflater.eof:
+        raise ValueError("more than its bound")
     at = 0
     while at < len(body):
-        (size,) = _LENGTH.unpack_from(body, at)
-        at += _LENGTH.size + size
+        (size,) = LENGTH.unpack_from(body, at)
+        at += LENGTH.size + size
         yield body[at - size : at]
 
 

@@ -14,15 +14,18 @@ no wrapper, and costs nothing more. Entries are lists for CBOR, in the order in 
     ["send", mono_s]                the core was asked for frames, and had some:
     ["sent", port, mac, frame]      one of them
 
-When the ring is full, the oldest entries go. A journal that has its first entry can be replayed.
+A block is entries of some 32 KiB, each after its length (4), compressed by zlib. When the ring is full, the oldest
+block goes. A journal that has its first entry can be replayed.
 """
 
 from __future__ import annotations
 
 import base64
 import functools
+import struct
+import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from itertools import islice
 from typing import Any, Final, TypeVar
@@ -39,7 +42,7 @@ from gdp.rib.state import RibSettings
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["CALLS", "Journal"]
+__all__ = ["CALLS", "LENGTH", "Journal"]
 
 
 def _moment(value: Any) -> Timestamps:
@@ -68,28 +71,31 @@ CALLS: Final[Mapping[str, tuple[Callable[[Any], Any], ...]]] = {  # each argumen
     "diagnostics.ask": (Name, str),
     "rib.load": (lambda value: [Entry.from_cbor(_octets(each)) for each in value], _moment),
 }
-_ENTRY_BYTES: Final = 300  # of an entry in memory, without its frames
-_PAGE_BYTES: Final = 64 << 10  # the socket's buffer holds a page in base64, which is sent in one piece
+LENGTH: Final = struct.Struct("!I")  # before each entry of a block
+_BLOCK_BYTES: Final = 32 << 10  # before compression, which takes about a millisecond
+_PAGE_BYTES: Final = 48 << 10  # the socket's buffer holds two more than that in base64
 _C = TypeVar("_C")
 _R = TypeVar("_R")
 
 
 class Journal:
-    """Ring of the entries of one core.
+    """Ring of the entries of one core, in compressed blocks.
 
     Args:
-        max_bytes: of all entries in memory, about.
+        max_bytes: of all blocks; more than one.
         unrepeatable: why it cannot be replayed; empty: it can.
 
     Attributes:
-        entries: those that are kept, the oldest first, with the bytes of each.
-        first: number of the oldest; 0: none is lost.
+        first: number of the oldest entry that is kept; 0: none is lost.
     """
 
     def __init__(self, max_bytes: int, unrepeatable: str = "") -> None:
-        self.entries: deque[tuple[list[Any], int]] = deque()
         self.first = 0
+        self._blocks: deque[tuple[int, bytes]] = deque()  # entries, compressed
+        self._lost_blocks = 0
         self._max_bytes, self._bytes = max_bytes, 0
+        self._open: list[bytes] = []  # entries of the block that is being written
+        self._open_bytes = 0
         self._is_within = False  # a call of the core: calls from within it follow from it
         self._was_asked = False  # for its next timer, since the last call
         self._start: dict[str, object] = {"unrepeatable": unrepeatable}
@@ -141,35 +147,36 @@ class Journal:
         named = {str(index): device for index, device in (ports or {}).items()}
         return {**self._start, "first": self.first, "drops": drops, "ports": named}
 
-    def wires(self, first: int = 0) -> Iterator[bytes]:
-        """Yield the entries that are kept, from a number on, encoded."""
-        for entry, _ in islice(self.entries, max(first - self.first, 0), None):
-            yield encode(_plain(entry))
+    def blocks(self) -> list[bytes]:
+        """Return the blocks that are kept, the oldest first."""
+        self._close_block()
+        return [block for _, block in self._blocks]
 
     def page(self, arguments: Mapping[str, object], ports: Mapping[int, str]) -> dict[str, object]:
         """Return a page for a client of the control socket: JSON fields.
 
         Args:
-            arguments: ``from``: number of an entry, or nothing: the oldest; ``until``: of the first that is not wanted.
+            arguments: none for the first page; ``from`` and ``until`` for another: numbers of blocks.
 
         Raises:
-            LocalError: entries from there on are lost meanwhile, or an argument is wrong.
+            LocalError: blocks from there on are lost meanwhile, or an argument is wrong.
         """
-        end = self.first + len(self.entries)
-        at, until = arguments.get("from", self.first), arguments.get("until", end)
+        fields: dict[str, object] = {}
+        if not arguments:
+            fields["head"] = base64.b64encode(encode(self.head(ports))).decode()
+            self._close_block()
+        at = arguments.get("from", self._lost_blocks)
+        until = arguments.get("until", self._lost_blocks + len(self._blocks))
         if not isinstance(at, int) or not isinstance(until, int):
             raise LocalError("from and until: expected numbers")
-        if at < self.first:
+        if at < self._lost_blocks:
             raise LocalError("the journal was overwritten while it was read; give it more memory, or try again")
         page: list[str] = []
-        size = 0
-        for wire in islice(self.wires(at), max(min(until, end) - at, 0)):
-            page.append(base64.b64encode(wire).decode())
-            size += len(wire)
-            if size > _PAGE_BYTES:
+        for _, block in islice(self._blocks, at - self._lost_blocks, max(until - self._lost_blocks, 0)):
+            page.append(base64.b64encode(block).decode())
+            if sum(map(len, page)) > _PAGE_BYTES:
                 break
-        head = {} if "from" in arguments else {"head": base64.b64encode(encode(self.head(ports))).decode()}
-        return {**head, "entries": page, "next": at + len(page), "until": until}
+        return {**fields, "blocks": page, "next": at + len(page), "until": until}
 
     def _follow(self, core: Any) -> None:
         """Record the calls and the frames of a core from now on; it has no port yet."""
@@ -207,12 +214,9 @@ class Journal:
             return function(*arguments, **named)
         if self._was_asked:
             self._add(["timer"])
-        size = 0
-        if path == "receive":
-            size = sum([_ENTRY_BYTES + len(each.frame) for each in arguments[0]])
-        elif path == "rib.load":
+        if path == "rib.load":
             arguments = (list(arguments[0]), *arguments[1:])
-        self._add([path, *arguments, *([named] if named else [])], size)
+        self._add([path, *arguments, *([named] if named else [])])
         self._is_within, self._was_asked = True, False
         try:
             return function(*arguments, **named)
@@ -227,22 +231,33 @@ class Journal:
         return get_timer()
 
     def _send(self, frames_to_send: Callable[[float], list[OutgoingFrames]], now_s: float) -> list[OutgoingFrames]:
-        self._add(["send", now_s])
         transmits = frames_to_send(now_s)
-        if not transmits and self.entries and self.entries[-1][0][0] == "send":
-            self._bytes -= self.entries.pop()[1]  # most steps of a node send nothing
+        if transmits:
+            self._add(["send", now_s])
         for port, mac, frames in transmits:
             for frame in frames:
-                self._add(["sent", port, mac, frame], len(frame))
+                self._add(["sent", port, mac, frame])
         return transmits
 
-    def _add(self, entry: list[Any], size: int = 0) -> None:
-        size += _ENTRY_BYTES
-        self.entries.append((entry, size))
-        self._bytes += size
-        while self._bytes > self._max_bytes:
-            self._bytes -= self.entries.popleft()[1]
-            self.first += 1
+    def _add(self, entry: list[Any]) -> None:
+        wire = encode(_plain(entry))
+        self._open += (LENGTH.pack(len(wire)), wire)
+        self._open_bytes += len(wire)
+        if self._open_bytes > _BLOCK_BYTES:
+            self._close_block()
+
+    def _close_block(self) -> None:
+        """Compress the block that is being written; remove the oldest ones while there is no memory for it."""
+        if self._open:
+            block = zlib.compress(b"".join(self._open), 1)
+            self._blocks.append((len(self._open) // 2, block))
+            self._bytes += len(block)
+            self._open, self._open_bytes = [], 0
+        while self._bytes > self._max_bytes and len(self._blocks) > 1:
+            entries, block = self._blocks.popleft()
+            self.first += entries
+            self._bytes -= len(block)
+            self._lost_blocks += 1
 
 
 class _ObservedKey(SigningKey):

@@ -60,7 +60,7 @@ class Simulation:
         journal_bytes: of the journal of each node; 0: none.
 
     Attributes:
-        journals: by node; of one that was restarted that of the present incarnation.
+        journals: by node; of one that was restarted also by the number of the incarnation.
     """
 
     topology: Topology
@@ -266,14 +266,15 @@ class Simulation:
         if not self.journal_bytes:
             return make(identity, policy, settings)
         unrepeatable = "" if identity.role is not Role.PROXY else "calls of a member's program are not in its journal"
-        journal = self.journals[name] = Journal(self.journal_bytes, unrepeatable)
+        lives = sum(each.partition("~")[0] == name for each in self.journals)
+        journal = self.journals[f"{name}~{lives + 1}" if lives else name] = Journal(self.journal_bytes, unrepeatable)
         return journal.build(make, replace(identity), policy, settings, self.network.now, rib)
 
     def save_journals(self, folder: Path) -> None:
         """Write the incident of each node that has a journal, not sealed: a simulation has no secrets."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, journal in self.journals.items():
-            data = Incident.of(journal.head(), journal.wires()).to_bytes()
+            data = Incident.of(journal.head(), journal.blocks()).to_bytes()
             (folder / f"{name.replace('/', '-')}.incident").write_bytes(data)
 
     def _settings(self) -> NodeSettings:

@@ -125,8 +125,7 @@ def test_a_replay_names_the_first_frame_that_differs(incident: Incident) -> None
 
 
 def test_a_full_ring_keeps_the_last_entries_and_is_not_replayed(tmp_path: Path) -> None:
-    world, _ = _ran(100_000)
-    assert len(world.journals["left"].entries) < 400
+    world, _ = _ran(10_000)
     incident = _incident(world, "left", tmp_path)
     assert incident.head["first"] > 0
     assert summary(incident)["kind"]
@@ -188,7 +187,8 @@ def test_what_a_node_drew_is_in_its_file_for_that_node_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world, _ = _ran()
-    drawn = [more[0] for (kind, *more), _ in world.journals["left"].entries if kind == "draw"]
+    entries = Incident.of({}, world.journals["left"].blocks()).entries
+    drawn = [more[0] for kind, *more in entries if kind == "draw"]
     assert drawn
     kem = world.identities["left"].kem
     keys = NodeKeys.generate(Role.SWITCH, "left")
@@ -201,7 +201,7 @@ def test_what_a_node_drew_is_in_its_file_for_that_node_alone(
     assert file.stat().st_mode & 0o777 == 0o600
     saved = Incident.from_bytes(file.read_bytes())
     assert not [more for kind, *more in saved.entries if kind == "draw" and more[0] in drawn]
-    assert saved.opened(kem).entries == [Incident.of({}, [wire]).entries[0] for wire in world.journals["left"].wires()]
+    assert saved.opened(kem).entries == entries
     assert _code("show", str(file)) == 0
     assert "eth0" in capsys.readouterr().out
     assert _code("replay", str(file)) == 2
@@ -225,6 +225,6 @@ def test_a_node_without_a_journal_says_how_to_keep_one(tmp_path: Path, capsys: p
 
 
 def test_pages_that_the_ring_overtakes_are_refused() -> None:
-    journal: Journal = _ran(100_000)[0].journals["left"]
+    journal: Journal = _ran(10_000)[0].journals["left"]
     with pytest.raises(LocalError, match="overwritten"):
-        journal.page({"from": 0}, {})
+        journal.page({"from": 0, "until": 1}, {})
