@@ -38,6 +38,7 @@ def save(
         typer.Option("-o", "--output", metavar="FILE", help="Default: NODE-TIME.incident."),
     ] = None,
     force: options.Force = False,
+    as_json: options.Json = False,
 ) -> None:
     """Save the journal of a running switch or RIB that has the key journal in its configuration.
 
@@ -49,10 +50,10 @@ def save(
       gdp incident save robot/switch -o /tmp/robot.incident
     """
     with connect(node) as connection:
-        incident = Incident.of(*connection.journal()).sealed()
+        incident = Incident.from_blocks(*connection.journal()).sealed()
     path = output or Path(f"{incident.head['label']}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}.incident")
     write_all(path.parent, {path.name: private(incident.to_bytes())}, force=force)
-    echo(f"{path}: {len(incident.entries)} entries; gdp incident show {path}")
+    show({"file": str(path), "entries": len(incident.entries), "lost before": incident.head["first"]}, as_json=as_json)
 
 
 @app.command("show")

@@ -46,7 +46,7 @@ class Incident:
     entries: list[list[Any]]
 
     @classmethod
-    def of(cls, head: Mapping[str, Any], blocks: Iterable[bytes]) -> Incident:
+    def from_blocks(cls, head: Mapping[str, Any], blocks: Iterable[bytes]) -> Incident:
         """Return the incident of a journal. Raises ``LocalError``: a block is of the wrong form."""
         with well_formed("journal"):
             return cls(head, [_entry(item) for block in blocks for item in _items(block)])

@@ -35,14 +35,14 @@ from gdp.control.rib_replication import Entry
 from gdp.control.settings import NodeSettings
 from gdp.crypto.cbor import encode
 from gdp.crypto.identity import Identity
-from gdp.crypto.keys import SigningKey
+from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.rib.state import RibSettings
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["CALLS", "LENGTH", "Journal"]
+__all__ = ["CALLS", "LENGTH", "Journal", "JournalKey"]
 
 
 def _moment(value: Any) -> Timestamps:
@@ -74,6 +74,7 @@ CALLS: Final[Mapping[str, tuple[Callable[[Any], Any], ...]]] = {  # each argumen
 LENGTH: Final = struct.Struct("!I")  # before each entry of a block
 _BLOCK_BYTES: Final = 32 << 10  # before compression, which takes about a millisecond
 _PAGE_BYTES: Final = 48 << 10  # the socket's buffer holds two more than that in base64
+_Sign = Callable[[bytes], bytes]
 _C = TypeVar("_C")
 _R = TypeVar("_R")
 
@@ -131,7 +132,8 @@ class Journal:
             "settings": _fields(settings),
             "rib": None if rib is None else _fields(rib),
         }
-        identity.key = _ObservedKey(identity.key, self._observed)
+        key = identity.key
+        identity.key = JournalKey(key.public, self._observed("sign", key.sign), self._observed("sign", key.sign_digest))
         settings = replace(settings, random_bytes=self._observed("draw", settings.random_bytes))
         core = make(identity, policy, settings)
         self._follow(core)
@@ -260,13 +262,13 @@ class Journal:
             self._lost_blocks += 1
 
 
-class _ObservedKey(SigningKey):
-    """A node's key whose signatures are recorded: ECDSA draws a number for each."""
+class JournalKey(SigningKey):
+    """Key of a node whose signatures go into a journal, or come from one: ECDSA draws a number for each."""
 
-    def __init__(self, key: SigningKey, observed: Callable[[str, Callable[..., bytes]], Callable[..., bytes]]) -> None:
-        self.public = key.public
-        self._sign, self._sign_digest = observed("sign", key.sign), observed("sign", key.sign_digest)
-        self._to_file = key.to_file
+    def __init__(
+        self, public: PublicKey, sign: Callable[[bytes], bytes], sign_digest: Callable[[bytes], bytes]
+    ) -> None:
+        self.public, self._sign, self._sign_digest = public, sign, sign_digest
 
     def sign(self, data: bytes) -> bytes:
         """Return r || s (64 bytes) over SHA-256 of ``data``."""
@@ -277,8 +279,9 @@ class _ObservedKey(SigningKey):
         return self._sign_digest(digest)
 
     def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
-        """Return the content of this key's private file, in PEM."""
-        return self._to_file(protect)
+        """Raise ``LocalError``: a running node writes no key."""
+        del protect
+        raise LocalError("the key of a running node is not written")
 
 
 def _fields(settings: NodeSettings | RibSettings) -> dict[str, object]:

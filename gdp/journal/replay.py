@@ -7,9 +7,11 @@ from the journal, so it needs no private key, and cannot speak for the node.
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice, takewhile, zip_longest
 from typing import Any
 
 from gdp.client.rib_host import RibHost
@@ -17,13 +19,12 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import Identity
 from gdp.crypto.kem import KemPrivateKey, KemPublicKey
-from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.frame.codec import KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.journal.incident import Incident, well_formed
-from gdp.journal.journal import CALLS
+from gdp.journal.journal import CALLS, JournalKey
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.rib.state import RibSettings
@@ -144,31 +145,24 @@ class Replay:
 
     def _compare(self, transmits: list[OutgoingFrames]) -> None:
         """Compare the frames that the core sends with the entries that follow."""
-        for port, mac, frames in transmits:
-            for frame in frames:
-                self.sent[kind_of(frame)] += 1
-                if self._peek() != "sent":
-                    self._differ(f"the replay sends a {kind_of(frame)} more")
-                elif self._next()[1:] != [port, mac, frame]:
-                    was_port, was_mac, was = self.incident.entries[self.at - 1][1:]
-                    byte = next((at for at, (a, b) in enumerate(zip(was, frame, strict=False)) if a != b), len(frame))
-                    self._differ(
-                        f"the node sent a {kind_of(was)} of {len(was)} bytes at port {was_port} to {was_mac.hex(':')}, "
-                        f"the replay a {kind_of(frame)} of {len(frame)} at port {port} to {mac.hex(':')}; "
-                        f"byte {byte} is the first that differs"
-                    )
-                if self.difference:
-                    return
-        if self._peek() == "sent":
-            self._differ(f"the node sent a {kind_of(self._next()[3])} more")
+        sent: list[list[Any]] = [["sent", port, mac, frame] for port, mac, frames in transmits for frame in frames]
+        was = list(takewhile(lambda entry: entry[0] == "sent", islice(self.incident.entries, self.at, None)))
+        for mine, its in zip_longest(sent, was):
+            self.at += 1
+            if mine != its:
+                self._differ(f"the node sent {_described(its)}, the replay {_described(mine)}")
+                return
+            self.sent[kind_of(mine[3])] += 1
 
     def _built(self, head: Mapping[str, Any]) -> Core:
         """Return the core as it was at the start of the journal."""
         begun = self.now = Timestamps(*head["begun"])
         root = Root.from_wire(head["root"])
         member = Membership.from_wire(head["member"], root, begun.unix_s)
-        key = _RecordedKey(member.key, self._take)
-        identity = Identity(member, root, key, KemPrivateKey(b"", KemPublicKey.from_wire(head["kem"])))
+        sign = lambda _: bytes(memoryview(self._take("sign")))  # noqa: E731
+        identity = Identity(
+            member, root, JournalKey(member.key, sign, sign), KemPrivateKey(b"", KemPublicKey.from_wire(head["kem"]))
+        )
         roots = {each.domain: each for each in map(Root.from_wire, head["roots"])}
         transit, diagnostics = (map(Name, head[part]) for part in ("transit", "diagnostics"))
         policy = Policy(roots[member.domain], roots.values(), transit, diagnostics=diagnostics)
@@ -184,25 +178,13 @@ class Replay:
         return RibHost(identity, policy, RibCore(identity, policy, MemoryStore(), RibSettings(**named)), settings)
 
 
-@dataclass(slots=True)
-class _RecordedKey(SigningKey):
-    """The public half of a node's key, with the signatures of the journal."""
-
-    public: PublicKey
-    take: Callable[[str], Any]
-
-    def sign(self, data: bytes) -> bytes:
-        """Return the next signature of the journal."""
-        return self.sign_digest(data)
-
-    def sign_digest(self, digest: bytes) -> bytes:
-        """Return the next signature of the journal."""
-        del digest
-        return bytes(memoryview(self.take("sign")))
-
-    def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
-        """Raise ``LocalError``: there is no private key here."""
-        raise LocalError(f"a replay has no private key to write{'' if protect is None else ' protected'}")
+def _described(entry: list[Any] | None) -> str:
+    """Return a frame that was sent, in words; None: there was none."""
+    if entry is None:
+        return "no further frame"
+    _, port, mac, frame = entry
+    digest = hashlib.sha256(frame).hexdigest()[:16]
+    return f"a {kind_of(frame)} of {len(frame)} bytes at port {port} to {mac.hex(':')} (SHA-256 {digest}...)"
 
 
 def kind_of(frame: bytes) -> str:

@@ -274,7 +274,7 @@ class Simulation:
         """Write the incident of each node that has a journal, not sealed: a simulation has no secrets."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, journal in self.journals.items():
-            data = Incident.of(journal.head(), journal.blocks()).to_bytes()
+            data = Incident.from_blocks(journal.head(), journal.blocks()).to_bytes()
             (folder / f"{name.replace('/', '-')}.incident").write_bytes(data)
 
     def _settings(self) -> NodeSettings:

@@ -211,7 +211,7 @@ class Overlay:
             try:
                 path = find_control_socket(self.directory / "nodes" / f"{role}-{node}")
                 with NodeConnection(path) as connection:
-                    incident = Incident.of(*connection.journal())
+                    incident = Incident.from_blocks(*connection.journal())
             except LocalError as error:
                 progress(f"no journal of {who}: {error}")
                 continue
