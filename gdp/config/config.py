@@ -27,6 +27,7 @@ from gdp.config.schema import (
     ExistingFile,
     Identity,
     Ifname,
+    JournalMib,
     Metrics,
     NewFile,
     RequiredName,
@@ -210,6 +211,7 @@ class SwitchConfig(Section):
     detect_multiplier: DetectMultiplier = Field(
         default=DETECT_MULTIPLIER, description="Missed keepalives after which the other end gives up."
     )
+    journal: JournalMib = None
     control_socket: ControlSocket = None
     sandbox: Sandbox = True
 
@@ -346,6 +348,7 @@ class RibConfig(Section):
     metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
     audit: AuditFolder = None
     token_folders: TokenFolders = ()
+    journal: JournalMib = None
     control_socket: ControlSocket = None
     sandbox: Sandbox = True
 

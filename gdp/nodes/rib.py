@@ -70,9 +70,16 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             confine_rib(config)  # before the thread of the store starts; the device can still be opened
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
-        rib = RibCore(identity, policy, upkeep.store, _settings(config))
-        host = RibHost(identity, policy, rib, fresh_settings(config.lease_s))
-        upkeep.start(rib, now())
+        host = node.build_core(
+            lambda identity, policy, settings: RibHost(
+                identity, policy, RibCore(identity, policy, upkeep.store, _settings(config)), settings
+            ),
+            fresh_settings(config.lease_s),
+            config.journal,
+            rib=_settings(config),
+            unrepeatable="" if config.store == "memory" else "what its cluster answered is not in its journal",
+        )
+        upkeep.start(host.rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
