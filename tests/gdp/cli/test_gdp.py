@@ -8,6 +8,7 @@ import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -192,7 +193,7 @@ def test_a_card_of_another_domain_is_refused_where_a_root_is_given(gdp: Run, key
     assert "wrong-domain" in done.err
 
 
-def leaves(command: object, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+def leaves(command: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
     """Return the commands that are there, without those whose extension is absent."""
     if not isinstance(command, TyperGroup):
         return [path] if command.callback.__name__ != placeholder.__name__ else []
