@@ -57,7 +57,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
             return local_provider(site, regions)
         case "aws":
             from fog.catalog.prices import price_list
-            from fog.providers.aws.provider import AwsProvider
+            from gdp_extensions.aws.provider import AwsProvider
 
             return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
         case "skypilot":

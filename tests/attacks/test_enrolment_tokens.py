@@ -23,7 +23,7 @@ from fog.bootstrap.bundles import machine_boot
 from fog.host.bundle import JOIN_FILE, install, pack
 from fog.host.joining import join
 from fog.machine import MachineBundle, MachineSpec
-from fog.providers.aws.provider import AwsProvider
+from gdp_extensions.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup, placed, shell_script, user_data
 from fog.site import Site
 from fog.supervisor.journal import Journal
@@ -51,7 +51,7 @@ from gdp.trust.enrolment_wire import (
 )
 from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, join_id
 from tests.fog.bootstrap.desk import BINDING, CLUSTER, NONCE, Desk, Machine, desk_of, made_desk, memberships
-from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
+from tests.gdp_extensions.aws.test_aws import Cloud, aws, cloud, spec
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, journal, site, supervisor, work
 from tests.gdp.enrolment.lab import running_lab
 

@@ -11,10 +11,10 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from fog.providers.aws.clients import filters
-from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.core.run_request import Ground
-from fog.providers.aws.errors import is_code
+from gdp_extensions.aws.clients import filters
+from fog.providers.aws_config import AwsConfig
+from gdp_extensions.aws.core.run_request import Ground
+from gdp_extensions.aws.errors import is_code
 from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.core.run_request import Ground, order
-from fog.providers.aws.provider import AwsProvider
-from tests.fog.providers.test_aws import BOOT, EAST, Cloud, aws, cloud, spec
+from fog.providers.aws_config import AwsConfig
+from gdp_extensions.aws.core.run_request import Ground, order
+from gdp_extensions.aws.provider import AwsProvider
+from tests.gdp_extensions.aws.test_aws import BOOT, EAST, Cloud, aws, cloud, spec
 
 __all__ = ["aws", "cloud"]
 

@@ -26,7 +26,7 @@ from urllib.request import ProxyHandler, Request, build_opener
 import typer
 
 from fog.host.preemption_notice import write_notice
-from fog.providers.aws.core.instances import DRAIN
+from gdp_extensions.aws.core.instances import DRAIN
 from gdp.cli.version import HELP
 from gdp.terminal import echo
 
@@ -119,7 +119,7 @@ class Watch:
         return False
 
 
-@app.command(context_settings=HELP, epilog="Example: python -m fog.providers.aws.notice --home /var/lib/fog")
+@app.command(context_settings=HELP, epilog="Example: python -m gdp_extensions.aws.notice --home /var/lib/fog")
 def watch(
     home: Annotated[Path, typer.Option(help="The machine's folder.")],
     url: Annotated[str, typer.Option(help="Where the metadata service is.")] = METADATA_URL,

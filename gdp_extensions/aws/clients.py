@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from fog.providers.aws.errors import asking
+from gdp_extensions.aws.errors import asking
 from gdp.errors import LocalError
 from gdp.extras import install_command
 

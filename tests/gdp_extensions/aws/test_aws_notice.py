@@ -16,8 +16,8 @@ import pytest
 from fog.host.bundle import install
 from fog.host.preemption_notice import read_notice
 from fog.machine import MachineBundle
-from fog.providers.aws.notice import DRAIN_BEFORE_S, Metadata, Watch
-from fog.providers.aws.provider import WATCHER
+from gdp_extensions.aws.notice import DRAIN_BEFORE_S, Metadata, Watch
+from gdp_extensions.aws.provider import WATCHER
 
 ACTION = "/latest/meta-data/spot/instance-action"
 DRAIN = "/latest/meta-data/tags/instance/fog-drain"
@@ -146,7 +146,7 @@ def test_nonsense_is_an_error_that_may_pass(service: Service, text: str) -> None
 
 def test_the_program_tells_the_machine_and_waits_to_be_ended(service: Service, tmp_path: Path) -> None:
     interrupt(service)
-    program = [sys.executable, "-m", "fog.providers.aws.notice", "--home", str(tmp_path), "--url", service.url]
+    program = [sys.executable, "-m", "gdp_extensions.aws.notice", "--home", str(tmp_path), "--url", service.url]
     machine = [sys.executable, "-c", MACHINE, *program, "--poll-s", "0.01"]
     done = subprocess.run(machine, capture_output=True, text=True, timeout=60, check=True)
     assert json.loads(done.stdout) == {

@@ -14,8 +14,8 @@ import yaml
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
-from fog.providers.aws.config import AwsConfig, Ssh
-from fog.providers.aws.provider import AwsProvider
+from fog.providers.aws_config import AwsConfig, Ssh
+from gdp_extensions.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup
 from gdp.errors import LocalError, StoreError
 
@@ -159,7 +159,7 @@ def test_a_machine_gets_its_boot_and_the_watcher(cloud: Cloud, aws: AwsProvider)
         "content": "rules: []\n",
     }
     assert base64.b64decode(written["/var/lib/fog/keys/own.key"]["content"]) == b"\x00\xff"
-    assert "fog.providers.aws.notice" in written["/var/lib/fog/boot.json"]["content"]
+    assert "gdp_extensions.aws.notice" in written["/var/lib/fog/boot.json"]["content"]
 
 
 def test_a_spot_machine_is_a_spot_machine_and_locked_down(cloud: Cloud, aws: AwsProvider) -> None:
@@ -268,7 +268,7 @@ def test_a_refusal_says_what_may_be_done(
 
 def test_an_ec2_that_is_not_there_may_be_asked_again(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr("fog.providers.aws.clients._ATTEMPTS", 1)
+    monkeypatch.setattr("gdp_extensions.aws.clients._ATTEMPTS", 1)
     away = provider()
     with pytest.raises(StoreError, match="machines of unknown"):
         away.describe("unknown")
@@ -347,7 +347,7 @@ def test_a_group_is_kept_until_its_machines_have_ended(cloud: Cloud, monkeypatch
     own = provider(ssh=login("203.0.113.10/32", "ending"))
     own.terminate([own.create(spec("ending"), BOOT)])
     cloud.refuse(monkeypatch, "DependencyViolation", "delete_security_group")
-    monkeypatch.setattr("fog.providers.aws.provider._END_S", 0.0)
+    monkeypatch.setattr("gdp_extensions.aws.provider._END_S", 0.0)
     with pytest.raises(StoreError, match="try again"):
         own.clear_account()
     own.close()

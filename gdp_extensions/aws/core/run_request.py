@@ -12,8 +12,8 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, cast
 
 from fog.machine import MachineSpec
-from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.core.instances import tags_of
+from fog.providers.aws_config import AwsConfig
+from gdp_extensions.aws.core.instances import tags_of
 
 if TYPE_CHECKING:
     from types_boto3_ec2.literals import InstanceTypeType, ResourceTypeType

@@ -21,12 +21,12 @@ from fog.hardware import Hardware
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec, Program
 from fog.offer import Offer
-from fog.providers.aws.clients import Clients, filters
-from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.core.instances import CLUSTER, DRAIN, MACHINE, machine_of
-from fog.providers.aws.core.run_request import order
-from fog.providers.aws.errors import asking, is_code
-from fog.providers.aws.region import ground_of, remove_groups
+from gdp_extensions.aws.clients import Clients, filters
+from fog.providers.aws_config import AwsConfig
+from gdp_extensions.aws.core.instances import CLUSTER, DRAIN, MACHINE, machine_of
+from gdp_extensions.aws.core.run_request import order
+from gdp_extensions.aws.errors import asking, is_code
+from gdp_extensions.aws.region import ground_of, remove_groups
 from fog.providers.cloud_init import lines_of, user_data
 from gdp.errors import LocalError
 
@@ -39,7 +39,7 @@ __all__ = ["WATCHER", "AwsProvider"]
 
 log = logging.getLogger(__name__)
 
-WATCHER: Final = Program("notice", ("{python}", "-m", "fog.providers.aws.notice", "--home", "{home}"))
+WATCHER: Final = Program("notice", ("{python}", "-m", "gdp_extensions.aws.notice", "--home", "{home}"))
 _AT_ONCE: Final = 8
 _END_S: Final = 180.0  # a machine that is terminated takes about a minute to end
 _LIVING: Final = ("pending", "running", "stopping", "stopped")
