@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from threading import Lock
 from typing import TYPE_CHECKING
 
-from gdp_extensions.aws.errors import asking
+import boto3
+
 from gdp.errors import LocalError
-from gdp.extras import install_command
+from gdp_extensions.aws.errors import asking
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
@@ -26,17 +27,9 @@ _FIRST_REGION = "us-east-1"  # enabled in every account
 
 
 class Clients:
-    """Clients of all regions of an account, or of the chosen ones; thread-safe.
-
-    Raises:
-        LocalError: boto3 is not installed.
-    """
+    """Clients of all regions of an account, or of the chosen ones; thread-safe."""
 
     def __init__(self, chosen: tuple[str, ...] = ()) -> None:
-        try:
-            import boto3
-        except ModuleNotFoundError as missing:
-            raise LocalError(f"provider aws needs boto3: {install_command('aws')}") from missing
         with asking("credentials"):
             self._session = boto3.session.Session()
         self._regions = chosen

@@ -26,9 +26,9 @@ from urllib.request import ProxyHandler, Request, build_opener
 import typer
 
 from fog.host.preemption_notice import write_notice
-from gdp_extensions.aws.core.instances import DRAIN
 from gdp.cli.version import HELP
 from gdp.terminal import echo
+from gdp_extensions.aws.core.instances import DRAIN
 
 __all__ = ["Metadata", "Watch", "main"]
 

@@ -17,25 +17,27 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Final, cast
 
+from fog.catalog.prices import price_list
 from fog.hardware import Hardware
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec, Program
 from fog.offer import Offer
-from gdp_extensions.aws.clients import Clients, filters
 from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_init import lines_of, user_data
+from fog.site import Site
+from gdp.errors import LocalError
+from gdp_extensions.aws.clients import Clients, filters
 from gdp_extensions.aws.core.instances import CLUSTER, DRAIN, MACHINE, machine_of
 from gdp_extensions.aws.core.run_request import order
 from gdp_extensions.aws.errors import asking, is_code
 from gdp_extensions.aws.region import ground_of, remove_groups
-from fog.providers.cloud_init import lines_of, user_data
-from gdp.errors import LocalError
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
     from types_boto3_ec2.literals import InstanceTypeType
     from types_boto3_ec2.type_defs import FilterTypeDef, InstanceTypeDef, SpotInstanceRequestTypeDef
 
-__all__ = ["WATCHER", "AwsProvider"]
+__all__ = ["WATCHER", "AwsProvider", "open_aws"]
 
 log = logging.getLogger(__name__)
 
@@ -225,3 +227,8 @@ def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float
             usd = float(each["SpotPrice"])
             cheapest[each["InstanceType"]] = min(usd, cheapest.get(each["InstanceType"], usd))
     return cheapest
+
+
+def open_aws(site: Site) -> AwsProvider:
+    """Return the provider of a site."""
+    return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)

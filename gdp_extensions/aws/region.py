@@ -11,11 +11,11 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from gdp_extensions.aws.clients import filters
 from fog.providers.aws_config import AwsConfig
+from gdp.errors import LocalError, StoreError
+from gdp_extensions.aws.clients import filters
 from gdp_extensions.aws.core.run_request import Ground
 from gdp_extensions.aws.errors import is_code
-from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client

@@ -15,9 +15,9 @@ from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.aws_config import AwsConfig, Ssh
-from gdp_extensions.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup
 from gdp.errors import LocalError, StoreError
+from gdp_extensions.aws.provider import AwsProvider
 
 if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend
