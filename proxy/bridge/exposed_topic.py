@@ -17,7 +17,7 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.adaptation import adaptation_of
+from gdp_extensions.reduction.adaptation import adaptation_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
 from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos

@@ -28,7 +28,7 @@ from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPubl
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
-from proxy.reduce.picture import LibraryError
+from gdp_extensions.reduction.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 

@@ -13,11 +13,11 @@ from pydantic.config import JsonDict
 
 from gdp.config.schema import Section, relative
 from gdp.errors import LocalError
-from proxy.reduce.adaptive import MIN_HZ, MIN_QUALITY
-from proxy.reduce.compression import LEVEL_MAX, check_dictionary
-from proxy.reduce.picture import QUALITY
-from proxy.reduce.region import Bounds
-from proxy.reduce.region import Region as RegionBounds
+from gdp_extensions.reduction.adaptive import MIN_HZ, MIN_QUALITY
+from gdp_extensions.reduction.compression import LEVEL_MAX, check_dictionary
+from gdp_extensions.reduction.picture import QUALITY
+from gdp_extensions.reduction.region import Bounds
+from gdp_extensions.reduction.region import Region as RegionBounds
 
 __all__ = ["Adapt", "Compress", "Region", "SomeAdapt", "SomeCompress"]
 

@@ -50,9 +50,9 @@ from gdp.stores.files import read_private
 from proxy.config.history import SomeHistory
 from proxy.config.readiness import Readiness
 from proxy.config.reduction import Region, SomeAdapt, SomeCompress
-from proxy.reduce.cloud import CLOUD
-from proxy.reduce.image import IMAGE
-from proxy.reduce.picture import QUALITY, PictureFormat
+from gdp_extensions.reduction.cloud import CLOUD
+from gdp_extensions.reduction.image import IMAGE
+from gdp_extensions.reduction.picture import QUALITY, PictureFormat
 from proxy.serial.serializer import Encoding
 
 __all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]

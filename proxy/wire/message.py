@@ -17,8 +17,8 @@ from typing import Annotated, Final, NamedTuple, TypeVar
 from gdp.crypto.cbor import Value
 from gdp.crypto.schema import FieldSet, Form, Keyed, literal, many, mapped, octets
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
-from proxy.reduce.compression import DICTIONARY_MAX_BYTES
-from proxy.reduce.picture import PictureFormat
+from gdp_extensions.reduction.compression import DICTIONARY_MAX_BYTES
+from gdp_extensions.reduction.picture import PictureFormat
 from proxy.serial.channel import CHANNEL, Channel
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 from proxy.serial.serializer import ENCODING, Encoding

@@ -31,7 +31,7 @@ from proxy.bridge.core.expander import MessageExpander
 from proxy.config.reduction import Compress, Region
 from proxy.config.rule import Rule
 from proxy.recordings.reader import BagReader
-from proxy.reduce.image import IMAGE
+from gdp_extensions.reduction.image import IMAGE
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 

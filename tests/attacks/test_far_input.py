@@ -15,7 +15,7 @@ from gdp.errors import RemoteError
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.expander import MessageExpander
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.reduce.compression import BodyDecompressor
+from gdp_extensions.reduction.compression import BodyDecompressor
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.empty import NoAnswer

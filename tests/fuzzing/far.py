@@ -32,7 +32,7 @@ from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Origin, RosEndpoint
 from proxy.recordings.mcap_writer import McapWriter
-from proxy.reduce.compression import BodyCompressor
+from gdp_extensions.reduction.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
 from proxy.serial.rosbridge_json import RosbridgeCodec, cbor_raw

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from proxy.bridge.faults import Fault
 from proxy.config.rule import Rule
-from proxy.reduce.cloud import CLOUD, CloudReducer
-from proxy.reduce.compression import BodyCompressor
-from proxy.reduce.image import IMAGE, ImageReducer
-from proxy.reduce.picture import HAS_LIBRARY, NO_LIBRARY
+from gdp_extensions.reduction.cloud import CLOUD, CloudReducer
+from gdp_extensions.reduction.compression import BodyCompressor
+from gdp_extensions.reduction.image import IMAGE, ImageReducer
+from gdp_extensions.reduction.picture import HAS_LIBRARY, NO_LIBRARY
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Serializer

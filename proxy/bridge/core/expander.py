@@ -9,8 +9,8 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from gdp.errors import DropReason, RemoteError
-from proxy.reduce.compression import BodyDecompressor, body_max_bytes
-from proxy.reduce.image import ImageRestorer
+from gdp_extensions.reduction.compression import BodyDecompressor, body_max_bytes
+from gdp_extensions.reduction.image import ImageRestorer
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage, Step, TopicDescription
 

@@ -9,11 +9,11 @@ import numpy.typing as npt
 import pytest
 
 from gdp.errors import RemoteError
-from proxy.reduce.image import IMAGE, ImageReducer, ImageRestorer
-from proxy.reduce.picture import HAS_LIBRARY, PictureFormat
-from proxy.reduce.region import Region
+from gdp_extensions.reduction.image import IMAGE, ImageReducer, ImageRestorer
+from gdp_extensions.reduction.picture import HAS_LIBRARY, PictureFormat
+from gdp_extensions.reduction.region import Region
 from proxy.serial.channel import RosVersion
-from tests.proxy.reduce.samples import channel, image, image_of, pixels_of
+from tests.gdp_extensions.reduction.samples import channel, image, image_of, pixels_of
 
 pytestmark = pytest.mark.skipif(not HAS_LIBRARY, reason="Pillow is not installed")
 

@@ -10,18 +10,18 @@ import pytest
 
 from gdp.errors import LocalError
 from proxy.config.recorded import RecordedRules
-from proxy.reduce import picture
-from proxy.reduce.cloud import CLOUD
-from proxy.reduce.compression import BodyCompressor
-from proxy.reduce.image import IMAGE, ImageReducer
-from proxy.reduce.picture import HAS_LIBRARY
+from gdp_extensions.reduction import picture
+from gdp_extensions.reduction.cloud import CLOUD
+from gdp_extensions.reduction.compression import BodyCompressor
+from gdp_extensions.reduction.image import IMAGE, ImageReducer
+from gdp_extensions.reduction.picture import HAS_LIBRARY
 from proxy.serial.channel import RosVersion
 from proxy.wire.message import RosMessage, Step, TopicDescription
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.endpoints.fake import FakeGraph, Publication
-from tests.proxy.reduce.samples import channel, cloud, cloud_of, image, image_of, pixels_of
-from tests.proxy.reduce.test_compression import DICTIONARY
+from tests.gdp_extensions.reduction.samples import channel, cloud, cloud_of, image, image_of, pixels_of
+from tests.gdp_extensions.reduction.test_compression import DICTIONARY
 from tests.proxy.rule_files import refusals, rule, rules
 
 CHATTER = f"name: /chatter, type: {STRING}"
@@ -142,7 +142,7 @@ def test_a_reader_without_the_library_says_so_once_and_counts_what_it_refused(
     file = picture.encode_picture(sent[-SHADE.size :], picture.Layout(64, 48, "mono8", 64), "png", 80)
     assert file is not None
     monkeypatch.setattr(picture, "HAS_LIBRARY", False)
-    monkeypatch.setattr("proxy.reduce.image.encode_picture", lambda *_: file)
+    monkeypatch.setattr("gdp_extensions.reduction.image.encode_picture", lambda *_: file)
     talker.publish(sent)
     talker.publish(sent)
     sites.run(2)

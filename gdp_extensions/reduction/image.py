@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gdp.errors import DropReason, RemoteError
-from proxy.reduce.picture import Layout, PictureFormat, decode_picture, encode_picture
-from proxy.reduce.region import Region
+from gdp_extensions.reduction.picture import Layout, PictureFormat, decode_picture, encode_picture
+from gdp_extensions.reduction.region import Region
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import native_codec
 

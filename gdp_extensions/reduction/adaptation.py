@@ -11,7 +11,7 @@ from typing import Final
 from gdp.message.loss import Losses, LossReason
 from proxy.config.reduction import Adapt
 from proxy.config.rule import Rule
-from proxy.reduce.adaptive import AdaptBounds, AdaptiveQuality
+from gdp_extensions.reduction.adaptive import AdaptBounds, AdaptiveQuality
 
 __all__ = ["Adaptation", "adaptation_of"]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import LocalError, RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
-from proxy.reduce.compression import (
+from gdp_extensions.reduction.compression import (
     DICTIONARY_MAX_BYTES,
     BodyCompressor,
     BodyDecompressor,

@@ -10,13 +10,13 @@ import pytest
 
 from gdp.client.governing_paths import GoverningPaths
 from gdp.message.loss import Losses, LossReason, LostRange
-from proxy.bridge.core.adaptation import Adaptation, adaptation_of
-from proxy.reduce.adaptive import AdaptBounds
-from proxy.reduce.picture import HAS_LIBRARY
+from gdp_extensions.reduction.adaptation import Adaptation, adaptation_of
+from gdp_extensions.reduction.adaptive import AdaptBounds
+from gdp_extensions.reduction.picture import HAS_LIBRARY
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import Sites
-from tests.proxy.bridge.test_reductions import CAMERA, flowing
-from tests.proxy.reduce.samples import image
+from tests.gdp_extensions.reduction.test_reductions import CAMERA, flowing
+from tests.gdp_extensions.reduction.samples import image
 from tests.proxy.rule_files import furnish, rule
 
 CHATTER = f"name: /chatter, type: {STRING}"

@@ -7,8 +7,8 @@ import pytest
 from reduce import CLOUD, Case, cloud, described, image, measure_one, zstd_of
 
 from proxy.config.reduction import Region
-from proxy.reduce.image import IMAGE
-from proxy.reduce.picture import HAS_LIBRARY
+from gdp_extensions.reduction.image import IMAGE
+from gdp_extensions.reduction.picture import HAS_LIBRARY
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 WAVES = 128 + 60 * np.sin(ROWS / 37) + 50 * np.cos(COLUMNS / 53)

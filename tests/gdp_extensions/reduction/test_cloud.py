@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from proxy.reduce.cloud import CLOUD, CloudReducer
-from proxy.reduce.region import Region
+from gdp_extensions.reduction.cloud import CLOUD, CloudReducer
+from gdp_extensions.reduction.region import Region
 from proxy.serial.channel import RosVersion
-from tests.proxy.reduce.samples import channel, cloud, cloud_of
+from tests.gdp_extensions.reduction.samples import channel, cloud, cloud_of
 
 RANDOM = np.random.default_rng(1)
 POINTS = np.column_stack([RANDOM.uniform(-2, 2, (5_000, 3)), np.arange(5_000)]).astype(np.float32)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from proxy.reduce.cloud import CLOUD
-from proxy.reduce.image import IMAGE
+from gdp_extensions.reduction.cloud import CLOUD
+from gdp_extensions.reduction.image import IMAGE
 from proxy.serial.channel import Channel, RosVersion
 
 __all__ = ["channel", "cloud", "cloud_of", "image", "image_of", "pixels_of"]

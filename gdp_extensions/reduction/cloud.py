@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from proxy.reduce.region import Bounds, Region
+from gdp_extensions.reduction.region import Bounds, Region
 from proxy.serial.channel import Channel
 from proxy.serial.reader import Tree
 from proxy.serial.serializer import native_codec

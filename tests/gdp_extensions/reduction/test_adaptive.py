@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import pytest
 
-from proxy.reduce.adaptive import AdaptBounds, AdaptiveQuality
+from gdp_extensions.reduction.adaptive import AdaptBounds, AdaptiveQuality
 
 MBIT = 1e6 / 8
 FPS = 30
