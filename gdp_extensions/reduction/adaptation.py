@@ -9,21 +9,22 @@ from collections import deque
 from typing import Final
 
 from gdp.message.loss import Losses, LossReason
+from gdp_extensions.reduction.adaptive import AdaptBounds, AdaptiveQuality
+from proxy.bridge.core.reduction import Adaptation
 from proxy.config.reduction import Adapt
 from proxy.config.rule import Rule
-from gdp_extensions.reduction.adaptive import AdaptBounds, AdaptiveQuality
 
-__all__ = ["Adaptation", "adaptation_of"]
+__all__ = ["PathAdaptation", "adaptation_of"]
 
 _NOT_OF_THE_PATH: Final = (LossReason.NO_READER, LossReason.TOO_LARGE)
 
 
-def adaptation_of(rule: Rule) -> Adaptation | None:
-    """Return the adaptation that a rule states; None where it states none."""
-    return None if rule.adapt is None else Adaptation(_bounds(rule, rule.adapt))
+def adaptation_of(rule: Rule) -> Adaptation:
+    """Return the adaptation that a rule states."""
+    return Adaptation(rule.quality) if rule.adapt is None else PathAdaptation(_bounds(rule, rule.adapt))
 
 
-class Adaptation:
+class PathAdaptation(Adaptation):
     """Adaptation of one topic to its path.
 
     Args:
@@ -33,6 +34,7 @@ class Adaptation:
     __slots__ = ("_controller", "_dropped", "_looked_s", "_on_way", "_refused")
 
     def __init__(self, bounds: AdaptBounds) -> None:
+        super().__init__(bounds.max_quality)
         self._controller = AdaptiveQuality(bounds)
         self._on_way = deque[tuple[int, float]]()  # count of published messages, second of publishing
         self._dropped = 0  # by the path, as far as the controller knows
@@ -45,13 +47,7 @@ class Adaptation:
         return self._controller.quality
 
     def may_send(self, losses: Losses, acknowledged: int, path_bytes_s: float | None, now_s: float) -> bool:
-        """Return whether a message that comes now may leave.
-
-        Args:
-            losses: messages that were given up, and why.
-            acknowledged: messages that have left for good: confirmed, or of a best-effort topic sent.
-            path_bytes_s: bytes a second that the path gives the topic; None: not measured.
-        """
+        """Return whether a message that comes now may leave."""
         counts = losses.counts
         lost = counts.total()
         dropped = lost - self._refused - sum(counts[reason] for reason in _NOT_OF_THE_PATH)

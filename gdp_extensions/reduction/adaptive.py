@@ -27,10 +27,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-__all__ = ["MIN_HZ", "MIN_QUALITY", "AdaptBounds", "AdaptiveQuality"]
+from proxy.config.reduction import MIN_HZ, MIN_QUALITY, QUALITY
 
-MIN_HZ: Final = 1.0
-MIN_QUALITY: Final = 30
+__all__ = ["AdaptBounds", "AdaptiveQuality"]
 
 _LATE_S: Final = 0.1  # longest wait that is no sign of a backlog, beyond the shortest wait seen lately
 _DECREASE: Final = 0.8
@@ -71,7 +70,7 @@ class AdaptBounds:
     min_hz: float = MIN_HZ
     max_hz: float | None = None
     min_quality: int = MIN_QUALITY
-    max_quality: int = 80
+    max_quality: int = QUALITY
     has_quality: bool = True
 
 

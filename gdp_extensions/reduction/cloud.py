@@ -12,14 +12,13 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gdp_extensions.reduction.region import Bounds, Region
+from proxy.config.reduction import Bounds, Region
 from proxy.serial.channel import Channel
 from proxy.serial.reader import Tree
 from proxy.serial.serializer import native_codec
 
-__all__ = ["CLOUD", "CloudReducer"]
+__all__ = ["CloudReducer"]
 
-CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 _Axes: TypeAlias = "npt.NDArray[np.float64]"
 _FORMATS: Final = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
 _VOXELS_MAX: Final = 1 << 21  # along each axis: three of them fit into 63 bits
@@ -126,7 +125,7 @@ def _is_inside(axes: _Axes, region: Region) -> npt.NDArray[np.bool_]:
     inside = np.ones(axes.shape[1], np.bool_)
     for values in axes:
         np.logical_and(inside, np.isfinite(values), out=inside)
-    bounds: tuple[Bounds | None, ...] = region
+    bounds: tuple[Bounds | None, ...] = region.x, region.y, region.z
     for values, limits in zip(axes, bounds, strict=True):
         if limits is not None:
             np.logical_and(inside, (values >= limits[0]) & (values < limits[1]), out=inside)

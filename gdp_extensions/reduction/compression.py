@@ -11,32 +11,20 @@ import sys
 from typing import Final
 
 from gdp.errors import DropReason, LocalError, RemoteError
-from gdp.limits import MESSAGE_MAX_BYTES
-from proxy.serial.serializer import Encoding
+from proxy.wire.message import DICTIONARY_MAX_BYTES
 
 if sys.version_info >= (3, 14):
     from compression import zstd
 else:
     from backports import zstd
 
-__all__ = [
-    "DICTIONARY_MAX_BYTES",
-    "LEVEL_MAX",
-    "BodyCompressor",
-    "BodyDecompressor",
-    "body_max_bytes",
-    "check_dictionary",
-]
+__all__ = ["BodyCompressor", "BodyDecompressor", "check_dictionary"]
 
-LEVEL_MAX: Final = 19  # higher ones need more memory than a robot may have
-DICTIONARY_MAX_BYTES: Final = 32 << 10  # it travels to each reader within the description
 GAIN_MIN: Final = 0.03  # share of the body that compression must save
 _SMALL_BYTES: Final = 32  # shorter bodies are never tried: a frame adds up to 9 bytes
 _FAILURES_MAX: Final = 3  # attempts without gain in a row, before attempts are left out
 _REST_MAX: Final = 256  # messages between two attempts
 _WINDOW_LOG_MAX: Final = 25  # memory of a decoder: 32 MiB, above the largest message
-_TEXT_RATIO: Final = 16  # most bytes of JSON or CBOR, with the names of fields, for each byte as ROS wrote it
-_TEXT_FREE_BYTES: Final = 64 << 10
 
 
 class BodyCompressor:
@@ -119,13 +107,6 @@ class BodyDecompressor:
     def _decompressor(self) -> zstd.ZstdDecompressor:
         made: zstd.ZstdDecompressor = zstd.ZstdDecompressor(zstd_dict=self._dictionary, options=self._options)
         return made
-
-
-def body_max_bytes(encoding: Encoding, max_bytes: int) -> int:
-    """Return the most bytes of a body, for messages of ``max_bytes`` as ROS wrote them."""
-    if encoding == "cdr":
-        return max_bytes
-    return min(_TEXT_FREE_BYTES + _TEXT_RATIO * max_bytes, MESSAGE_MAX_BYTES)
 
 
 def check_dictionary(dictionary: bytes) -> bytes:

@@ -13,14 +13,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gdp.errors import DropReason, RemoteError
-from gdp_extensions.reduction.picture import Layout, PictureFormat, decode_picture, encode_picture
-from gdp_extensions.reduction.region import Region
+from gdp_extensions.reduction.picture import Layout, decode_picture, encode_picture
+from proxy.config.reduction import Region
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import native_codec
+from proxy.wire.message import PictureFormat
 
-__all__ = ["IMAGE", "ImageReducer", "ImageRestorer"]
+__all__ = ["ImageReducer", "ImageRestorer"]
 
-IMAGE: Final = "sensor_msgs/msg/Image"
 _NAMED: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "rgb16": 6, "bgr16": 6}
 _OPENCV: Final = re.compile(r"(8|16|32|64)[USF]C(\d{1,2})")
 _BAYER: Final = re.compile(r"bayer_[a-z]{4}(8|16)")
@@ -58,7 +58,7 @@ class ImageReducer:
             quality: of JPEG, 1 to 100.
 
         Raises:
-            LibraryError: there is no Pillow.
+            MissingExtraError: there is no Pillow.
         """
         tree = self._codec.to_tree(raw)
         image = _image_of(tree)
@@ -101,7 +101,7 @@ class ImageRestorer:
 
         Raises:
             RemoteError: it is no image, its file does not fit it, or it is larger than ``max_bytes``.
-            LibraryError: there is no Pillow.
+            MissingExtraError: there is no Pillow.
         """
         tree = self._codec.to_tree(raw)
         image = _image_of(tree)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import struct
 import zlib
 from io import BytesIO
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from gdp.errors import DropReason, LocalError, RemoteError
+from gdp.errors import DropReason, RemoteError
+from gdp.extras import MissingExtraError
+from proxy.wire.message import PictureFormat
 
 try:
     from PIL import Image
@@ -24,24 +26,13 @@ else:
 
 __all__ = [
     "HAS_LIBRARY",
-    "NO_LIBRARY",
-    "QUALITY",
     "Layout",
-    "LibraryError",
-    "PictureFormat",
+    "check_pictures",
     "decode_picture",
     "encode_picture",
 ]
 
-PictureFormat: TypeAlias = Literal["jpeg", "png"]
-
-QUALITY: Final = 80  # of JPEG, where none is stated
-NO_LIBRARY: Final = "Pillow is not installed: pip install 'gdp-ros[images]'"
 _PNG_LEVEL: Final = 1  # of zlib: 6 takes eight times as long and saves a seventh
-
-
-class LibraryError(LocalError):
-    """A library that this machine lacks is needed."""
 
 
 class Layout(NamedTuple):
@@ -77,6 +68,12 @@ _PIXELS: Final = {
 }
 
 
+def check_pictures() -> None:
+    """Raise ``MissingExtraError`` where there is no Pillow."""
+    if not HAS_LIBRARY:
+        raise MissingExtraError("Pillow is not installed: pip install 'gdp-ros[images]'")
+
+
 def encode_picture(pixels: bytes | memoryview, layout: Layout, to: PictureFormat, quality: int) -> bytes | None:
     """Return a picture file; None where the format has none for this layout, or it would be no shorter.
 
@@ -85,10 +82,9 @@ def encode_picture(pixels: bytes | memoryview, layout: Layout, to: PictureFormat
         quality: 1 to 100, of JPEG.
 
     Raises:
-        LibraryError: there is no Pillow.
+        MissingExtraError: there is no Pillow.
     """
-    if not HAS_LIBRARY:
-        raise LibraryError(NO_LIBRARY)
+    check_pictures()
     kind = _kind(layout, to)
     if kind is None or len(pixels) != layout.height * layout.step:
         return None
@@ -111,11 +107,10 @@ def decode_picture(file: bytes | memoryview, layout: Layout, of: PictureFormat) 
     """Return the pixels of a picture file: ``height`` rows of ``step`` bytes, those after a row's last pixel zero.
 
     Raises:
-        LibraryError: there is no Pillow.
+        MissingExtraError: there is no Pillow.
         RemoteError: the file is not of this format and layout. Memory is bounded by ``height * step``.
     """
-    if not HAS_LIBRARY:
-        raise LibraryError(NO_LIBRARY)
+    check_pictures()
     kind = _kind(layout, of)
     if kind is None:
         raise RemoteError(DropReason.MALFORMED, f"{of}: no picture of {layout.encoding[:20]!r} images")

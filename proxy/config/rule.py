@@ -49,11 +49,9 @@ from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
 from proxy.config.history import SomeHistory
 from proxy.config.readiness import Readiness
-from proxy.config.reduction import Region, SomeAdapt, SomeCompress
-from gdp_extensions.reduction.cloud import CLOUD
-from gdp_extensions.reduction.image import IMAGE
-from gdp_extensions.reduction.picture import QUALITY, PictureFormat
+from proxy.config.reduction import CLOUD, IMAGE, QUALITY, Region, SomeAdapt, SomeCompress
 from proxy.serial.serializer import Encoding
+from proxy.wire.message import PictureFormat
 
 __all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gdp_extensions.reduction.cloud import CLOUD
-from gdp_extensions.reduction.image import IMAGE
+from proxy.config.reduction import CLOUD, IMAGE
 from proxy.serial.channel import Channel, RosVersion
 
 __all__ = ["channel", "cloud", "cloud_of", "image", "image_of", "pixels_of"]

@@ -10,13 +10,14 @@ import pytest
 
 from gdp.client.governing_paths import GoverningPaths
 from gdp.message.loss import Losses, LossReason, LostRange
-from gdp_extensions.reduction.adaptation import Adaptation, adaptation_of
+from gdp_extensions.reduction.adaptation import PathAdaptation
 from gdp_extensions.reduction.adaptive import AdaptBounds
 from gdp_extensions.reduction.picture import HAS_LIBRARY
+from proxy.bridge.core.reduction import Adaptation, adaptation_of
+from tests.gdp_extensions.reduction.samples import image
+from tests.gdp_extensions.reduction.test_reductions import CAMERA, flowing
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import Sites
-from tests.gdp_extensions.reduction.test_reductions import CAMERA, flowing
-from tests.gdp_extensions.reduction.samples import image
 from tests.proxy.rule_files import furnish, rule
 
 CHATTER = f"name: /chatter, type: {STRING}"
@@ -53,17 +54,17 @@ def run(
 
 
 def test_messages_that_leave_at_once_all_may_leave() -> None:
-    assert run(Adaptation(AdaptBounds()), FakePath(), 10, lag=0) == 300
+    assert run(PathAdaptation(AdaptBounds()), FakePath(), 10, lag=0) == 300
 
 
 def test_a_publisher_that_holds_messages_back_gets_fewer() -> None:
-    adaptation = Adaptation(AdaptBounds())
+    adaptation = PathAdaptation(AdaptBounds())
     run(adaptation, path := FakePath(), 5, lag=0)
     assert run(adaptation, path, 5, lag=12, begin_s=5) < 100
 
 
 def test_messages_without_a_reader_or_too_large_are_no_sign_of_the_path() -> None:
-    adaptation, path = Adaptation(AdaptBounds()), FakePath()
+    adaptation, path = PathAdaptation(AdaptBounds()), FakePath()
     run(adaptation, path, 3, lag=0)
     for reason in (LossReason.NO_READER, LossReason.TOO_LARGE):
         path.losses.add(LostRange(1, 5, reason))
@@ -71,7 +72,7 @@ def test_messages_without_a_reader_or_too_large_are_no_sign_of_the_path() -> Non
 
 
 def test_dropped_messages_lower_the_quality() -> None:
-    adaptation, path = Adaptation(AdaptBounds()), FakePath()
+    adaptation, path = PathAdaptation(AdaptBounds()), FakePath()
     run(adaptation, path, 3, lag=1)
     best = adaptation.quality
     path.losses.add(LostRange(1, 1, LossReason.QUEUE_OVERFLOW))
@@ -81,9 +82,8 @@ def test_dropped_messages_lower_the_quality() -> None:
 
 def test_a_rule_states_the_bounds(tmp_path: Path) -> None:
     furnish(tmp_path)
-    assert adaptation_of(rule(tmp_path, "name: /a")) is None
+    assert type(adaptation_of(rule(tmp_path, "name: /a"))) is Adaptation
     adaptation = adaptation_of(rule(tmp_path, "name: /a, image: jpeg, quality: 60, max_hz: 5, adapt: true"))
-    assert adaptation is not None
     assert adaptation.quality == 60
     assert run(adaptation, FakePath(), 10, lag=0) == pytest.approx(50, abs=1)
 

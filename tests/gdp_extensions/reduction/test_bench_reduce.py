@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from reduce import CLOUD, Case, cloud, described, image, measure_one, zstd_of
 
-from proxy.config.reduction import Region
-from gdp_extensions.reduction.image import IMAGE
 from gdp_extensions.reduction.picture import HAS_LIBRARY
+from proxy.config.reduction import IMAGE, Region
 
 ROWS, COLUMNS = np.mgrid[0:480, 0:640]
 WAVES = 128 + 60 * np.sin(ROWS / 37) + 50 * np.cos(COLUMNS / 53)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gdp_extensions.reduction.cloud import CLOUD, CloudReducer
-from gdp_extensions.reduction.region import Region
+from gdp_extensions.reduction.cloud import CloudReducer
+from proxy.config.reduction import CLOUD, Region
 from proxy.serial.channel import RosVersion
 from tests.gdp_extensions.reduction.samples import channel, cloud, cloud_of
 
@@ -42,14 +42,14 @@ def test_points_without_a_finite_position_do_not_cross() -> None:
 
 
 def test_only_the_points_of_the_region_cross() -> None:
-    reducer = CloudReducer(channel(CLOUD), None, Region((0, 1), None, (-0.5, 0.5)))
+    reducer = CloudReducer(channel(CLOUD), None, Region(x=(0, 1), z=(-0.5, 0.5)))
     _, kept = cloud_of(reducer.reduce(cloud(POINTS)))
     x, _, z, _ = POINTS.T
     assert kept.tolist() == POINTS[(x >= 0) & (x < 1) & (z >= -0.5) & (z < 0.5)].tolist()
 
 
 def test_a_cloud_outside_the_region_crosses_empty() -> None:
-    message, kept = cloud_of(CloudReducer(channel(CLOUD), 0.1, Region((50, 60))).reduce(cloud(POINTS)))
+    message, kept = cloud_of(CloudReducer(channel(CLOUD), 0.1, Region(x=(50, 60))).reduce(cloud(POINTS)))
     assert (len(kept), message.width, len(message.data)) == (0, 0, 0)
 
 

@@ -9,10 +9,11 @@ import numpy.typing as npt
 import pytest
 
 from gdp.errors import RemoteError
-from gdp_extensions.reduction.image import IMAGE, ImageReducer, ImageRestorer
-from gdp_extensions.reduction.picture import HAS_LIBRARY, PictureFormat
-from gdp_extensions.reduction.region import Region
+from gdp_extensions.reduction.image import ImageReducer, ImageRestorer
+from gdp_extensions.reduction.picture import HAS_LIBRARY
+from proxy.config.reduction import IMAGE, Region
 from proxy.serial.channel import RosVersion
+from proxy.wire.message import PictureFormat
 from tests.gdp_extensions.reduction.samples import channel, image, image_of, pixels_of
 
 pytestmark = pytest.mark.skipif(not HAS_LIBRARY, reason="Pillow is not installed")
@@ -87,7 +88,7 @@ def test_big_endian_depth_travels_as_it_is() -> None:
 
 def test_only_the_pixels_of_the_region_cross() -> None:
     raw = image("mono8", SHADE.shape, pixels("mono8"), pad=3)
-    cut, is_file = ImageReducer(channel(IMAGE), None, Region((10, 30), (5, 6))).reduce(raw, 80)
+    cut, is_file = ImageReducer(channel(IMAGE), None, Region(x=(10, 30), y=(5, 6))).reduce(raw, 80)
     assert not is_file
     assert image_of(cut).header == image_of(raw).header
     assert pixels_of(cut).tolist() == [pixels_of(raw)[5, 10:30].tolist()]
@@ -95,14 +96,14 @@ def test_only_the_pixels_of_the_region_cross() -> None:
 
 def test_a_region_beyond_the_image_ends_with_it_and_one_outside_cuts_nothing() -> None:
     raw = image("mono8", SHADE.shape, pixels("mono8"))
-    cut, _ = ImageReducer(channel(IMAGE), None, Region((60, 900), None)).reduce(raw, 80)
+    cut, _ = ImageReducer(channel(IMAGE), None, Region(x=(60, 900))).reduce(raw, 80)
     assert (image_of(cut).width, image_of(cut).height) == (4, 48)
-    assert ImageReducer(channel(IMAGE), None, Region((64, 900), None)).reduce(raw, 80) == (raw, False)
+    assert ImageReducer(channel(IMAGE), None, Region(x=(64, 900))).reduce(raw, 80) == (raw, False)
 
 
 def test_a_cut_keeps_the_pattern_of_a_bayer_image() -> None:
     raw = image("bayer_rggb8", SHADE.shape, pixels("mono8"))
-    cut, _ = ImageReducer(channel(IMAGE), None, Region((3, 7), (1, 4))).reduce(raw, 80)
+    cut, _ = ImageReducer(channel(IMAGE), None, Region(x=(3, 7), y=(1, 4))).reduce(raw, 80)
     assert pixels_of(cut).tolist() == pixels_of(raw)[0:4, 2:8].tolist()
 
 

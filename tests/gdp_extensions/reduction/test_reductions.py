@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from gdp.errors import LocalError
-from proxy.config.recorded import RecordedRules
 from gdp_extensions.reduction import picture
-from gdp_extensions.reduction.cloud import CLOUD
 from gdp_extensions.reduction.compression import BodyCompressor
-from gdp_extensions.reduction.image import IMAGE, ImageReducer
+from gdp_extensions.reduction.image import ImageReducer
 from gdp_extensions.reduction.picture import HAS_LIBRARY
+from proxy.config.recorded import RecordedRules
+from proxy.config.reduction import CLOUD, IMAGE
 from proxy.serial.channel import RosVersion
 from proxy.wire.message import RosMessage, Step, TopicDescription
+from tests.gdp_extensions.reduction.samples import channel, cloud, cloud_of, image, image_of, pixels_of
+from tests.gdp_extensions.reduction.test_compression import DICTIONARY
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.endpoints.fake import FakeGraph, Publication
-from tests.gdp_extensions.reduction.samples import channel, cloud, cloud_of, image, image_of, pixels_of
-from tests.gdp_extensions.reduction.test_compression import DICTIONARY
 from tests.proxy.rule_files import refusals, rule, rules
 
 CHATTER = f"name: /chatter, type: {STRING}"
@@ -121,7 +121,7 @@ def test_a_cloud_crosses_thinned(sites: Sites) -> None:
 def test_a_publisher_without_the_library_says_so_and_sends_images_as_they_are(
     sites: Sites, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("proxy.bridge.core.encoder.HAS_LIBRARY", False)
+    monkeypatch.setattr(picture, "HAS_LIBRARY", False)
     robot, _, talker, ear = flowing(sites, ", image: jpeg, encoding: cdr", CAMERA)
     raw = image("mono8", SHADE.shape, SHADE)
     talker.publish(raw)
