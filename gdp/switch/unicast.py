@@ -88,7 +88,7 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Retry the frames that wait for a name."""
-        for frame, until_s, owner in self._state.resolver.release_frames(name):
+        for frame, until_s, owner in self._state.resolver.pending.release(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 

@@ -45,6 +45,7 @@ class ClientQueue:
         dropped: messages dropped so far.
         dropped_bytes: their bytes.
         is_overrun: the control messages exceed their bound, or the queues of all clients do and this one has most.
+        held_bytes: the bytes of the messages of subscriptions.
     """
 
     def __init__(self, data_max_bytes: int = DATA_MAX_BYTES, data_max_messages: int = DATA_MAX_MESSAGES) -> None:
@@ -55,20 +56,15 @@ class ClientQueue:
         self._lanes: dict[int, _Lane] = {}
         self._order = 0
         self._count = 0
-        self._held_bytes = 0
+        self.held_bytes = 0
         self.dropped = 0
         self.dropped_bytes = 0
         self.is_overrun = False
 
     @property
-    def held_bytes(self) -> int:
-        """Return the bytes of the messages of subscriptions."""
-        return self._held_bytes
-
-    @property
     def waiting_bytes(self) -> int:
         """Return the bytes of everything that waits."""
-        return self._held_bytes + self._control_bytes
+        return self.held_bytes + self._control_bytes
 
     def put_control(self, payload: str | bytes) -> None:
         """Add a message that must arrive."""
@@ -86,18 +82,18 @@ class ClientQueue:
         lane = self._lanes.setdefault(key, _Lane())
         lane.messages.append(Pending(key, stamp_ns, raw, self._order))
         lane.held_bytes += len(raw)
-        self._held_bytes += len(raw)
+        self.held_bytes += len(raw)
         self._count += 1
         while depth and len(lane.messages) > depth:
             self._drop_oldest(key)
-        while self._count > 1 and (self._held_bytes > self._max_bytes or self._count > self._max_messages):
+        while self._count > 1 and (self.held_bytes > self._max_bytes or self._count > self._max_messages):
             self._drop_oldest(self._largest(key))
 
     def forget(self, key: int) -> Sequence[Pending]:
         """Remove and return the messages of a subscription that has ended; they do not count as dropped."""
         lane = self._lanes.pop(key, None) or _Lane()
         self._count -= len(lane.messages)
-        self._held_bytes -= lane.held_bytes
+        self.held_bytes -= lane.held_bytes
         return lane.messages
 
     def pop(self) -> str | bytes | Pending | None:
@@ -123,7 +119,7 @@ class ClientQueue:
         lane = self._lanes[key]
         message = lane.messages.popleft()
         lane.held_bytes -= len(message.raw)
-        self._held_bytes -= len(message.raw)
+        self.held_bytes -= len(message.raw)
         self._count -= 1
         if not lane.messages:
             del self._lanes[key]

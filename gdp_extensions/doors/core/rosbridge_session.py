@@ -14,6 +14,7 @@ from typing import Final
 
 import orjson
 
+from gdp.due_queue import earliest
 from gdp.errors import GdpError, LocalError
 from gdp.ros_names import resolved
 from gdp_extensions.doors.core.client_fields import Fields, identifier, ros2_type, text_of, whole_number, word, wrong
@@ -160,8 +161,7 @@ class RosbridgeSession:
 
     def get_timer(self) -> float | None:
         """Return when a throttled message is due."""
-        times = (each.throttle.get_timer() for each in self._subscriptions.values())
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*(each.throttle.get_timer() for each in self._subscriptions.values()))
 
     def handle_timer(self, now_s: float) -> None:
         """Queue the throttled messages whose turn has come."""

@@ -11,8 +11,8 @@ import cbor2
 import pytest
 
 from gdp.client.unicast_stream import PeerIncarnation, private_incarnation, private_name
-from gdp.crypto.control_seal import ControlSealer, control_key
-from gdp.crypto.envelope import Sealer, seal_key
+from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
+from gdp.crypto.envelope import KeyContext, Sealer, seal_key
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.parity_seal import ParitySealer
 from gdp.frame.codec import HEADER_BYTES, decode, encode
@@ -44,10 +44,7 @@ def sealer(
     return Sealer(
         secret=secret,
         epoch=epoch,
-        kind=kind,
-        source=WRITER.name,
-        incarnation=incarnation,
-        destination=topic,
+        context=KeyContext(kind, WRITER.name, incarnation, topic),
         signer=KEY,
         random_bytes=random.Random(1).randbytes,
         address=address,
@@ -58,12 +55,7 @@ def note(kind: Kind, key: bytes, sender: PeerIncarnation = READER, to: PeerIncar
     made = ControlSealer(
         key=key,
         epoch=EPOCH,
-        kind=kind,
-        source=sender.name,
-        incarnation=sender.incarnation,
-        destination=to.name,
-        topic=TOPIC,
-        destination_incarnation=to.incarnation,
+        context=ControlContext(kind, sender.name, sender.incarnation, to.name, to.incarnation, TOPIC),
         numbers=count(1),
     )
     return made.seal(b"body")

@@ -10,7 +10,7 @@ import pytest
 
 from gdp.cli.gdp import main
 from gdp.crypto.certificates import Role
-from gdp.crypto.envelope import Sealer
+from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import ethernet
 from gdp.frame.kinds import Kind
@@ -57,10 +57,7 @@ def _sealed(topic: Name, secret: bytes, body: bytes, number: int) -> list[bytes]
     sealer = Sealer(
         secret=secret,
         epoch=0,
-        kind=Kind.DATA,
-        source=b"w" * 32,
-        incarnation=1,
-        destination=topic,
+        context=KeyContext(Kind.DATA, b"w" * 32, 1, topic),
         signer=SigningKey.generate(),
         random_bytes=os.urandom,
     )

@@ -129,7 +129,7 @@ class _Network:
         """Return what each command reads of each node."""
         world = self.sites.world
         found: dict[str, object] = {}
-        topic = self.robot.stream.topic if len(self.robot.member.publishers()) == 1 else self._topic()
+        topic = self.robot.stream.topic if len(list(self.robot.member.publications)) == 1 else self._topic()
         for label, handlers in self.handlers.items():
             self.runtimes[label].tick(world.network.now)
             shown: dict[str, object] = {"status": handlers.status(), "snapshot": handlers.snapshot()}
