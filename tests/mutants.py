@@ -4,8 +4,8 @@
 
 A mutant changes one comparison, operator, constant, condition or returned value. The tests of its file and package run
 first. Those that live are put into one tree, on which journeys, attacks and all other tests in memory run once; each is
-then judged alone by the tests that failed. The nightly tests follow in the same way. Tests that need namespaces are
-left out.
+then judged alone by the tests that failed. With ``--nightly`` the nightly tests follow in the same way. Tests that need
+namespaces are left out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = (
     "gdp/switch", "gdp/rib", "gdp/client", "gdp/exchange", "gdp/message", "gdp/crypto", "gdp/trust", "proxy/bridge",
 )  # fmt: skip
-_COPIED: Final = ("gdp", "proxy", "fog", "tests", "scripts", "netns_tests", "examples", "docs")
+_COPIED: Final = ("gdp", "proxy", "fog", "gdp_extensions", "tests", "scripts", "netns_tests", "examples", "docs")
 _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
@@ -36,7 +36,7 @@ _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
 _COMPUTED: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.FloorDiv, ast.FloorDiv: ast.Mult,
 }  # fmt: skip
-_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp")
+_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp", "tests/gdp_extensions")
 _TEST_S: Final = 2_400.0  # a mutant that hangs counts as killed
 
 
@@ -210,6 +210,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=60, help="mutants (60)")
     parser.add_argument("--seed", type=int, default=1, help="of the draw (1)")
+    parser.add_argument("--nightly", action="store_true", help="judge those that live by the nightly tests too (hours)")
     options = parser.parse_args()
     alive: list[Mutant] = []
     with tempfile.TemporaryDirectory(prefix="gdp-mutants-") as name:
@@ -221,12 +222,14 @@ def main() -> int:
             alive += [] if killer else [mutant]
             print(f"{number:3} {mutant.file}:{mutant.line} {mutant.what}: {killer or 'lives'}", flush=True)
         change = tree.judged(alive, "not nightly")
-        nightly = tree.judged([each for each in alive if each not in change], "nightly")
+        rest = [each for each in alive if each not in change]
+        nightly = tree.judged(rest, "nightly") if options.nightly else {}
     for mutant in alive:
         verdict = change.get(mutant) or (f"nightly only, {nightly[mutant]}" if mutant in nightly else "SURVIVED")
         print(f"{mutant.file}:{mutant.line} {mutant.what}: {verdict}")
     killed = options.count - len(alive) + len(change)
-    print(f"of {options.count}: the change lane kills {killed}, the nightly tests {len(nightly)} more")
+    more = f", the nightly tests {len(nightly)} more" if options.nightly else ""
+    print(f"of {options.count}: the change lane kills {killed}{more}")
     return 0
 
 

@@ -69,10 +69,15 @@ def run_switch(
         raise LocalError("a switch needs at least one port: --iface, or ports, links or relay in the configuration")
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
-    switch = SwitchCore(identity, policy, table, _settings(config))
     with contextlib.ExitStack() as stack:
         audit = audit_folder(config.audit)
         node = Node("switch", member, config, stack, state_folder=config.state, audit=audit)
+        switch = node.build_core(
+            lambda identity, policy, settings: SwitchCore(identity, policy, table, settings),
+            _settings(config),
+            config.journal,
+            unrepeatable="" if config.links is None else "calls about tunnels are not in its journal",
+        )
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
@@ -107,7 +112,7 @@ def run_switch(
         handlers = replace(
             handlers,
             reload=reload,
-            drain=lambda: runtime.drain(lambda: not switch.resolver.pending_frames, DRAIN_MAX_S),
+            drain=lambda: runtime.drain(lambda: not len(switch.resolver.pending), DRAIN_MAX_S),
             is_drained=lambda: runtime.has_drained,
         )
         node.follow_clients(runtime, handlers, config.control_socket)
@@ -242,7 +247,7 @@ def switch_sources(state: SwitchState, chosen: Chosen, loop: Loop) -> Sources:
         frames=frames,
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
-        pending_frames=lambda: switch.resolver.pending_frames,
+        pending_frames=lambda: len(switch.resolver.pending),
         two_paths=lambda: two_paths,
         clashes=lambda: switch.hello_protocol.conflicts.clashes,
     )
