@@ -361,7 +361,9 @@ class PathController:
         """Signal an empty queue at once."""
         highest_s = self._highest.value(0.0) - self.base_rtt_s
         # the base may be that of a short frame: what a full one takes to leave is no queue
-        wanted_s = min(self._wanted_frames() / self._frames_s(), _WANTED_MOST_S) + 1 / self._frames_s()
+        # and the least window of a lone flow on a thin path is no queue of another one
+        most_s = max(_WANTED_MOST_S, _LEAST_FRAMES * self._mtu / self._capacities.value(float("inf")))
+        wanted_s = min(self._wanted_frames() / self._frames_s(), most_s) + 1 / self._frames_s()
         if self.queue_s <= max(_EMPTY_SHARE * highest_s, wanted_s, _STANDING_S / 2):
             self._empty_s = now_s
             self._signal(Signal.QUEUE_EMPTY, now_s)
