@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from fog.providers.local.spawn import spawn_detached
 from fog.providers.provider import AccountProvider, Provider
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
+from gdp.extras import Seam
 from gdp.host.run_registry import RunRegistry
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ log = logging.getLogger(__name__)
 
 _OWN_SPACE: Final = Path("/proc/self/ns/net")
 _GATEWAY_DAYS: Final = 3_650.0
+_PROVIDERS: Final[Seam[Callable[[Site], Provider]]] = Seam("fog.provider")
 _BOOT_S: Final = 60.0
 _STEP_S: Final = 0.05
 
@@ -49,18 +51,9 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
     Raises:
         LocalError: a requirement is not installed, or its settings are wrong.
     """
-    match site.provider:
-        case "local":
-            return local_provider(site, regions)
-        case "aws":
-            from fog.catalog.prices import price_list
-            from fog.providers.aws.provider import AwsProvider
-
-            return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
-        case "skypilot":
-            from fog.providers.skypilot.provider import SkyPilotProvider
-
-            return SkyPilotProvider(site.skypilot)
+    if site.provider == "local":
+        return local_provider(site, regions)
+    return _PROVIDERS.get(site.provider, f"provider {site.provider}")(site)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:

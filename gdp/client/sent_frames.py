@@ -104,7 +104,7 @@ class SentFrames:
             size = sum(map(len, frames[:again]))
             samples = self._samples(frames[:again])
             for name in names:
-                self._paths.path(name, now_s).controller.charge(size, now_s)
+                self._paths.path(name, now_s).controller.pace.charge(size, now_s)
                 if name in self._readers:
                     self._readers[name].repairs += again
                     self._readers[name].receipts.sent(samples, is_repair=True)
@@ -113,8 +113,9 @@ class SentFrames:
                 if number in self._runs:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
-        self._add(frames[:again], names, now_s, is_repair=True)
-        self._add(frames[again:], names, now_s, is_repair=False)
+        if again:
+            self._add(frames[:again], names, now_s, is_repair=True)
+        self._add(frames[again:] if again else frames, names, now_s, is_repair=False)
         if not names or len(self._runs) > _MESSAGES_MAX:
             self._forget_places()
 
@@ -142,9 +143,8 @@ class SentFrames:
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
-        (number, part), (last_number, last_part) = (
-            NUMBER_AND_PART.unpack_from(frame, NUMBER_AT) for frame in (frames[0], frames[-1])
-        )
+        number, part = NUMBER_AND_PART.unpack_from(frames[0], NUMBER_AT)
+        last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
         if not is_repair and number == last_number and last_part - part == len(frames) - 1:  # of one message, in order
             self._runs.setdefault(number, []).append(_Run(part, last_part, place, False))
             return
@@ -259,7 +259,7 @@ class SentFrames:
         for name in self._readers.keys() - set(readers):
             path, reader = self._paths.get(name), self._readers.pop(name)
             if path is not None:
-                path.controller.forget(reader.flights)
+                path.controller.rate.forget(reader.flights)
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""

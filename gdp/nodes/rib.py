@@ -9,10 +9,12 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final, Protocol
 
 from gdp.client.rib_host import RibHost
-from gdp.config.config import RibConfig
+from gdp.config.config import ClusterConfig, RibConfig
 from gdp.crypto.certificates import Role
+from gdp.extras import Seam
 from gdp.links.uplink import load_plane, open_uplink
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
@@ -37,6 +39,15 @@ from gdp.trust.domain import Policy
 __all__ = ["rib_handlers", "rib_sources", "run_rib"]
 
 log = logging.getLogger(__name__)
+
+
+class _OpenStore(Protocol):
+    """Opens a store outside of the RIB's process, with its upkeep."""
+
+    def __call__(self, cluster: ClusterConfig, policy: Policy, *, allow_unowned: bool) -> Upkeep: ...
+
+
+_STORES: Final[Seam[_OpenStore]] = Seam("gdp.store")
 
 
 def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | None = None) -> None:
@@ -67,7 +78,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             rib=_settings(config),
             unrepeatable="" if config.store == "memory" else "what its cluster answered is not in its journal",
         )
-        upkeep.begin(host.rib, now())
+        upkeep.start(host.rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
@@ -105,9 +116,8 @@ def _settings(config: RibConfig) -> RibSettings:
 def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     if config.store == "memory":
         return MemoryUpkeep(config.snapshot)
-    from gdp.nodes.rib_cluster import ClusterUpkeep  # the client library is an optional extra
-
-    return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
+    open_store = _STORES.get("cluster", "store: cluster")
+    return open_store(config.store.cluster, policy, allow_unowned=config.allow_unowned)
 
 
 def rib_handlers(state: RibState, sources: Sources, store: Store) -> ControlHandlers:

@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError
+from gdp.extras import MissingExtraError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.expander import MessageExpander
+from proxy.bridge.core.reduction import MessageExpander, expander_of
 from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.bridge.decoder_cache import DecoderCache
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -28,7 +29,6 @@ from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPubl
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
-from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
@@ -53,6 +53,7 @@ class ImportedTopic:
         local_readers: how many there are on this machine.
         thinned: messages that the rule's rate left out.
         last_s: monotonic second of the newest message that arrived; None: there was none.
+        is_joined: whether it is subscribed: a local node reads it.
 
     Raises:
         LocalError: this graph does not accept a publisher of it.
@@ -66,7 +67,7 @@ class ImportedTopic:
         self._topic = topic
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
-        self._is_joined = False
+        self.is_joined = False
         self.local_readers = 0
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
@@ -84,10 +85,10 @@ class ImportedTopic:
         """Update the local readers."""
         self.local_readers = len(ends)
         self._tell_unmatched(ends)
-        if ends and not self._is_joined:
-            self._is_joined = True
+        if ends and not self.is_joined:
+            self.is_joined = True
             self._context.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
-        elif not ends and self._is_joined:
+        elif not ends and self.is_joined:
             self._leave()
             self._output.drop_kept()
         self._output.receive_readers(ends)
@@ -106,7 +107,7 @@ class ImportedTopic:
     def _receive(self, message: Message, now_s: float) -> None:
         try:
             self._deliver(message, now_s)
-        except LibraryError as error:
+        except MissingExtraError as error:
             self._refuse(Fault.NO_LIBRARY, str(error))
         except LocalError as error:
             self._refuse(Fault.REFUSED, str(error))
@@ -117,14 +118,9 @@ class ImportedTopic:
         if isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
-    @property
-    def is_joined(self) -> bool:
-        """Return whether it is subscribed: a local node reads it."""
-        return self._is_joined
-
     def parties(self, now_s: float) -> list[Party]:
         """Return the publishers that are known now."""
-        names = [each.publisher for each in self._context.member.writer_proxies_of(self._topic.name)]
+        names = [each.publisher for each in self._context.member.subscriptions.writer_proxies_of(self._topic.name)]
         self._heard_s = {name: self._heard_s[name] for name in names if name in self._heard_s}
         ago_s = {name: now_s - heard_s for name, heard_s in self._heard_s.items()}
         return [Party("publisher", name.to_text(), ago_s.get(name)) for name in names]
@@ -132,7 +128,7 @@ class ImportedTopic:
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
         del now_s
-        if self._is_joined:
+        if self.is_joined:
             self._leave()
         self.count_losses()
         self._output.close()
@@ -140,7 +136,7 @@ class ImportedTopic:
     def renew(self, topic: Topic) -> None:
         """Replace the delegation."""
         self._topic = topic
-        if self._is_joined:
+        if self.is_joined:
             self._context.member.renew(topic)
 
     def set_offered(self, flow_spec: FlowSpec) -> None:
@@ -152,12 +148,12 @@ class ImportedTopic:
         """Update the losses in the topic's statistics."""
         self.stats.losses = losses = Losses()
         losses.update(self._past_losses)
-        if self._is_joined:
-            losses.update(self._context.member.losses_of(self._topic.name))
+        if self.is_joined:
+            losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
 
     def _leave(self) -> None:
-        self._is_joined = False
-        self._past_losses.update(self._context.member.losses_of(self._topic.name))
+        self.is_joined = False
+        self._past_losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
         self._context.member.unsubscribe(self._topic.name)
 
     def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:
@@ -216,7 +212,7 @@ class ImportedTopic:
             return None
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
-            expanders = [MessageExpander(description, source, self._flow_spec.rule.max_bytes) for source in sources]
+            expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
         except DefinitionError as error:
             self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None

@@ -147,7 +147,7 @@ class Traffic:
             numbers = [number for number, _ in came]
             assert numbers == sorted(set(numbers)), f"{source} to {reader}"
             member = self.bed.world.members[f"{reader}/member"]
-            lost = member.losses_of(self.flows[source].topic.name).total
+            lost = member.subscriptions.losses_of(self.flows[source].topic.name).total
             assert lost == len(self.sent_s) - len(numbers), f"{source} to {reader}: lost without a report"
         for pair, came in (*self.read.items(), *self.answered.items()):
             if pair in direct:
