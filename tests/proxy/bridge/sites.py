@@ -36,7 +36,6 @@ from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
 ROBOT: Final = "nuc1/robot"
 SERVER: Final = "nuc5/server"
-_LOOK_S: Final = 0.005
 _GRAPHS: Final = {1: "{endpoint: ros1}", 2: "{endpoint: ros2, domain: 0}"}
 _TICK_S: Final = 0.5  # of the proxy's loop
 _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
@@ -132,14 +131,18 @@ class Sites:
     Args:
         folder: an empty one, for the files that rules name.
         topology: None: the ring of five.
+        look_s: after which a proxy with news wakes up.
         options: further ones of ``Simulation``.
     """
 
-    def __init__(self, folder: Path, seed: int = 1, topology: Topology | None = None, **options: Any) -> None:
+    def __init__(
+        self, folder: Path, seed: int = 1, topology: Topology | None = None, look_s: float = 0.005, **options: Any
+    ) -> None:
         self.world = Simulation(topology=topology or ring5(), seed=seed, keepalive_ms=500, **options)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder
+        self._look_s = look_s
         furnish(folder)
         assert self.world.run_until_attached()
         self._look()
@@ -270,7 +273,7 @@ class Sites:
                 machine.bridge.work(now_s)
                 machine.member.flush(now_s)
                 self.world.network.send_pending(machine.label)
-        self.world.network.call(_LOOK_S, self._look)
+        self.world.network.call(self._look_s, self._look)
 
 
 def named(name: str, type_name: str = known.STRING, kind: str = "topic") -> Metadata:
