@@ -138,7 +138,8 @@ class LocalAdvertisements:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
         interval_s = min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
-        repeats, due = Backoff(interval_s, interval_s), []
+        # behind a slow link the relays of all names are a queue of their own, for which the next ones must not count
+        repeats, due = Backoff(interval_s, _RELAY_MAX_S if interval_s > RELAY_AGAIN_S else interval_s), []
         for key in self._relays.poll_due(now_s):
             name, advertiser = key
             each = self._by_name[name][advertiser]

@@ -13,7 +13,6 @@ from typing import Final
 from gdp.cli.node import emit, emit_wait, report
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
-from gdp_extensions.doors.core.hub import Rights
 from gdp_extensions.doors.endpoint import DoorEndpoint
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
@@ -24,7 +23,7 @@ __all__ = ["OpenDoor", "run_door"]
 
 log = logging.getLogger(__name__)
 
-OpenDoor = Callable[[Callable[[], Rights]], DoorEndpoint]
+OpenDoor = Callable[[Callable[[], DelegatedRules]], DoorEndpoint]
 
 _TICK_S: Final = 0.5
 _TURN_S: Final = 0.0002  # longest wait of the server's thread for the interpreter; Python's default is 5 ms

@@ -17,9 +17,9 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.adaptation import adaptation_of
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.encoder import MessageEncoder, description_of
+from proxy.bridge.core.reduction import adaptation_of, encoders_of
 from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.bridge.depth_probe import DepthProbe
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -75,7 +75,7 @@ class ExposedTopic:
         self.local_publishers = len(ends)
         self._depth_probe: DepthProbe | None = None
         self._keys = {end.key for end in ends}
-        self._compressor = compressor_of(flow_spec.rule)
+        self._new_encoder = encoders_of(flow_spec.rule)
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self._adaptation = adaptation_of(flow_spec.rule)
         self.handle = self._subscribe()
@@ -161,7 +161,7 @@ class ExposedTopic:
         rule = self._flow_spec.rule
         self._channels = tuple(channels)
         described = self.qos.describe(channels, rule.global_name_of(self._flow_spec.local))
-        self._encoders = [MessageEncoder(channel, rule, self._compressor) for channel in described]
+        self._encoders = [self._new_encoder(channel) for channel in described]
         opaque = {each.serializer.opaque for each in self._encoders if each.serializer.opaque}
         if opaque and rule.encoding != "cdr":
             detail = f"messages travel as bytes, unread: {', '.join(sorted(opaque))}"
@@ -213,22 +213,18 @@ class ExposedTopic:
             self._count(event)
             return
         adaptation, path = self._adaptation, publisher.governing_paths
-        if adaptation is not None and not adaptation.may_send(
-            publisher.losses, publisher.acknowledgements.acknowledged, path.bytes_s, now_s
-        ):
+        acknowledged = publisher.acknowledgements.acknowledged
+        if not adaptation.may_send(publisher.losses, acknowledged, path.bytes_s, now_s):
             traffic.thinned += 1
             return
         if not publisher.has_space():
-            if adaptation is not None:
-                adaptation.handle_refused(now_s)
+            adaptation.handle_refused(now_s)
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
             publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
             return
-        body, steps = self._encoders[event.channel].encode(
-            event.raw, rule.quality if adaptation is None else adaptation.quality
-        )
+        body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)
         message = RosMessage(event.channel, event.stamp_ns, body, steps).to_wire()
         try:
             count = publisher.publish(message, now_s)
@@ -236,7 +232,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if adaptation is not None and count is not None:
+        if count is not None:
             adaptation.handle_sent(count, len(message), now_s)
         traffic.sent(len(message))
         self._count(event)

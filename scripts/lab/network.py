@@ -12,7 +12,7 @@ import random
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, ethernet
@@ -103,7 +103,7 @@ class SimNetwork:
     def __init__(self, seed: int = 1) -> None:
         self._random = random.Random(seed)
         self._nodes: dict[str, _Node] = {}
-        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._events: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._count = 0
         self._now_s = 1_000.0
         self.taps: list[Tap] = []
@@ -200,9 +200,9 @@ class SimNetwork:
         if until is not None and until():
             return True
         while self._events and self._events[0][0] <= end_s:
-            at_s, _, action = heapq.heappop(self._events)
+            at_s, _, action, arguments = heapq.heappop(self._events)
             self._now_s = max(self._now_s, at_s)
-            action()
+            action(*arguments)
             if until is not None and until():
                 return True
         self._now_s = end_s
@@ -229,9 +229,9 @@ class SimNetwork:
         self._count += 1
         return b"\x02" + self._count.to_bytes(5, "big")
 
-    def _push(self, at_s: float, action: Callable[[], None]) -> None:
+    def _push(self, at_s: float, action: Callable[..., None], *arguments: object) -> None:
         self._count += 1
-        heapq.heappush(self._events, (at_s, self._count, action))
+        heapq.heappush(self._events, (at_s, self._count, action, arguments))
 
     def _arm(self, name: str) -> None:
         """Schedule the call of a core for when its next timer is due."""
@@ -240,7 +240,7 @@ class SimNetwork:
         if due_s is None or node.stalled is not None or (node.timer_s is not None and node.timer_s <= due_s):
             return
         node.timer_s = max(due_s, self._now_s)
-        self._push(node.timer_s, lambda: self._timer(name, node))
+        self._push(node.timer_s, self._timer, name, node)
 
     def _timer(self, name: str, node: _Node) -> None:
         if self._nodes[name] is not node or not node.is_alive:
@@ -286,7 +286,7 @@ class SimNetwork:
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)
             left_s = sim_link.leaves_s(far.mac, len(frame), self._now_s)
-            self._push(left_s + delay_s, lambda: self._arrive(sim_link, far, frame))
+            self._push(left_s + delay_s, self._arrive, sim_link, far, frame)
 
     def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> None:
         if sim_link.is_up:
