@@ -104,7 +104,6 @@ JOINS_AGAIN_MAX: Final = 16  # whole joins that one reply about unknown ones cau
 JOINS_LOST_FROM: Final = 0.01  # share of frames
 JOIN_REFRESH_LOSSY_S: Final = 0.5
 
-WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for this time reports why
 
 # Tables
 TABLE_MAX: Final = 1 << 20

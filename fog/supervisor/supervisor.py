@@ -31,6 +31,7 @@ from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
 from gdp.errors import GdpError
+from gdp.intervals import WATCH_S
 from gdp.stores.keyring import load_public_key
 
 __all__ = ["Heard", "Supervisor"]
@@ -40,7 +41,6 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
 _UNREADY_S: Final = 60.0  # a replica that does not pass its readiness probe for so long is replaced
-_NEWS_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
 
@@ -118,8 +118,8 @@ class Supervisor:
         """
         left_s = self._actions.provider.poll_s
         beat()
-        while left_s > 0 and not self._woken.wait(min(left_s, _NEWS_S)) and not self._has_news():
-            left_s -= _NEWS_S
+        while left_s > 0 and not self._woken.wait(min(left_s, WATCH_S)) and not self._has_news():
+            left_s -= WATCH_S
             beat()
         self._woken.clear()
 

@@ -15,6 +15,7 @@ from typing import Final
 from gdp.congestion.controller import FIRST_RTT_S, PathController
 from gdp.congestion.delivery_rate import Flight
 from gdp.congestion.states import State
+from gdp.intervals import FORGET_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 
 __all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
@@ -32,7 +33,6 @@ _BEHIND_REPORTS: Final = 2
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
 _MESSAGE_FRAMES: Final = 100  # of a large message, one loss among which costs a round trip
-_FORGET_S: Final = 60.0
 _NEVER: Final = float("inf")
 _UNLIMITED: Final = 1 << 30
 
@@ -221,7 +221,7 @@ class ReaderPath:
 
     def is_unused(self, now_s: float) -> bool:
         """Return whether nothing was confirmed for so long that the path need not be remembered."""
-        return not self.controller.inflight and now_s - self._confirmed_s > _FORGET_S
+        return not self.controller.inflight and now_s - self._confirmed_s > FORGET_S
 
 
 class ReaderPaths:

@@ -17,6 +17,7 @@ from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.control.settings import NodeSettings
+from gdp.intervals import NEVER_S
 from gdp.limits import HELLO_IDLE
 from gdp.names import Name
 
@@ -26,7 +27,6 @@ _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone k
 _LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
 _OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
 _UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
-_NEVER_S: Final = float("inf")
 
 
 class LivenessMonitor:
@@ -153,7 +153,7 @@ class LivenessMonitor:
 
     def find_next(self) -> float:
         """Return the monotonic second of the next keepalive or loss of a neighbour; infinity: never."""
-        due_s, self.is_probing = _NEVER_S, False
+        due_s, self.is_probing = NEVER_S, False
         for port in self._ports.values():
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self.gone_at_s(neighbour)
@@ -186,7 +186,7 @@ class LivenessMonitor:
         """Return when a probe ends the neighbour: never unless another link has answered since it began."""
         probe = session.probe
         if probe is None:
-            return _NEVER_S
+            return NEVER_S
         for other in self._others(neighbour, of_uplink=probe.is_moved):
             probe.note_other(other.quality.confirmed_s)
         uplink = self._uplinks.get(neighbour.port)

@@ -52,6 +52,7 @@ from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
+from gdp.intervals import UPKEEP_S
 from gdp.limits import COST_AUTO, HELLO_IDLE, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
@@ -60,7 +61,6 @@ from gdp.trust.domain import Policy
 __all__ = ["HelloProtocol"]
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
-_RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalives come
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 
@@ -371,7 +371,7 @@ class HelloProtocol:
         known = port.neighbours.get(Name(header.source)) if port is not None else None
         if known is None or known.keepalives is None:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a keepalive")
-        if known.member is not None and now.mono_s >= known.checked_s + _RECHECK_S:
+        if known.member is not None and now.mono_s >= known.checked_s + UPKEEP_S:
             self._policy.check_member(known.member, now.unix_s)
             known.checked_s = now.mono_s
         known.digest = known.keepalives.open(header, arrival.frame, now.mono_s, arrival.waited_s)

@@ -28,6 +28,7 @@ from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.intervals import DAY_S
 from gdp.management.control_socket import short_path
 from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
@@ -61,9 +62,7 @@ _EACH_PER_S: Final = 25.0  # of them, of one address
 _EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
 _LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
 _REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
-_IDLE_S: Final = 2 * POLL_MAX_S
 _FLUSH_S: Final = 10.0
-_TLS_S: Final = 86_400.0
 _INSTANCES_MAX: Final = 16  # remembered starts of one machine's agent
 
 _T = TypeVar("_T")
@@ -253,7 +252,7 @@ class EnrolmentServer:
         end_s: float,
     ) -> bool:
         """Answer one request; return whether another one may follow."""
-        idle_s = _IDLE_S if connection.session is not None else end_s - time.monotonic()
+        idle_s = 2 * POLL_MAX_S if connection.session is not None else end_s - time.monotonic()
         try:
             with _cut_after(writer, idle_s):
                 head = await reader.readexactly(LENGTH_BYTES)
@@ -372,14 +371,14 @@ class EnrolmentServer:
 
     async def _keep_up(self) -> None:
         """Write the audit log, and replace the certificate in time."""
-        tls_s = time.monotonic() + _TLS_S
+        tls_s = time.monotonic() + DAY_S
         while True:
             await asyncio.sleep(_FLUSH_S)
             try:
                 await self._work(self._desk.flush)
                 if time.monotonic() >= tls_s:
                     self._tls = await self._work(self._make_tls)
-                    tls_s = time.monotonic() + _TLS_S
+                    tls_s = time.monotonic() + DAY_S
             except GdpError as error:
                 log.error("enrolment upkeep failed reason=%s", error)
 

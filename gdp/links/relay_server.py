@@ -17,8 +17,9 @@ from typing import Final
 from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
+from gdp.intervals import CONNECT_S
 from gdp.links.relay_context import RelayContext
-from gdp.links.relay_hello import HELLO_S, HelloWait, hand_over
+from gdp.links.relay_hello import HelloWait, hand_over
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_loop import RelayLoop
 from gdp.names import Name
@@ -113,7 +114,7 @@ class BorderServer:
 
     def handle_timer(self, now_s: float) -> float:
         """Accept connections again after a pause, and end late hellos; return the second of the next call."""
-        for hello in [each for each in self._hellos if now_s >= each.since_s + HELLO_S]:
+        for hello in [each for each in self._hellos if now_s >= each.since_s + CONNECT_S]:
             self._end_stranger(hello, "no hello in time")
         if self._resume_s is not None and now_s >= self._resume_s:
             self._resume_s = None

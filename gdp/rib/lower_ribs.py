@@ -10,21 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.intervals import NEVER_S
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
 from gdp.rib.upstream_advertisements import QUIET_S
 
 __all__ = ["LowerRibs"]
 
-_NEVER_S: Final = float("-inf")
 _KEEP_S: Final = ADVERTISEMENT_LEASE_S / 2  # at a time, and after a RIB is back: it renews within a third
 
 
 @dataclass(slots=True)
 class _Rib:
-    probed_s: float = _NEVER_S
-    heard_s: float = _NEVER_S
-    returned_s: float = _NEVER_S
+    probed_s: float = -NEVER_S
+    heard_s: float = -NEVER_S
+    returned_s: float = -NEVER_S
     is_silent: bool = False
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from gdp.intervals import NEVER_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.watches import Asker
@@ -23,7 +24,6 @@ _QUERIES: Final = Backoff(RETRY_S, RETRY_S)
 _RENEWALS: Final = Backoff(RETRY_S, WATCH_AGAIN_S)
 _SILENT: Final = Backoff(WATCH_AGAIN_S, WATCH_AGAIN_S)
 OPEN_MAX: Final = 65_536
-_NEVER_S: Final = float("inf")
 
 
 class DueQuery(NamedTuple):
@@ -97,7 +97,7 @@ class UpstreamQueries:
         """Return whether a response from above is still pending."""
         return self._requests.is_open(name)
 
-    def answered(self, name: Name, now_s: float, lease_s: float = _NEVER_S, *, is_unknown: bool = False) -> list[Asker]:
+    def answered(self, name: Name, now_s: float, lease_s: float = NEVER_S, *, is_unknown: bool = False) -> list[Asker]:
         """Record a response; return the askers that waited for it. More responses may come for the same askers.
 
         Args:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError
+from gdp.intervals import UPKEEP_S
 from gdp.sharing.exchange import Exchange
 from gdp.sharing.sharing import Sharing
 from gdp.stores.keyring import OWNER_KEY
@@ -21,7 +22,6 @@ __all__ = ["ShareUpkeep"]
 
 log = logging.getLogger(__name__)
 
-_EACH_S: Final = 1.0
 _STOP_S: Final = 3.0  # a pass may wait for a server that does not answer
 
 
@@ -33,7 +33,7 @@ class ShareUpkeep:
         each_s: seconds between two passes.
     """
 
-    def __init__(self, directory: Path, exchange: Exchange, *, each_s: float = _EACH_S) -> None:
+    def __init__(self, directory: Path, exchange: Exchange, *, each_s: float = UPKEEP_S) -> None:
         self._directory = directory
         self._exchange = exchange
         self._each_s = each_s

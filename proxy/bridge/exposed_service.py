@@ -18,6 +18,7 @@ from typing import Final
 
 from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
+from gdp.intervals import DAY_S
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.frames import Answer, Request, Stop
@@ -38,7 +39,6 @@ from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.undescribed_requests import UndescribedRequests
-from proxy.config.rule import CALL_MAX_S
 from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
@@ -277,8 +277,8 @@ class ExposedService(ServiceFlow):
         """Return the seconds that a call may take; None: as long as its goal."""
         if self.flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
             return None
-        asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
-        return min(asked_s, CALL_MAX_S)
+        asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else DAY_S
+        return min(asked_s, DAY_S)  # the most that a rule may state
 
     def _keep(self, number: int) -> OrderedServer:
         return OrderedServer(

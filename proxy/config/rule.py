@@ -28,6 +28,7 @@ from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import DAY_S
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
@@ -59,7 +60,6 @@ __all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "R
 
 _OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
-CALL_MAX_S: Final = 86_400.0
 COPIES_MAX: Final = 1_024
 AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
@@ -172,7 +172,7 @@ NamePrefix = Annotated[
 Owner = Annotated[PublicKey, BeforeValidator(_owner_key), WithJsonSchema({"type": "string", "minLength": 1})]
 Salt = Annotated[str | None, BeforeValidator(_salt), Field(max_length=4_096, repr=False)]
 ExtraMetadata = Annotated[dict[str, str | int], AfterValidator(_extra_metadata)]
-CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
+CallSeconds = Annotated[float, Field(gt=0, le=DAY_S)]
 
 
 def _by_kind(kind: Kind) -> JsonValue:

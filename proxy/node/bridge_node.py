@@ -13,6 +13,7 @@ from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
 from gdp.errors import LocalError
+from gdp.intervals import TICK_S
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge, FlowChange
@@ -30,7 +31,6 @@ __all__ = ["run"]
 
 log = logging.getLogger(__name__)
 
-TICK_S: Final = 0.5
 _LOOK_S: Final = 2.0  # with less, a new proxy may not detect yet that another proxy of its graph carries the same
 DRAIN_MAX_S: Final = 10.0  # after this time a leaving server abandons unanswered requests
 _TURN_S: Final = 0.0002  # longest wait of an endpoint's thread for the interpreter; Python's default is 5 ms

@@ -17,12 +17,13 @@ from typing import Final
 from gdp.client.participant import Participant, Topic
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import TICK_S
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node import Node, common_sources
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, OnWait
+from gdp.nodes.node_log import OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.runtime.runtime import Runtime, now
 from proxy.bridge.bridge import Bridge
@@ -140,7 +141,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         node = ProxyNode(config, stack, on_wait)
         runtime = node.runtime
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
-        runtime.every(RECONCILE_PERIOD_S, EpochTimer(node.reload_on_signal).handle_timer)
+        runtime.every(TICK_S, EpochTimer(node.reload_on_signal).handle_timer)
         sources = common_sources(node.node_log, proxy_sources(node.state))
         handlers = replace(
             proxy_handlers(node.state, sources),

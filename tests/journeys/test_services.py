@@ -6,10 +6,10 @@ from functools import partial
 
 import pytest
 
-from gdp.client.unicast_stream import IDLE_S
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
+from gdp.intervals import FORGET_S
 from gdp.limits import ADVERTISEMENT_LEASE_S, READER_LEASE_S
 from gdp.sansio import ReceivedFrame
 from gdp.trust.adcert import AdCert
@@ -309,7 +309,7 @@ def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -
         if writer_proxy not in client.member.writer_proxies_of(client.service)
     ]
     writer_proxy.schedule.due_s = float("inf")  # it sends nothing any more
-    world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
+    world.network.run(READER_LEASE_S + 1.5 * FORGET_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")
     assert work(world, client, until_s=2, have=2)

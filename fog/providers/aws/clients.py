@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from fog.providers.aws.errors import asking
 from gdp.errors import LocalError
 from gdp.extras import install_command
+from gdp.intervals import CONNECT_S, SERVER_S
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Clients", "filters"]
 
-_CONNECT_S = 5.0
-_ANSWER_S = 30.0
 _ATTEMPTS = 4
 _FIRST_REGION = "us-east-1"  # enabled in every account
 
@@ -56,8 +55,8 @@ class Clients:
         with self._lock:
             if region not in self._clients:
                 retries = Config(
-                    connect_timeout=_CONNECT_S,
-                    read_timeout=_ANSWER_S,
+                    connect_timeout=CONNECT_S,
+                    read_timeout=SERVER_S,
                     retries={"mode": "standard", "max_attempts": _ATTEMPTS},
                 )
                 with asking(region):

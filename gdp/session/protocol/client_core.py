@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
 from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Call", "ClientCore"]
 
-_FOLLOW_S: Final = 0.05  # between two checks of the present servers, while calls are active
 _GONE: Final = "the server has gone"
 
 
@@ -163,7 +163,7 @@ class ClientCore:
 
     def _follow(self, now_s: float) -> None:
         """Update the set of servers."""
-        self._follow_at_s = now_s + _FOLLOW_S
+        self._follow_at_s = now_s + LOOK_S
         member = self._member
         peers = set(member.peers(self._name) or member.connected_peers(self._name))  # a slow server is better than none
         if not peers:  # and a silent one may return: its calls go on

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.errors import LocalError
+from gdp.intervals import TICK_S
 from gdp.names import Name
 from gdp.service.frames import Answer, Outcome, Request
 from gdp.service.serving import Asked, Serving, Turn
@@ -29,7 +30,6 @@ __all__ = ["ServerCore"]
 
 _GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
 _CALL_MAX_S: Final = 3_600.0
-_CHECK_CLIENTS_S: Final = 0.5
 _CLIENT_AWAY_S: Final = 30.0  # a client that is silent for so long has ended its wait
 _PART: Final = 0
 
@@ -132,7 +132,7 @@ class ServerCore:
                 )
         if self._check_at_s is not None and now_s >= self._check_at_s:
             self._check_clients(now_s)
-            self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
+            self._check_at_s = now_s + TICK_S if self._serving else None
         self._give(now_s)
 
     def get_timer(self) -> float | None:
@@ -157,7 +157,7 @@ class ServerCore:
             self._respond(asked, Answer.failed(RESPONSE, frame.call, str(error)))
             return
         if self._check_at_s is None:
-            self._check_at_s = now_s + _CHECK_CLIENTS_S
+            self._check_at_s = now_s + TICK_S
 
     def _give(self, now_s: float) -> None:
         self.turns.extend(self._serving.poll_turns(now_s))

@@ -22,6 +22,7 @@ from typing import Final
 import cbor2
 
 from gdp.errors import LocalError, RemoteError
+from gdp.intervals import ANSWER_S, STEADY_S
 from gdp.requests import Backoff
 from proxy.endpoints.core.endpoint import (
     CallFailed,
@@ -45,9 +46,7 @@ __all__ = ["Ros1Endpoint"]
 
 _ANSWER_S: Final = 1.0
 _START_S: Final = 4.0  # a process that has just been started answers later
-_FAREWELL_S: Final = 2.0
 _RESTARTS: Final = Backoff(0.25, 5.0)
-_SOUND_S: Final = 10.0  # a process that ran this long did not fail at its start
 _ROOT: Final = Path(__file__).resolve().parents[3]
 
 
@@ -201,7 +200,7 @@ class Ros1Endpoint:
         """Leave the graph; may block two seconds while the process unregisters from the master."""
         self._link.close()
         self._ended.append(self._process)
-        until_s = time.monotonic() + _FAREWELL_S
+        until_s = time.monotonic() + ANSWER_S
         for process in self._ended:
             try:
                 process.wait(max(0.0, until_s - time.monotonic()))
@@ -257,7 +256,7 @@ class Ros1Endpoint:
             for call in sorted(held.calls):
                 self._fail(handle, call, self._trouble)
         self._is_graph_old = True
-        self._failures = 0 if time.monotonic() - self._started_s > _SOUND_S else self._failures + 1
+        self._failures = 0 if time.monotonic() - self._started_s > STEADY_S else self._failures + 1
         self._start(_RESTARTS.pause_s(self._failures) if self._failures else 0.0)
 
     def _watch_space(self) -> None:

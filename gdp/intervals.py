@@ -1,0 +1,67 @@
+"""Named intervals, and the formulas by which other times derive from them.
+
+Sans-I/O; imports nothing of this project. A time of one mechanism alone is in its module; one idea has one value here.
+
+::
+
+    SoftState      sent again each ``refresh_s``, forgotten after ``lease_s`` = ``periods`` * ``refresh_s``
+    a wait         LOOK_S < WATCH_S < TICK_S < UPKEEP_S: what has no event is looked at so often, by who waits for it
+    a request      PROMPT_S < ANSWER_S < RELOAD_S < SERVER_S: by what the other program does before it answers
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+NEVER_S: Final = float("inf")
+MINUTE_S: Final = 60
+HOUR_S: Final = 3_600
+DAY_S: Final = 86_400
+
+
+@dataclass(frozen=True, slots=True)
+class SoftState:
+    """State that its owner sends again before those who keep it forget it.
+
+    Source: RFC 7761, section 4.11 (a join is held for 3.5 periods); RFC 2205, section 3.7.
+
+    Attributes:
+        refresh_s: between two sends.
+        periods: for which it is kept: one less, rounded down, may be lost in a row.
+    """
+
+    refresh_s: float
+    periods: float = 3.5
+
+    @property
+    def lease_s(self) -> float:
+        """Return how long it is kept after it was last sent."""
+        return self.periods * self.refresh_s
+
+
+# Looks at what has no event
+LOOK_S: Final = 0.05  # by who waits for it: a process that ends, a socket that appears
+WATCH_S: Final = 0.25  # by who shows it to an operator
+TICK_S: Final = 0.5  # by a node: its files, its clients, its rules
+UPKEEP_S: Final = 1.0  # at what changes rarely: devices, memberships, journals
+POLL_S: Final = 2.0  # at what another program answers: counters, machines of a provider
+
+# Requests to a program, until it counts as silent
+PROMPT_S: Final = 0.5  # silence is an answer, too, and others wait meanwhile
+ANSWER_S: Final = 2.0  # on this machine, from its state
+RELOAD_S: Final = 10.0  # ... from its files, which it reads again
+CONNECT_S: Final = 5.0  # handshake with another machine
+SERVER_S: Final = 30.0  # work of a server, or of a program of the system
+RETRY_S: Final = 5.0  # after a failure that time alone may end
+CACHE_S: Final = 30.0  # for which an answer of another service is used again
+
+# Life of programs
+ATTACH_S: Final = 10.0  # until a device is there, or a switch has accepted a node
+STOP_S: Final = 5.0  # from SIGTERM to SIGKILL
+STEADY_S: Final = 30.0  # a program that ran this long is started again at once
+DRAIN_S: Final = 60.0  # until a server that leaves has answered all calls
+FORGET_S: Final = 60.0  # for which the state of what is gone, or silent, is kept
+
+# Reports
+REPORT_S: Final = 5.0  # of what is young or makes no progress, until the reason is reported
