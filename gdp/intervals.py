@@ -12,7 +12,7 @@ Sans-I/O; imports nothing of this project. A time of one mechanism alone is in i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 NEVER_S: Final = float("inf")
 MINUTE_S: Final = 60
@@ -38,6 +38,13 @@ class SoftState:
     def lease_s(self) -> float:
         """Return how long it is kept after it was last sent."""
         return self.periods * self.refresh_s
+
+
+class Rate(NamedTuple):
+    """What one peer may cause (RFC 2697): so often a second, and so many at once."""
+
+    per_s: float
+    burst: float
 
 
 # Looks at what has no event

@@ -1,11 +1,13 @@
 """Bounds that several packages share; a bound of one mechanism is in its module.
 
-Sans-I/O; imports nothing of this project. Units end the names.
+Sans-I/O. Units end the names.
 """
 
 from __future__ import annotations
 
 from typing import Final
+
+from gdp.intervals import Rate
 
 # Frames
 HOPS_MAX: Final = 64  # hops left at the source
@@ -113,38 +115,34 @@ PENDING_S: Final = 1.5
 ATTACHED_MAX: Final = 16_384  # advertisements of the nodes attached to a switch, some 3 KiB each
 READERS_MAX: Final = 16_384  # advertisements of the readers attached to a switch
 TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
-JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
-JOINS_BURST: Final = 16_384.0
-ADVERTISEMENTS_PER_S: Final = 2_048.0  # advertisements and withdrawals of one neighbour; each is verified and relayed
-ADVERTISEMENTS_BURST: Final = 2.0 * ATTACHED_MAX
+JOINS_RATE: Final = Rate(2_000.0, burst=16_384.0)  # of one neighbouring switch; each is verified
+# advertisements and withdrawals of one neighbour; each is verified and relayed
+ADVERTISEMENTS_RATE: Final = Rate(2_048.0, burst=2.0 * ATTACHED_MAX)
 ADVERTISEMENTS_WINDOW: Final = 1_024  # how far advertisements of one node may overtake each other
-QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may cause queries to a RIB for
-QUESTIONS_BURST: Final = 256.0
-SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
-SWITCH_QUESTIONS_BURST: Final = 2_048.0
+QUESTIONS_RATE: Final = Rate(16.0, burst=256.0)  # new names that an attached node may cause queries to a RIB for
+SWITCH_QUESTIONS_RATE: Final = Rate(256.0, burst=2_048.0)  # ... or a neighbouring switch
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
 # of responses that one sender's queries may cause at a RIB; some 2,000 responses
-ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)
-ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch queries at a RIB that is new
+# ... and at once: all that a switch queries at a RIB that is new
+ANSWER_BYTES_RATE: Final = Rate(4.0 * (1 << 20), burst=64.0 * (1 << 20))
 ENDPOINT_LEASE_S: Final = 60.0  # for which a RIB keeps an endpoint record; renewed after a third
 ENDPOINT_RECORDS_MAX: Final = 8_192  # at one RIB, one of each switch
 ENDPOINT_RECORDS_OF_OTHERS_MAX: Final = 2_048  # ... of other domains
-ENDPOINT_RECORDS_PER_S: Final = 4.0  # of one switch that a RIB verifies
-ENDPOINT_RECORDS_BURST: Final = 16.0
-ENDPOINT_QUERIES_PER_S: Final = 8.0  # of one switch or RIB
-ENDPOINT_QUERIES_BURST: Final = 64.0
+ENDPOINT_RECORDS_RATE: Final = Rate(4.0, burst=16.0)  # of one switch that a RIB verifies
+ENDPOINT_QUERIES_RATE: Final = Rate(8.0, burst=64.0)  # of one switch or RIB
 RELAY_RATE_MIN: Final = 10_000  # bytes per second into one tunnel: below it hellos would be late
 RELAY_RATE_MAX: Final = (1 << 32) - 1
 DIRECT_TUNNELS_MAX: Final = 32  # of one switch to others that are behind a NAT, too
-LINK_STATES_PER_S: Final = 10.0  # of one origin that are accepted, and flooded
-LINK_STATES_BURST: Final = 100.0
+LINK_STATES_RATE: Final = Rate(10.0, burst=100.0)  # of one origin that are accepted, and flooded
+# new connections that a relay or an enrolment server accepts: a handshake costs about a millisecond
+CONNECTIONS_RATE: Final = Rate(50.0, burst=50.0)
+ADDRESS_CONNECTIONS_RATE: Final = Rate(25.0, burst=100.0)  # of one address: a site behind a NAT starts together
 
 # Diagnostics
-DIAGNOSTICS_PER_S: Final = 32.0  # requests of one member that a node answers
-DIAGNOSTICS_BURST: Final = 64.0
-DIAGNOSTIC_FRAMES_PER_S: Final = 1_024.0  # frames of one neighbour that are read for it, before a signature is verified
-DIAGNOSTIC_FRAMES_BURST: Final = 2_048.0
+DIAGNOSTICS_RATE: Final = Rate(32.0, burst=64.0)  # requests of one member that a node answers
+# frames of one neighbour that are read for it, before a signature is verified
+DIAGNOSTIC_FRAMES_RATE: Final = Rate(1_024.0, burst=2_048.0)
 DIAGNOSTIC_REPLY_MAX_BYTES: Final = 8_000  # longest reply that one request may ask for, and pays with its own length
 DIAGNOSTIC_WAIT_S: Final = 1.0  # a node that must query a RIB first answers within this time
 

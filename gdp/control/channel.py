@@ -29,6 +29,7 @@ from gdp.crypto.records import RecordKey
 from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, octets
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, StatementError
+from gdp.intervals import Rate
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
@@ -56,8 +57,8 @@ _REOPEN_S: Final = 0.3  # minimum time between two reactions to a hint
 _CHANNELS_PER_PEER: Final = 2  # in use: the newest, and the one before
 _OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
 _PEERS_MAX: Final = 8_192
-_OFFERS_PER_S: Final = 20.0  # accepted of one peer
-_HINTS_PER_S: Final = 100.0
+_OFFERS_RATE: Final = Rate(20.0, burst=20.0)  # accepted of one peer
+_HINTS_RATE: Final = Rate(100.0, burst=100.0)
 _PEER_ROLES: Final = (Role.SWITCH, Role.LEAF, Role.RIB)
 
 
@@ -147,7 +148,7 @@ class _Asker:
 
     channels: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)
     offers: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)  # by fingerprint of the OPEN
-    pace: TokenBucket = field(default_factory=lambda: TokenBucket(_OFFERS_PER_S, _OFFERS_PER_S))
+    pace: TokenBucket = field(default_factory=lambda: TokenBucket(*_OFFERS_RATE))
 
 
 class Channels:
@@ -167,7 +168,7 @@ class Channels:
         self._asked: dict[Name, _Asked] = {}
         self._offers = Requests[Name]()  # ours, by peer
         self._askers: OrderedDict[Name, _Asker] = OrderedDict()
-        self._hints = TokenBucket(_HINTS_PER_S, _HINTS_PER_S)
+        self._hints = TokenBucket(*_HINTS_RATE)
         self._out: list[Outgoing] = []
         self.drops: Counter[DropReason] = Counter()
 

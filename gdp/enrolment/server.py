@@ -29,6 +29,7 @@ from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.intervals import DAY_S
+from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.management.control_socket import short_path
 from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
@@ -57,9 +58,6 @@ _BACKLOG: Final = 128
 _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
-_ACCEPTS_PER_S: Final = 50.0  # a handshake costs about 1 ms
-_EACH_PER_S: Final = 25.0  # of them, of one address
-_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
 _LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
 _REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
 _FLUSH_S: Final = 10.0
@@ -131,8 +129,8 @@ class EnrolmentServer:
         self._desk = desk
         self._make_tls = make_tls
         self._tls = make_tls()
-        self._rate = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
-        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
+        self._rate = TokenBucket(*CONNECTIONS_RATE)
+        self._each = TokenBuckets(*ADDRESS_CONNECTIONS_RATE)
         self._strangers: OrderedDict[_Connection, None] = OrderedDict()
         self._members: dict[int, OrderedDict[_Connection, None]] = defaultdict(OrderedDict)
         self._polling: dict[int, OrderedDict[bytes, None]] = defaultdict(OrderedDict)  # instances, the newest last
@@ -163,7 +161,7 @@ class EnrolmentServer:
         return [*self._strangers, *(each for connections in self._members.values() for each in connections)]
 
     async def _accept(self) -> None:
-        wait_s = (1.0 - self._rate.left(time.monotonic())) / _ACCEPTS_PER_S
+        wait_s = (1.0 - self._rate.left(time.monotonic())) / CONNECTIONS_RATE.per_s
         if wait_s > 0:
             await asyncio.sleep(wait_s)  # further connections wait in the kernel's queue
         try:

@@ -17,7 +17,8 @@ from typing import Final
 from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
-from gdp.intervals import CONNECT_S
+from gdp.intervals import CONNECT_S, Rate
+from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_hello import HelloWait, hand_over
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
@@ -37,10 +38,8 @@ __all__ = ["BorderServer", "listen_tls", "port_status"]
 log = logging.getLogger(__name__)
 
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
-_ACCEPTS_PER_S: Final = 50.0  # a handshake costs about a millisecond
-_EACH_PER_S: Final = 25.0  # of them, of one address
-_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
-_LOOKS_PER_S: Final = 2_000.0  # connections whose address is looked at: an address above its share costs no handshake
+# connections whose address is looked at: an address above its share costs no handshake
+_LOOKS_RATE: Final = Rate(2_000.0, burst=2_000.0)
 _ACCEPT_PAUSE_S: Final = 0.1
 
 
@@ -93,9 +92,9 @@ class BorderServer:
         self._clients: dict[Name, _Client] = {}
         self._handshakes: set[RelayLink] = set()
         self._hellos: set[HelloWait] = set()
-        self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
-        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
-        self._looks = TokenBucket(_LOOKS_PER_S, _LOOKS_PER_S)
+        self._accepts = TokenBucket(*CONNECTIONS_RATE)
+        self._each = TokenBuckets(*ADDRESS_CONNECTIONS_RATE)
+        self._looks = TokenBucket(*_LOOKS_RATE)
         self._turned_away = 0
         self._resume_s: float | None = None
         self._ended = ConnectionCounters()

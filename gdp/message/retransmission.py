@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
+from gdp.intervals import Rate
 from gdp.limits import PROBE_MIN_S
 from gdp.message.acknack import MissingRange
 from gdp.message.history_cache import HistoryCache
@@ -19,15 +20,16 @@ from gdp.token_bucket import TokenBucket
 
 __all__ = ["RetransmissionQueue", "repair_allowance"]
 
-_SCAN_PARTS: Final = 8_192  # fragments examined for reports of one reader at once; a window of small frames has fewer
-_SCAN_PARTS_PER_S: Final = 131_072  # ... and in a second: more than a process sends, and 2 % of a core
+# fragments examined for reports of one reader: in a second more than a process sends, and 2 % of a core; at once more
+# than a window of small frames has
+_SCAN_RATE: Final = Rate(131_072, burst=8_192)
 _ROUND_MIN_S: Final = PROBE_MIN_S / 3
 _NEVER: Final = float("-inf")
 
 
 def repair_allowance() -> TokenBucket:
     """Return the fragments that may be examined for one reader."""
-    return TokenBucket(_SCAN_PARTS_PER_S, _SCAN_PARTS)
+    return TokenBucket(*_SCAN_RATE)
 
 
 class RetransmissionQueue:

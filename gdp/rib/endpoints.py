@@ -26,12 +26,10 @@ from gdp.exchange.sync_set import SyncSet, line_of, rank_in
 from gdp.frame.kinds import Kind
 from gdp.limits import (
     ENDPOINT_LEASE_S,
-    ENDPOINT_QUERIES_BURST,
-    ENDPOINT_QUERIES_PER_S,
-    ENDPOINT_RECORDS_BURST,
+    ENDPOINT_QUERIES_RATE,
     ENDPOINT_RECORDS_MAX,
     ENDPOINT_RECORDS_OF_OTHERS_MAX,
-    ENDPOINT_RECORDS_PER_S,
+    ENDPOINT_RECORDS_RATE,
     RIB_WATCHES_MAX,
 )
 from gdp.names import NAME_BYTES, Name
@@ -84,8 +82,8 @@ class RibEndpoints:
         self.records = SyncSet[int](lambda sequence: sequence)
         self._of_others = 0  # records of other domains
         self._watches = Watches(watches)
-        self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
-        self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
+        self._record_paces = TokenBuckets(*ENDPOINT_RECORDS_RATE)
+        self._query_paces = TokenBuckets(*ENDPOINT_QUERIES_RATE)
         self._changes = Requests[Name]()  # for watchers, by switch
         self._out: list[OutgoingStatement] = []
 

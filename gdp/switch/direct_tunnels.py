@@ -32,6 +32,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.intervals import Rate
 from gdp.limits import DIRECT_TUNNELS_MAX
 from gdp.names import Name
 from gdp.requests import Backoff
@@ -50,8 +51,7 @@ _STAGGER_S: Final = 0.5  # between the two ends after a silence, at most; in hal
 _RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
 _MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
-_OPENS_PER_S: Final = 0.1  # of one peer's tunnel: each makes devices
-_OPENS_BURST: Final = 8.0
+_OPENS_RATE: Final = Rate(0.1, burst=8.0)  # of one peer's tunnel: each makes devices
 _REDUNDANT_S: Final = 30.0  # a tunnel next to a local link is closed after this time
 _IPV4_PRIVATE_BITS: Final = 16  # two private addresses with this prefix may be in one network
 
@@ -219,7 +219,7 @@ class DirectTunnels:
         self._attempts: dict[Name, _Attempt] = {}
         self._own: EndpointRecord | None = None
         self._ranks: dict[Name, bytes] = {}  # of the members at the last call of ``peers``
-        self._opens = TokenBuckets(_OPENS_PER_S, _OPENS_BURST)
+        self._opens = TokenBuckets(*_OPENS_RATE)
 
     def peers(self, members: Iterable[Name], linked: Collection[Name]) -> list[Name]:
         """Return the switches whose records are of use, the most preferred first.

@@ -22,7 +22,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_RATE
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.damping import Damping
@@ -71,7 +71,7 @@ class Flooding:
         self.link_states = state.paths.link_states
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
-        self._paces = TokenBuckets(LINK_STATES_PER_S, LINK_STATES_BURST)
+        self._paces = TokenBuckets(*LINK_STATES_RATE)
         self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are rejected
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope does not renew the other

@@ -23,10 +23,8 @@ from gdp.control.neighbour import Neighbour
 from gdp.errors import DropReason
 from gdp.limits import (
     ADVERTISEMENT_LEASE_S,
-    QUESTIONS_BURST,
-    QUESTIONS_PER_S,
-    SWITCH_QUESTIONS_BURST,
-    SWITCH_QUESTIONS_PER_S,
+    QUESTIONS_RATE,
+    SWITCH_QUESTIONS_RATE,
 )
 from gdp.names import Name
 from gdp.switch.name_cache import Location, NameCache
@@ -71,8 +69,8 @@ class NameResolver:
         self._queries = NameQueries(lease_s)
         self._pending = PendingFrames()
         self._rates = {
-            _FROM_NODE: TokenBuckets(QUESTIONS_PER_S, QUESTIONS_BURST),
-            _FROM_SWITCH: TokenBuckets(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
+            _FROM_NODE: TokenBuckets(*QUESTIONS_RATE),
+            _FROM_SWITCH: TokenBuckets(*SWITCH_QUESTIONS_RATE),
         }
         self._refused: Counter[DropReason] = Counter()
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.http_server import Answer, HttpServer
+from gdp.intervals import Rate
 from gdp.telemetry.health import PROBES, Health, probe
 from gdp.token_bucket import TokenBucket
 
@@ -19,7 +20,7 @@ __all__ = ["scrape_server"]
 _CONNECTIONS_MAX: Final = 4
 _CONNECTION_S: Final = 5.0  # even if the client reads slowly
 _BACKLOG: Final = 128
-_ANSWERS_PER_S: Final = 20.0  # a few ms each; a scraper polls every few seconds
+_ANSWERS_RATE: Final = Rate(20.0, burst=20.0)  # a few ms each; a scraper polls every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _JSON: Final = "application/json"
 
@@ -35,7 +36,7 @@ def scrape_server(port: int, text: Callable[[], bytes], health: Callable[[], Hea
     Raises:
         OSError: the port is in use.
     """
-    answers = TokenBucket(_ANSWERS_PER_S, _ANSWERS_PER_S)
+    answers = TokenBucket(*_ANSWERS_RATE)
 
     def answer(path: str) -> Answer:
         """Return the response for a path."""

@@ -18,7 +18,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of, rank_in
 from gdp.frame.kinds import Kind
-from gdp.limits import ENDPOINT_LEASE_S, ENDPOINT_RECORDS_BURST
+from gdp.limits import ENDPOINT_LEASE_S, ENDPOINT_RECORDS_RATE
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.rib.endpoints import RibEndpoints
@@ -198,8 +198,8 @@ def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_an
     core = rib()
     wires = [record(sequence=sequence).wire for sequence in range(1, 60)]
     answered = sum(len(give(core, wire)) for wire in wires)
-    assert answered <= ENDPOINT_RECORDS_BURST
-    assert core.state.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_BURST
+    assert answered <= ENDPOINT_RECORDS_RATE.burst
+    assert core.state.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_RATE.burst
     assert len(core.state.endpoints) == 1
     assert responses(give(core, record(TWO).wire, TWO), TWO)[0].refused is None
 

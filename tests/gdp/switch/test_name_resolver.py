@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import DropReason
-from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S, PENDING_S, QUESTIONS_BURST
+from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S, PENDING_S, QUESTIONS_RATE
 from gdp.names import Name
 from gdp.switch.name_cache import Location
 from gdp.switch.name_queries import QUERIES_MAX, RETRY_S, TRIES_MAX
@@ -126,11 +126,11 @@ def test_a_frame_that_has_no_query_is_counted() -> None:
 
 def test_a_neighbour_above_its_rate_opens_no_query() -> None:
     resolver = NameResolver(ME)
-    for number in range(int(QUESTIONS_BURST) + 10):
+    for number in range(int(QUESTIONS_RATE.burst) + 10):
         resolver.resolve(name(str(number)), 0.0, NEIGHBOUR)
-    assert len(resolver._queries) == QUESTIONS_BURST
+    assert len(resolver._queries) == QUESTIONS_RATE.burst
     resolver.resolve(SERVER, 0.0, b"n" + name("other"))
-    assert len(resolver._queries) == QUESTIONS_BURST + 1
+    assert len(resolver._queries) == QUESTIONS_RATE.burst + 1
 
 
 def test_a_name_that_only_publishes_has_no_reader() -> None:
