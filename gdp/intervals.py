@@ -47,6 +47,21 @@ class Rate(NamedTuple):
     burst: float
 
 
+def renew_after_s(lease_s: float) -> float:
+    """Return when a lease is renewed after it began: two renewals may be lost (RFC 8415, section 21.4, has a half)."""
+    return lease_s / 3
+
+
+# Soft state
+NEIGHBOUR: Final = SoftState(0.25, periods=3.6)  # a hello, until keepalives come; without keepalives it is lost then
+LINK_STATE: Final = SoftState(30.0, periods=10 / 3)
+JOIN: Final = SoftState(2.0)  # a branch of a tree
+JOIN_PROOF: Final = SoftState(60.0, periods=3)  # a whole join; in between only its number is sent
+ADVERTISEMENT: Final = SoftState(8.0, periods=3)  # unless a node's configuration sets another lease
+ENDPOINT: Final = SoftState(20.0, periods=3)  # an endpoint record at a RIB
+READER: Final = SoftState(1.0, periods=6)  # a report; a reader that sends none for so long blocks its publisher no more
+SERVER: Final = SoftState(0.5, periods=4)  # a report to clients; a server that sends none for so long is no peer
+
 # Looks at what has no event
 LOOK_S: Final = 0.05  # by who waits for it: a process that ends, a socket that appears
 WATCH_S: Final = 0.25  # by who shows it to an operator

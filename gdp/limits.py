@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.intervals import Rate
+from gdp.intervals import LINK_STATE, Rate
 
 # Frames
 HOPS_MAX: Final = 64  # hops left at the source
@@ -47,13 +47,7 @@ REPAIRS_ABOVE_PARTS: Final = 2  # a best-effort message of more fragments is rep
 REPAIR_S: Final = 0.5  # ... which is this time, unless its publisher states a deadline
 PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
-REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
 SENDS_MAX: Final = 3  # times that an urgent frame is sent against loss: 0.05 ** 3 is below 0.1 %
-READER_LEASE_S: Final = 6.0  # a reader that does not report for this time no longer blocks its publisher
-READER_GRACE_S: Final = 60.0  # ... but what it lacks is cached for this time, as far as the window allows
-CALL_LAG_S: Final = 1.0  # ... or a reader of requests that has not confirmed in this time what another server has
-CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
-CALL_QUIET_S: Final = 2.0  # a server that does not report for this time is no peer meanwhile
 EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, reports of readers under the previous one are still accepted
 NACKS_PER_REPORT: Final = 23  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
 
@@ -73,39 +67,24 @@ CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
 # of a membership or delegation; a revocation may count for this time
 CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0
-CLOCK_EARLY_S: Final = 3_600.0  # a certificate is accepted this long before it begins
-CLOCK_SKEW_S: Final = 3_600.0  # ... and this long after it has ended
-CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
+CLOCK_SKEW_S: Final = 3_600.0  # a certificate is accepted this long before it begins, and after it has ended
 
 # Leases
 LEASE_MIN_S: Final = 1.0
 LEASE_MAX_S: Final = 3_600.0
-ADVERTISEMENT_LEASE_S: Final = (
-    24.0  # lease that a node requests unless its configuration sets another; renewed after a third
-)
 NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it
 
 # Neighbours and link state
-HELLO_S: Final = 0.25  # between hellos on a port, until keepalives of its neighbours arrive
-HELLO_IDLE: Final = 16  # hello intervals between two hellos, from then on
-DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is lost after this time of silence
+HELLO_IDLE: Final = 16  # hello intervals between two hellos, once keepalives of the neighbours arrive
 KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
 SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
 DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
 COST_DEFAULT: Final = 10  # of a link
 COST_AUTO: Final = 0  # of a port: the cost of its links is measured
-LINK_STATE_REFRESH_S: Final = 30.0
-LINK_STATE_LEASE_S: Final = 100.0
-LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
-JOIN_REFRESH_S: Final = 2.0
-JOIN_LEASE_S: Final = 7.0
-JOIN_PROOF_S: Final = 60.0  # a join whose terms do not change is sent whole at least this often, else by its number
-JOIN_PROOF_LEASE_S: Final = 3 * JOIN_PROOF_S  # no refresh lets a branch outlive its last whole join by more
+LINK_STATE_AGE_MAX_S: Final = 2 * CLOCK_SKEW_S + LINK_STATE.lease_s  # by two clocks
 JOINS_AGAIN_MAX: Final = 16  # whole joins that one reply about unknown ones causes
 # Refreshes are sent more often over a link that loses frames: they find the joins that were lost.
 JOINS_LOST_FROM: Final = 0.01  # share of frames
-JOIN_REFRESH_LOSSY_S: Final = 0.5
-
 
 # Tables
 TABLE_MAX: Final = 1 << 20
@@ -126,7 +105,6 @@ RIB_WATCHES_MAX: Final = 500_000
 # of responses that one sender's queries may cause at a RIB; some 2,000 responses
 # ... and at once: all that a switch queries at a RIB that is new
 ANSWER_BYTES_RATE: Final = Rate(4.0 * (1 << 20), burst=64.0 * (1 << 20))
-ENDPOINT_LEASE_S: Final = 60.0  # for which a RIB keeps an endpoint record; renewed after a third
 ENDPOINT_RECORDS_MAX: Final = 8_192  # at one RIB, one of each switch
 ENDPOINT_RECORDS_OF_OTHERS_MAX: Final = 2_048  # ... of other domains
 ENDPOINT_RECORDS_RATE: Final = Rate(4.0, burst=16.0)  # of one switch that a RIB verifies

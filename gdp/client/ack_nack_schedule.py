@@ -9,14 +9,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import Header
-from gdp.limits import (
-    REPORT_DELAY_S,
-    REPORT_EVERY_BYTES,
-    REPORT_EVERY_MAX_BYTES,
-    REPORT_GAP_S,
-    REPORT_IDLE_S,
-    REPORT_PAUSE_S,
-)
+from gdp.intervals import READER
+from gdp.limits import REPORT_DELAY_S, REPORT_EVERY_BYTES, REPORT_EVERY_MAX_BYTES, REPORT_GAP_S, REPORT_PAUSE_S
 from gdp.message.reassembly import Reassembler
 from gdp.message.receipts import sum_of_samples
 
@@ -44,7 +38,7 @@ class AckNackSchedule:
     def __init__(self, data: Reassembler, due_s: float) -> None:
         self._data = data
         self.due_s = due_s
-        self.idle_s = REPORT_IDLE_S
+        self.idle_s = READER.refresh_s
         self.received = self.receipts = 0
         self.newest = (0, -1, due_s)
         self._unreported_bytes = 0

@@ -38,7 +38,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
-from gdp.limits import HELLO_S
+from gdp.intervals import NEIGHBOUR
 from gdp.message.loss import Losses, LossReason
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
@@ -53,7 +53,7 @@ _FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT), int(Kind.PARI
 _DIAGNOSTICS: Final = (int(Kind.DIAGNOSTIC_REQUEST), int(Kind.DIAGNOSTIC_REPLY))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
 # a participant that is called later than this, although hellos are due, was not scheduled
-_STALL_S: Final = 2 * HELLO_S
+_STALL_S: Final = 2 * NEIGHBOUR.refresh_s
 
 __all__ = ["Message", "Participant", "ServiceOptions", "Topic"]
 
@@ -216,7 +216,7 @@ class Participant:
     def peers(self, service: Name) -> list[Name]:
         """Return the servers of a name called here, or the clients of one served here, that are connected and keep up.
 
-        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is excluded until it confirms again.
+        A server that falls behind the others, or is silent for ``SERVER.lease_s``, is excluded until it confirms again.
         """
         publisher = self._publications.get(service)
         if publisher is None:

@@ -5,8 +5,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RTPS 2.5, sect
 A report opens under a key that depends on its reader's introduction, so no other node can change what a reader has
 confirmed.
 
-A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It does not count as a reader until it
-reports again, and is forgotten ``READER_GRACE_S`` later.
+A reader that is silent for ``READER.lease_s`` is suspended: it may have moved. It does not count as a reader until it
+reports again, and is forgotten ``FORGET_S`` later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import CALL_IDLE_S, CALL_LAG_S, CALL_QUIET_S, READER_GRACE_S, READER_LEASE_S, REPORT_IDLE_S
+from gdp.intervals import FORGET_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart
 from gdp.names import Name
@@ -50,9 +50,9 @@ class ReaderTimeouts(NamedTuple):
     fastest_governs: bool = False
 
 
-TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
+TOPICS: Final = ReaderTimeouts(READER.lease_s, READER.lease_s, READER.refresh_s)
 # other replicas must not wait for a dead one
-CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S, fastest_governs=True)
+CALLS: Final = ReaderTimeouts(READER.refresh_s, SERVER.lease_s, SERVER.refresh_s, fastest_governs=True)
 
 
 class _Incarnation:
@@ -156,14 +156,14 @@ class ReaderProxies:
         return [*self._readers.values(), *self._suspended.values()]
 
     def silent(self, now_s: float) -> list[bytes]:
-        """Return those that have not been heard for ``READER_LEASE_S``."""
-        return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER_LEASE_S]
+        """Return those that have not been heard for ``READER.lease_s``."""
+        return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER.lease_s]
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
-        due_s = [reading.heard_s + READER_LEASE_S for reading in self._readers.values()]
+        due_s = [reading.heard_s + READER.lease_s for reading in self._readers.values()]
         for readers in (self._readers, self._suspended):
-            due_s += [each.behind_s + READER_GRACE_S for each in readers.values() if each.behind_s is not None]
+            due_s += [each.behind_s + FORGET_S for each in readers.values() if each.behind_s is not None]
         return min(due_s) + 0.001 if due_s else None
 
     def suspend(self, name: bytes, now_s: float) -> None:
@@ -185,9 +185,9 @@ class ReaderProxies:
         return True
 
     def overdue(self, now_s: float) -> list[tuple[bytes, ReaderProxy]]:
-        """Return those whose window has been suspended for ``READER_GRACE_S``, and the first of too many."""
+        """Return those whose window has been suspended for ``FORGET_S``, and the first of too many."""
         everyone = [*self._readers.items(), *self._suspended.items()]
-        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > READER_GRACE_S]
+        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > FORGET_S]
         return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
 
     def is_quiet(self, name: bytes, now_s: float) -> bool:

@@ -8,16 +8,12 @@ above are (RFC 8767 in spirit). A RIB that is back has half a lease to relay the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
-from gdp.intervals import NEVER_S
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEVER_S
 from gdp.names import Name
 from gdp.rib.upstream_advertisements import QUIET_S
 
 __all__ = ["LowerRibs"]
-
-_KEEP_S: Final = ADVERTISEMENT_LEASE_S / 2  # at a time, and after a RIB is back: it renews within a third
 
 
 @dataclass(slots=True)
@@ -49,8 +45,8 @@ class LowerRibs:
         if known.heard_s < known.probed_s and since_s >= QUIET_S:
             known.is_silent = True
         if known.is_silent:
-            return _KEEP_S
-        left_s = known.returned_s + _KEEP_S - now_s
+            return ADVERTISEMENT.lease_s / 2  # it renews within a third
+        left_s = known.returned_s + ADVERTISEMENT.lease_s / 2 - now_s
         if left_s > 0.0:
             return left_s
         return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * QUIET_S else QUIET_S

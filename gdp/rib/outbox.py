@@ -15,7 +15,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.limits import LEASE_MIN_S, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
@@ -25,7 +25,6 @@ from gdp.trust.domain import Policy
 __all__ = ["OutgoingStatement", "RibOutbox"]
 
 _ADVISED_S: Final = 30.0  # how long members that received a response also receive moves
-_UNREPORTED_S: Final = 1.0  # ... where there are too many for that
 
 
 class OutgoingStatement(NamedTuple):
@@ -92,7 +91,7 @@ class RibOutbox:
         try:
             self.holders.add(route.name, to, now_s + lease_s)
         except StatementError:
-            lease_s = min(lease_s, _UNREPORTED_S)
+            lease_s = min(lease_s, LEASE_MIN_S)
         response = Response(
             name=route.name,
             advertiser=route.advertiser,

@@ -37,16 +37,8 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import second_path_key
-from gdp.limits import (
-    JOIN_LEASE_S,
-    JOIN_PROOF_LEASE_S,
-    JOIN_PROOF_S,
-    JOIN_REFRESH_LOSSY_S,
-    JOIN_REFRESH_S,
-    JOINS_AGAIN_MAX,
-    JOINS_LOST_FROM,
-    TREES_MAX,
-)
+from gdp.intervals import JOIN, JOIN_PROOF
+from gdp.limits import JOINS_AGAIN_MAX, JOINS_LOST_FROM, TREES_MAX
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
@@ -61,8 +53,8 @@ from gdp.trust.right import HEARS
 
 __all__ = ["MulticastTrees"]
 
-_NEW_JOINS: Final = Backoff(0.1, JOIN_REFRESH_S)
-_NEW_JOINS_MAX: Final = 4  # renewals of a new join, then one every JOIN_REFRESH_S
+_NEW_JOINS: Final = Backoff(0.1, JOIN.refresh_s)
+_NEW_JOINS_MAX: Final = 4  # renewals of a new join, then one every JOIN.refresh_s
 _SETTLED_JOINS: Final = 2  # renewals after which a tree has settled
 _TICK_EARLY: Final = 0.25  # of an interval: the first renewal at a tick comes at least 0.75 intervals after the last
 _OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
@@ -205,7 +197,7 @@ class MulticastTrees:
             self._place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
         branch = Branch(
-            expires_s=now_s + min(join.lease_s, JOIN_LEASE_S),
+            expires_s=now_s + min(join.lease_s, JOIN.lease_s),
             mtu=join.mtu,
             evidence=join.evidence,
             said_mtu=join.mtu,
@@ -213,7 +205,7 @@ class MulticastTrees:
             session=join.sender_session,
             route=join.route,
             place=(join.switch, join.domain),
-            proven_until_s=now_s + JOIN_PROOF_LEASE_S,
+            proven_until_s=now_s + JOIN_PROOF.lease_s,
         )
         branch.fit(self._state.outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
@@ -246,7 +238,7 @@ class MulticastTrees:
             ):
                 unknown.append(number)
                 continue
-            branch.expires_s = min(now_s + JOIN_LEASE_S, branch.proven_until_s)
+            branch.expires_s = min(now_s + JOIN.lease_s, branch.proven_until_s)
             self._install(tree)
         if unknown:
             self._joins.send_unknown(at, neighbour.name, tuple(unknown))
@@ -560,7 +552,7 @@ class MulticastTrees:
     def _ask_upstream(self, tree: Tree, now_s: float, *, renews: bool = False) -> None:
         """Send a join upstream; ``renews``: its number suffices if nothing in it has changed."""
         upstream = self._upstream_queries(tree)
-        tree.renew_at_s = self._tick_s(JOIN_REFRESH_S, now_s)
+        tree.renew_at_s = self._tick_s(JOIN.refresh_s, now_s)
         if (None if upstream is None else upstream[:2]) != tree.upstream:
             self._part_from_above(tree, now_s, keep=upstream is not None)
             if upstream is not None:
@@ -578,10 +570,10 @@ class MulticastTrees:
             tree.joins += 1
             tree.renew_at_s = now_s + _NEW_JOINS.pause_s(tree.joins)
         elif self._state.neighbours.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
-            tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
+            tree.renew_at_s = self._tick_s(JOIN.refresh_s / 4, now_s)
         is_proof_due = not renews or now_s >= tree.prove_at_s
         if is_proof_due:  # spread, so that the whole joins of many trees do not leave together
-            tree.prove_at_s = now_s + JOIN_PROOF_S * (1 + tree.topic[0] / 255) / 2
+            tree.prove_at_s = now_s + JOIN_PROOF.refresh_s * (1 + tree.topic[0] / 255) / 2
         self._show(tree, renews=not is_proof_due)
         if has_settled and self._state.paths.has_alternates:
             self._ask_for_backup(tree, renews=not is_proof_due)

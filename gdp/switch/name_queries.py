@@ -18,8 +18,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.intervals import NEVER_S
-from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
+from gdp.intervals import ADVERTISEMENT, NEVER_S
+from gdp.limits import PENDING_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.switch.query_window import QueryWindow
@@ -53,7 +53,7 @@ class NameQueries:
             frames are sent to is watched for twice as long after the last use.
     """
 
-    def __init__(self, watch_s: float = ADVERTISEMENT_LEASE_S) -> None:
+    def __init__(self, watch_s: float = ADVERTISEMENT.lease_s) -> None:
         self.watch_s = watch_s
         self._use_watch_s = 2 * watch_s
         self._watch_renewals = Backoff(RETRY_S, watch_s / 4, growing=_RENEWALS)

@@ -21,11 +21,8 @@ from typing import Final, NamedTuple
 
 from gdp.control.neighbour import Neighbour
 from gdp.errors import DropReason
-from gdp.limits import (
-    ADVERTISEMENT_LEASE_S,
-    QUESTIONS_RATE,
-    SWITCH_QUESTIONS_RATE,
-)
+from gdp.intervals import ADVERTISEMENT
+from gdp.limits import QUESTIONS_RATE, SWITCH_QUESTIONS_RATE
 from gdp.names import Name
 from gdp.switch.name_cache import Location, NameCache
 from gdp.switch.name_queries import NameQueries
@@ -63,7 +60,7 @@ class NameResolver:
         cache: the locations that are known; other classes only read it.
     """
 
-    def __init__(self, me: Name, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
+    def __init__(self, me: Name, lease_s: float = ADVERTISEMENT.lease_s) -> None:
         self._me = me
         self.cache = NameCache(lease_s)
         self._queries = NameQueries(lease_s)

@@ -11,8 +11,7 @@ from gdp.control.waiting import Wait, WaitLog, WaitReason
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, StatementError
-from gdp.intervals import REPORT_S
-from gdp.limits import HELLO_S
+from gdp.intervals import NEIGHBOUR, REPORT_S
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from tests.gdp.control.members import CLOUD, ELSEWHERE, POLICY, Nonces, at, hello_protocol, node, statement_of
@@ -87,7 +86,7 @@ def test_a_neighbour_of_a_domain_that_is_not_trusted_is_named_while_it_is_heard(
         alone.hello_protocol.receive(
             ReceivedFrame(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0)
         )
-    (wait,) = attachment_waits(alone, HELLO_S)
+    (wait,) = attachment_waits(alone, NEIGHBOUR.refresh_s)
     assert wait == Wait(WaitReason.STRANGER, 0, ELSEWHERE.root.label, refused=DropReason.WRONG_DOMAIN)
     assert reasons(alone, 10.0) == [WaitReason.NO_NEIGHBOUR]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites, named
 from tests.proxy.endpoints.fake import Publication
@@ -69,7 +69,7 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     assert sites.run(1, lambda: len(ear.heard) == 1)
     talker.close()
     assert sites.run(
-        READER_LEASE_S + 1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies())
+        READER.lease_s + 1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies())
     )
     talker = talk(robot)
     assert sites.run(1, robot.is_read)
@@ -84,7 +84,7 @@ def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Site
     talker.publish(string("goodbye"))
     talker.close()
     assert sites.run(1, lambda: ear.texts == ["goodbye"])
-    assert sites.run(READER_LEASE_S + 1, lambda: not robot.member.publishers())
+    assert sites.run(READER.lease_s + 1, lambda: not robot.member.publishers())
 
 
 @pytest.mark.parametrize("size", [20, 60_000])
@@ -99,7 +99,7 @@ def test_the_last_message_of_a_publisher_that_leaves_at_once_arrives_by_a_thin_l
     talker.publish(string("x" * size))
     talker.close()
     assert sites.run(5, lambda: len(ear.heard) == 1)
-    assert sites.run(READER_LEASE_S + 1, lambda: not robot.member.publishers())
+    assert sites.run(READER.lease_s + 1, lambda: not robot.member.publishers())
     assert robot.faults == {}
 
 
@@ -194,7 +194,7 @@ def test_messages_without_a_far_reader_are_counted_and_not_sent(sites: Sites) ->
     talker = talk(robot)
     sites.run(2)
     talker.publish(string("kept for readers that wait"))
-    sites.run(READER_LEASE_S + 1)
+    sites.run(READER.lease_s + 1)
     talker.publish(string("?"))
     sites.run(1)
     assert (robot.context.traffic.unread, robot.stream.losses.total) == (1, 2)
