@@ -63,6 +63,7 @@ READER: Final = SoftState(1.0, periods=6)  # a report; a reader that sends none 
 SERVER: Final = SoftState(0.5, periods=4)  # a report to clients; a server that sends none for so long is no peer
 
 # Looks at what has no event
+PACE_S: Final = 0.1  # between turns of work in the background of a data plane
 LOOK_S: Final = 0.05  # by who waits for it: a process that ends, a socket that appears
 WATCH_S: Final = 0.25  # by who shows it to an operator
 TICK_S: Final = 0.5  # by a node: its files, its clients, its rules
@@ -76,12 +77,16 @@ RELOAD_S: Final = 10.0  # ... from its files, which it reads again
 CONNECT_S: Final = 5.0  # handshake with another machine
 SERVER_S: Final = 30.0  # work of a server, or of a program of the system
 RETRY_S: Final = 5.0  # after a failure that time alone may end
+REFUSED_S: Final = 10.0  # for which a refusal, or silence, of one server is remembered
+IDLE_S: Final = 10.0  # a connection without a request may be closed for another one
 CACHE_S: Final = 30.0  # for which an answer of another service is used again
 
 # Life of programs
 ATTACH_S: Final = 10.0  # until a device is there, or a switch has accepted a node
 STOP_S: Final = 5.0  # from SIGTERM to SIGKILL
 STEADY_S: Final = 30.0  # a program that ran this long is started again at once
+LINGER_S: Final = 1.0  # for which a node that leaves waits for confirmations of its last messages
+GOODBYE_S: Final = 0.2  # ... and for its goodbye to be sent
 DRAIN_S: Final = 60.0  # until a server that leaves has answered all calls
 FORGET_S: Final = 60.0  # for which the state of what is gone, or silent, is kept
 

@@ -45,9 +45,10 @@ REPORT_PAUSE_S: Final = 0.004  # ... within a message: its publisher may be wait
 REPORT_GAP_S: Final = 0.002  # ... or this long after it detected a gap: frames may overtake each other
 REPAIRS_ABOVE_PARTS: Final = 2  # a best-effort message of more fragments is repaired while that can be in time
 REPAIR_S: Final = 0.5  # ... which is this time, unless its publisher states a deadline
-PROBE_MIN_S: Final = 0.03
-PROBE_MAX_S: Final = 0.25
 SENDS_MAX: Final = 3  # times that an urgent frame is sent against loss: 0.05 ** 3 is below 0.1 %
+CALL_GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
+CALLER_AWAY_S: Final = 30.0  # a client that is silent for this time has ended its wait
+PATH_LAG_MAX_S: Final = 0.5  # a path that is further behind the other one is not awaited
 EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, reports of readers under the previous one are still accepted
 NACKS_PER_REPORT: Final = 23  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
 
@@ -57,7 +58,6 @@ ADVERTISEMENT_MAX_BYTES: Final = (
     6_500  # with its evidence, so that a relay or response around one, or a join around two, fits a statement
 )
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
-SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most this far ahead
 RECORD_OVERHEAD_BYTES: Final = 33  # what a channel adds to a statement: head and tag
 CONTROL_PARTS_MAX: Final = 64
 CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node

@@ -35,11 +35,11 @@ from gdp.intervals import LOOK_S
 from gdp.stores.keyring import load_salt
 from gdp.terminal import echo
 
-__all__ = ["GatewayKind", "begin", "follow", "launch"]
+__all__ = ["WAIT_S", "GatewayKind", "begin", "follow", "launch"]
 
 log = logging.getLogger(__name__)
 
-_WAIT_S: Final = 600.0
+WAIT_S: Final = 600.0  # for the replicas, unless another time is given
 
 
 class GatewayKind(Enum):
@@ -75,7 +75,7 @@ def launch(
     dry_run: DryRun = False,
     detach: Detach = False,
     keep: Keep = False,
-    wait: Wait = _WAIT_S,
+    wait: Wait = WAIT_S,
     gateway: Gateway = None,
     region: Regions = None,
     ends_with: EndsWith = "",

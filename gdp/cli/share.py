@@ -18,10 +18,10 @@ import typer
 from gdp.cli import options
 from gdp.cli.machine import directory_of
 from gdp.cli.output import moment, show, table
-from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
+from gdp.client.send_options import RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
-from gdp.intervals import LOOK_S
+from gdp.intervals import HOUR_S, LOOK_S
 from gdp.sharing.folder_exchange import FolderExchange
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.member_exchange import MemberExchange
@@ -84,7 +84,7 @@ DeadlineMs = Annotated[
     typer.Option(
         "--deadline-ms",
         min=0.001,
-        max=1_000 * DEADLINE_MAX_S,
+        max=1_000 * HOUR_S,
         help="Best effort: a message that cannot leave within this time is dropped.",
     ),
 ]

@@ -13,11 +13,14 @@ from gdp.intervals import READER
 from gdp.limits import REPORT_DELAY_S, REPORT_EVERY_BYTES, REPORT_EVERY_MAX_BYTES, REPORT_GAP_S, REPORT_PAUSE_S
 from gdp.message.reassembly import Reassembler
 from gdp.message.receipts import sum_of_samples
+from gdp.requests import Backoff
 
 __all__ = ["AckNackSchedule"]
 
 _FIRST_BYTES: Final = 3_000
-_MISSING_MAX_S: Final = 16 * REPORT_DELAY_S  # between two requests of what is missing, while nothing comes
+_MISSING: Final = Backoff(
+    REPORT_DELAY_S, 16 * REPORT_DELAY_S
+)  # between two requests of what is missing, while nothing comes
 
 
 class AckNackSchedule:
@@ -96,7 +99,7 @@ class AckNackSchedule:
     def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
         """Schedule the report after one that is sent now: ever later while something is missing and nothing comes."""
         is_repeated = is_missing and not self._has_come
-        self._missing_s = min(2 * self._missing_s, _MISSING_MAX_S) if is_repeated else REPORT_DELAY_S
+        self._missing_s = _MISSING.after_s(self._missing_s) if is_repeated else _MISSING.first_s
         if is_missing:
             self._clean_bytes = 0
         self.due_s = now_s + (self._missing_s if is_missing else self.idle_s)

@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 _FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT), int(Kind.PARITY))
 _DIAGNOSTICS: Final = (int(Kind.DIAGNOSTIC_REQUEST), int(Kind.DIAGNOSTIC_REPLY))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
-# a participant that is called later than this, although hellos are due, was not scheduled
-_STALL_S: Final = 2 * NEIGHBOUR.refresh_s
 
 __all__ = ["Message", "Participant", "ServiceOptions", "Topic"]
 
@@ -488,7 +486,7 @@ class Participant:
         return publisher
 
     def _look_at_clock(self, now_s: float) -> None:
-        if now_s - self._now_s > _STALL_S:
+        if now_s - self._now_s > 2 * NEIGHBOUR.refresh_s:  # although hellos are due: it was not scheduled
             self._awake_s = now_s  # frames that the peers sent meanwhile are still to be processed
         self._now_s = now_s
 

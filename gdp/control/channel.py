@@ -29,7 +29,7 @@ from gdp.crypto.records import RecordKey
 from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, octets
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.intervals import Rate
+from gdp.intervals import HOUR_S, Rate
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
@@ -52,7 +52,6 @@ _OFFERS: Final = Backoff(0.1, 0.8)  # of an OPEN
 _OFFER_TRIES: Final = 4  # then the channel waits for news of the peer
 _WAITING_MAX: Final = 256  # statements that wait for a channel
 _WAITING_S: Final = 1.0  # by then the sender repeats a statement itself
-_RENEW_S: Final = 3_600.0
 _REOPEN_S: Final = 0.3  # minimum time between two reactions to a hint
 _CHANNELS_PER_PEER: Final = 2  # in use: the newest, and the one before
 _OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
@@ -179,7 +178,7 @@ class Channels:
             asked.waiting.append((statement, now_s + _WAITING_S))
             self._open(peer, asked, now_s)
             return
-        if now_s - asked.channel.begun_s >= _RENEW_S:
+        if now_s - asked.channel.begun_s >= HOUR_S:
             self._open(peer, asked, now_s)
         self._out.append(Outgoing(peer, asked.channel.seal(statement)))
 

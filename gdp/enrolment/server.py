@@ -59,7 +59,6 @@ _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
 _LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
-_REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
 _FLUSH_S: Final = 10.0
 _INSTANCES_MAX: Final = 16  # remembered starts of one machine's agent
 
@@ -255,7 +254,7 @@ class EnrolmentServer:
             with _cut_after(writer, idle_s):
                 head = await reader.readexactly(LENGTH_BYTES)
             size = message_bytes(head, REQUEST_MAX_BYTES if connection.session else STRANGER_MAX_BYTES)
-            with _cut_after(writer, min(_REQUEST_S, idle_s)):
+            with _cut_after(writer, min(STRANGER_S, idle_s)):
                 fields = read_message(await reader.readexactly(size))
             response = await self._response(connection, fields, binding)
             goes_on = True
@@ -273,7 +272,7 @@ class EnrolmentServer:
 
     async def _write(self, writer: asyncio.StreamWriter, fields: Mapping[str, object]) -> None:
         writer.write(encode_message(fields))
-        with _cut_after(writer, _REQUEST_S):
+        with _cut_after(writer, STRANGER_S):
             await writer.drain()
 
     async def _response(self, connection: _Connection, fields: Message, binding: bytes) -> Mapping[str, object]:

@@ -19,7 +19,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.mounts import roots
-from gdp.intervals import LOOK_S
+from gdp.intervals import LOOK_S, STOP_S
 
 __all__ = ["Cgroup"]
 
@@ -28,7 +28,6 @@ _PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow ma
 _LEAST_US: Final = 1_000  # the kernel accepts no quota below this
 _LONGEST_PERIOD_US: Final = 1_000_000
 _WEIGHT, _SHARES = 100, 1_024  # of one core: the defaults of a group
-_PATIENCE_S: Final = 3.0
 _GONE: Final = (errno.ENOENT, errno.ENODEV)
 
 
@@ -120,7 +119,7 @@ class Cgroup:
 
     def remove(self) -> None:
         """Kill the remaining processes of the group, and remove it with the groups in it; no error if it is gone."""
-        end_s = time.monotonic() + _PATIENCE_S
+        end_s = time.monotonic() + STOP_S
         for folder in self._standing():
             while True:
                 self.kill()  # in the loop: without cgroup.kill, a process may have started another

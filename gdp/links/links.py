@@ -34,11 +34,10 @@ from gdp.switch.core import SwitchCore
 from gdp.switch.direct_tunnels import Close, Open, Retry, Silence
 from gdp.trust.domain import Policy
 
-__all__ = ["LINKS_PERIOD_S", "TunnelLinks"]
+__all__ = ["TunnelLinks"]
 
 log = logging.getLogger(__name__)
 
-LINKS_PERIOD_S: Final = 0.1
 _RECORDS_PERIOD_S: Final = 0.3
 
 

@@ -20,13 +20,12 @@ from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["RELAY_COST", "RELAY_PERIOD_S", "VIA", "RelayPorts"]
+__all__ = ["RELAY_COST", "VIA", "RelayPorts"]
 
 log = logging.getLogger(__name__)
 
 RELAY_COST: Final = 1_000
 VIA: Final = "tls (slower)"
-RELAY_PERIOD_S: Final = 0.1
 
 
 class RelayPorts:

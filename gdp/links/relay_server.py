@@ -17,7 +17,7 @@ from typing import Final
 from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
-from gdp.intervals import CONNECT_S, Rate
+from gdp.intervals import CONNECT_S, PACE_S, Rate
 from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_hello import HelloWait, hand_over
@@ -40,7 +40,6 @@ log = logging.getLogger(__name__)
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
 # connections whose address is looked at: an address above its share costs no handshake
 _LOOKS_RATE: Final = Rate(2_000.0, burst=2_000.0)
-_ACCEPT_PAUSE_S: Final = 0.1
 
 
 def listen_tls(config: RelayServer) -> socket.socket:
@@ -235,7 +234,7 @@ class BorderServer:
     def _pause(self, now_s: float) -> None:
         """Leave further connections in the kernel's queue for a moment."""
         self._loop.unregister(self._listener.fileno())
-        self._resume_s = now_s + _ACCEPT_PAUSE_S
+        self._resume_s = now_s + PACE_S
         self._loop.wake_at(self._resume_s)
 
     def _authenticate(self, certificate: bytes, at: Timestamps) -> Membership:

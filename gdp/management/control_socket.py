@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError, LocalError
-from gdp.intervals import PROMPT_S
+from gdp.intervals import IDLE_S, PROMPT_S
 from gdp.names import Name
 from gdp.ports.readiness import readable
 from gdp.state.control_protocol import (
@@ -52,7 +52,6 @@ CONTROL_SOCKET: Final = "control.sock"  # in the folder of a process without an 
 _MODE: Final = 0o600
 _BACKLOG: Final = 8
 _CONNECTIONS_MAX: Final = 16
-_IDLE_S: Final = 10.0  # a connection without a request closes in favour of a newer one
 _RECEIVE_BYTES: Final = 4_096
 _TIMEVAL: Final = struct.Struct("@ll")
 
@@ -162,7 +161,7 @@ class ControlServer:
         self._epoll.register(peer.fileno(), select.EPOLLIN)
 
     def _end_oldest_idle(self, now_s: float) -> bool:
-        idle = [each for each in self._clients.values() if not each.awaits_drain and now_s - each.since_s >= _IDLE_S]
+        idle = [each for each in self._clients.values() if not each.awaits_drain and now_s - each.since_s >= IDLE_S]
         for client in idle[:1]:
             self._end(client)
         return bool(idle)

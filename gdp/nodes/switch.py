@@ -17,9 +17,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.single_instance import own_devices
-from gdp.intervals import TICK_S
-from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
-from gdp.links.relay_ports import RELAY_PERIOD_S, RelayPorts
+from gdp.intervals import PACE_S, TICK_S
+from gdp.links.links import TunnelLinks
+from gdp.links.relay_ports import RelayPorts
 from gdp.links.tunnels import open_underlays
 from gdp.links.uplink import refuse_loopback
 from gdp.links.veth import attach_pairs, switch_end
@@ -116,7 +116,7 @@ def run_switch(
         if config.sandbox:
             confine_switch(config, chosen.name)
         if links is not None:
-            runtime.every(LINKS_PERIOD_S, links.handle_timer)
+            runtime.every(PACE_S, links.handle_timer)
             stack.callback(lambda: links.close(now().mono_s))
         node.begin(runtime, config.metrics, sources)
         _report_start(identity, chosen, ready)
@@ -159,7 +159,7 @@ def _follow_relay(
     named = frozenset(port.iface for port in config.ports)
     relay = RelayPorts(name=identity.name, switch=switch, runtime=runtime, excluded=named)
     stack.callback(relay.close)
-    runtime.every(RELAY_PERIOD_S, relay.handle_timer)
+    runtime.every(PACE_S, relay.handle_timer)
     return relay
 
 

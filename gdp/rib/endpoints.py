@@ -36,7 +36,7 @@ from gdp.limits import (
 from gdp.names import NAME_BYTES, Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.outbox import OutgoingStatement
-from gdp.rib.watches import Asker, Watches
+from gdp.rib.watches import WATCHED_S, Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
@@ -45,7 +45,6 @@ __all__ = ["RibEndpoints"]
 
 _CHANGES: Final = Backoff(0.3, 0.6)
 _CHANGE_TRIES: Final = 3  # nothing acknowledges a change
-_WATCH_S: Final = 30.0  # a switch that requests a record also gets changes for so long
 
 
 @dataclass(slots=True)
@@ -190,7 +189,7 @@ class RibEndpoints:
             if kept is not None and kept.record.sequence > rank_in(line) and self._may_tell(kept, asker):
                 lacked += [item_of(kept.record.wire, kept.expires_s - now.mono_s)] if self._is_valid(kept, now) else []
             try:
-                self._watches.add(name, asker, now.mono_s + _WATCH_S)
+                self._watches.add(name, asker, now.mono_s + WATCHED_S)
             except StatementError as error:
                 refused = error  # without a watch it learns changes by its next query
         for page in list(pages(lacked)) or [()]:

@@ -15,7 +15,7 @@ from functools import partial
 from types import TracebackType
 from typing import Final, TypeVar
 
-from gdp.intervals import ATTACH_S
+from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
 from gdp.session.node import SessionNode
@@ -31,8 +31,6 @@ __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
 log = logging.getLogger(__name__)
 
 CALL_TIMEOUT_S: Final = 10.0
-LINGER_S: Final = 1.0
-GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 
 _C = TypeVar("_C")
 

@@ -25,6 +25,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
 from gdp.control.relayed_statement import relayed
 from gdp.frame.kinds import Kind
+from gdp.intervals import PACE_S
 from gdp.names import ZERO, Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
@@ -39,7 +40,6 @@ _DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
 _REMEMBERED_MAX: Final = 4_096
 _NOTICE_AT_S: Final = (0.0, 0.1, 0.4, 1.2)  # one datagram may be lost
 _FORMER_S: Final = 3.0  # how long responses of a former switch are accepted
-_SAY_EVERY_S: Final = 0.1  # between two messages to one neighbour about one node
 
 _Key = tuple[Name, Name]  # name and advertiser
 
@@ -167,7 +167,7 @@ class Relocations:
     def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
         """Return whether a message to a neighbour about a name is allowed now, and record it as sent."""
         key = (name, neighbour.port, neighbour.mac)
-        if now_s - self._said.get(key, float("-inf")) < _SAY_EVERY_S:
+        if now_s - self._said.get(key, float("-inf")) < PACE_S:
             return False
         _remember(self._said, key, now_s)
         return True

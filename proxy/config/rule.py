@@ -23,12 +23,12 @@ from pydantic import (
 from pydantic.config import JsonDict, JsonValue
 from pydantic_core import PydanticCustomError
 
-from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
+from gdp.client.send_options import RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
 from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
-from gdp.intervals import DAY_S
+from gdp.intervals import DAY_S, HOUR_S
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
@@ -249,7 +249,7 @@ class Rule(Section):
     deadline_ms: float | None = Field(
         default=None,
         gt=0,
-        le=1_000 * DEADLINE_MAX_S,
+        le=1_000 * HOUR_S,
         description="Exposed best-effort topics: time to leave whole. `null`: by QoS.",
     )
     repair: Literal["never", "in-time"] = Field(

@@ -44,7 +44,6 @@ from proxy.serial.service import Service
 
 __all__ = ["Ros1Endpoint"]
 
-_ANSWER_S: Final = 1.0
 _START_S: Final = 4.0  # a process that has just been started answers later
 _RESTARTS: Final = Backoff(0.25, 5.0)
 _ROOT: Final = Path(__file__).resolve().parents[3]
@@ -359,7 +358,7 @@ class Ros1Endpoint:
             return known
         question = next(self._numbers)
         self._link.send(kind, 0, question, cbor2.dumps([name, type_name]))
-        until_s = max(time.monotonic() + _ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
+        until_s = max(time.monotonic() + ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
         while question not in self._answers:
             left_s = until_s - time.monotonic()
             if left_s <= 0:

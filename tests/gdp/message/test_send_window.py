@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gdp.intervals import READER
-from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MESSAGES_MAX, NACKS_PER_REPORT, PROBE_MAX_S, REPAIRS_MAX_BYTES
+from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MESSAGES_MAX, NACKS_PER_REPORT, REPAIRS_MAX_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.flow_control import PROBES
 from gdp.message.renumbering import Renumbering
 from gdp.message.send_window import SendWindow
 
@@ -242,7 +243,7 @@ def test_probes_come_when_readers_are_silent_and_back_off() -> None:
         times.append(due_s - now_s)
         now_s = due_s
     assert times == sorted(times)
-    assert times[-1] == pytest.approx(PROBE_MAX_S)
+    assert times[-1] == pytest.approx(PROBES.most_s)
     window.handle_acknack(A, has(2), now_s)
     assert window.next_probe() is None
 

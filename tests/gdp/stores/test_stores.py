@@ -226,7 +226,7 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     upkeep.begin(rib, site.now())
     password = (servers.parent / "admin.password").read_text().strip()
     with monkeypatch.context() as patient:
-        patient.setattr("gdp.stores.cluster_link._TIMEOUT_S", 30.0)  # a busy server flushes late
+        patient.setattr("gdp.stores.cluster_link.PROMPT_S", 30.0)  # a busy server flushes late
         for client in (link := ClusterLink(config.address())).primaries():
             client.execute_command("AUTH", "admin", password)
             client.execute_command("FUNCTION FLUSH")
