@@ -1,6 +1,7 @@
-"""Sessions of nox: fast, full, docs, pages, bench, coverage, and an import test for each supported Python.
+"""Sessions of nox: fast, core, full, docs, pages, bench, coverage, and an import test for each supported Python.
 
     nox -s fast           static checks and tests without root, under 60 s
+    nox -s core           tests without the extensions
     nox -s full           everything that CI runs, as root
     nox -s coverage       branch coverage of the product code
     nox -s docs           the documentation as a site
@@ -41,6 +42,13 @@ def fast(session: nox.Session) -> None:
 
 
 @nox.session(python=False)
+def core(session: nox.Session) -> None:
+    """Run the tests of the core where no extension can be imported; arguments replace the folders."""
+    session.env["GDP_WITHOUT_EXTENSIONS"] = "1"
+    session.run(PYTHON, "-m", "pytest", *(session.posargs or ("tests",)), external=True)
+
+
+@nox.session(python=False)
 def full(session: nox.Session) -> None:
     """Run what CI runs; needs root for the tests with network namespaces."""
     session.run(".ci/run", external=True)
@@ -66,7 +74,7 @@ def pages(session: nox.Session) -> None:
 
 @nox.session(python=False)
 def coverage(session: nox.Session) -> None:
-    """Measure branch coverage of gdp, proxy and fog; fails below the limit in pyproject.toml.
+    """Measure branch coverage of gdp, proxy, fog and gdp_extensions; fails below the limit in pyproject.toml.
 
     Arguments replace the folders of tests. Nodes in namespaces count only as root; without root less is covered.
     """
@@ -92,8 +100,8 @@ def pythons(session: nox.Session, version: str) -> None:
     python = str(folder / "bin" / "python")
     session.run(found, "-m", "venv", "--clear", str(folder), external=True)
     session.run(python, "-m", "pip", "install", "--quiet", "-e", ".[aws,cluster,fog,scapy]", *TEST_TOOLS, external=True)
-    session.run(python, "-m", "compileall", "-q", "-f", "gdp", "proxy", "fog", external=True)
-    session.run(python, "scripts/import_all.py", "gdp", "proxy", "fog", external=True)
+    session.run(python, "-m", "compileall", "-q", "-f", "gdp", "proxy", "fog", "gdp_extensions", external=True)
+    session.run(python, "scripts/import_all.py", "gdp", "proxy", "fog", "gdp_extensions", external=True)
     session.run(python, "-m", "pytest", "-x", *FAST_TESTS, external=True)
 
 

@@ -33,7 +33,7 @@ from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
-from fog.providers.skypilot.config import SkyPilotConfig
+from fog.providers.skypilot_config import SkyPilotConfig
 from fog.software.config import SOFTWARE_PORT, SoftwareConfig, listening_host_port
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.config.config import LeaseSeconds, SwitchConfig

@@ -12,7 +12,7 @@ import heapq
 from itertools import count
 from typing import Any, Final, Generic, TypeVar
 
-__all__ = ["DueQueue"]
+__all__ = ["DueQueue", "earliest"]
 
 _NEVER: Final = float("inf")
 _SLACK: Final = 64  # void entries that are not yet worth a rebuild
@@ -95,3 +95,12 @@ class DueQueue(Generic[K]):
 
     def _rank(self, key: K) -> Any:
         return key if self._is_sorted else next(self._order)
+
+
+def earliest(*moments: float | None) -> float | None:
+    """Return the first of some moments, of which None is never."""
+    first: float | None = None
+    for each in moments:
+        if each is not None and (first is None or each < first):
+            first = each
+    return first

@@ -62,6 +62,14 @@ ENDPOINT: Final = SoftState(20.0, periods=3)  # an endpoint record at a RIB
 READER: Final = SoftState(1.0, periods=6)  # a report; a reader that sends none for so long blocks its publisher no more
 SERVER: Final = SoftState(0.5, periods=4)  # a report to clients; a server that sends none for so long is no peer
 
+HELLO_IDLE: Final = 16  # hello intervals between two hellos, once keepalives of the neighbours arrive
+KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
+SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
+DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
+LEASE_MIN_S: Final = 1.0
+LEASE_MAX_S: Final = 3_600.0
+NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it
+
 # Looks at what has no event
 PACE_S: Final = 0.1  # between turns of work in the background of a data plane
 LOOK_S: Final = 0.05  # by who waits for it: a process that ends, a socket that appears

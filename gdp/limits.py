@@ -69,16 +69,7 @@ CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
 CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0
 CLOCK_SKEW_S: Final = 3_600.0  # a certificate is accepted this long before it begins, and after it has ended
 
-# Leases
-LEASE_MIN_S: Final = 1.0
-LEASE_MAX_S: Final = 3_600.0
-NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it
-
 # Neighbours and link state
-HELLO_IDLE: Final = 16  # hello intervals between two hellos, once keepalives of the neighbours arrive
-KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
-SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
-DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
 COST_DEFAULT: Final = 10  # of a link
 COST_AUTO: Final = 0  # of a port: the cost of its links is measured
 LINK_STATE_AGE_MAX_S: Final = 2 * CLOCK_SKEW_S + LINK_STATE.lease_s  # by two clocks

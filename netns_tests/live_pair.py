@@ -36,7 +36,7 @@ from lab.process import LabProcess, new_run, python_path
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
-from tests.proxy.endpoints.dds_peers import CYCLONE
+from tests.gdp_extensions.dds.peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
 

@@ -31,14 +31,14 @@ from lab.debian import cache_folder
 from lab.process import calling
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
 from proxy.bridge.bridge import Bridge
+from proxy.bridge.core.delegated_rules import DelegatedRules
 from proxy.config.rule import Rule
-from proxy.doors.rules import DoorRules
 from proxy.endpoints.core.qos import default
-from proxy.node.door import door_config
+from proxy.node.member_config import member_config
 from proxy.node.node import run_node
+from tests.gdp_extensions.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES, STATUS
 from tests.pages import ROOT
 from tests.proxy.bridge import known
-from tests.proxy.doors.fibonacci import FEEDBACK, FIBONACCI, SERVICES, STATUS
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph, Publication
 
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -199,7 +199,7 @@ def serve(node_directory: str) -> None:
 
     Its graph is in memory, since this machine may have no ROS; bridge, switch and delegations are real.
     """
-    config, delegations = door_config(Path(node_directory).absolute(), None, None)
+    config, delegations = member_config(Path(node_directory).absolute(), None, None)
     services = known.services() | {each.type_name: each for each in SERVICES.values()}
     graph = FakeGraph(2, {**known.channels(), FEEDBACK.type_name: FEEDBACK}, services)
     graph.serve("/server", "/switch", known.SET_BOOL, lambda raw, done: done(known.switched("done")))
@@ -209,7 +209,7 @@ def serve(node_directory: str) -> None:
         owner = PublicKey.from_compressed(next(iter(held)).delegation.subject.owner_key)
         action = Rule.model_validate({"kind": "action", "name": "/fibonacci", "type": FIBONACCI, "owner": owner})
         service = Rule.model_validate({"kind": "service", "name": "/switch", "type": known.SET_BOOL, "owner": owner})
-        rules = DoorRules([action, service], [])
+        rules = DelegatedRules([action, service], [])
         bridge = Bridge(node.state.context, rules, [endpoint], held)
         node.runtime.watch(endpoint)
         is_ready = False

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("gdp_extensions.pkcs11")
+
 from gdp.crypto.certificates import Role
 from gdp.stores.issue import admit_node, make_node_keys
 from gdp.stores.keyring import store_again
-from gdp.stores.token import generate_token_key
+from gdp_extensions.pkcs11.token import generate_token_key
 from lab.machine import LabMachine
 from lab.namespaces import Space
 from netns_tests.test_rights import end, nodes
-from tests.gdp.stores.tokens import PIN, soft_token
+from tests.gdp_extensions.pkcs11.tokens import PIN, soft_token
 
 __all__ = ["nodes"]
 

@@ -34,8 +34,8 @@ class Robot:
     def meet(self, peers: int) -> None:
         """Return when it has this many peers."""
         deadline_s = time.monotonic() + PATIENCE_S
-        is_met = self._runtime.run(lambda: len(self._member.peers(self._service)) == peers, deadline_s)
-        assert is_met, f"{len(self._member.peers(self._service))} peers, not {peers}"
+        is_met = self._runtime.run(lambda: len(self._member.services.peers(self._service)) == peers, deadline_s)
+        assert is_met, f"{len(self._member.services.peers(self._service))} peers, not {peers}"
 
     def publish(self) -> None:
         """Call all peers; return when all have confirmed."""
@@ -45,9 +45,9 @@ class Robot:
 
     def ask(self) -> None:
         """Call one peer; return when the request has left."""
-        server = self._member.peers(self._service)[0]
+        server = self._member.services.peers(self._service)[0]
         for _ in self._paced():
-            self._member.send_request(self._service, server, self._body)
+            self._member.services.send_request(self._service, server, self._body)
         self._runtime.run(lambda: False, time.monotonic() + 0.2)
 
     def _paced(self) -> Iterator[None]:

@@ -74,9 +74,9 @@ link_scripts() {
 
 # compile_own: byte-compiles our packages, so that root leaves no caches that their owner cannot delete
 compile_own() {
-    "$venv/bin/python" -m compileall -q gdp proxy fog scripts/ring scripts/fog_demo scripts/internet scripts/internet_demo examples/grasp/grasp || fail "the source does not compile"
+    "$venv/bin/python" -m compileall -q gdp proxy fog gdp_extensions scripts/ring scripts/fog_demo scripts/internet scripts/internet_demo examples/grasp/grasp || fail "the source does not compile"
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
-        find gdp proxy fog scripts examples -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
+        find gdp proxy fog gdp_extensions scripts examples -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
     fi
 }
 

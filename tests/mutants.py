@@ -28,7 +28,7 @@ ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = (
     "gdp/switch", "gdp/rib", "gdp/client", "gdp/exchange", "gdp/message", "gdp/crypto", "gdp/trust", "proxy/bridge",
 )  # fmt: skip
-_COPIED: Final = ("gdp", "proxy", "fog", "tests", "scripts", "netns_tests", "examples", "docs")
+_COPIED: Final = ("gdp", "proxy", "fog", "gdp_extensions", "tests", "scripts", "netns_tests", "examples", "docs")
 _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
@@ -36,7 +36,7 @@ _COMPARED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
 _COMPUTED: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.FloorDiv, ast.FloorDiv: ast.Mult,
 }  # fmt: skip
-_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp")
+_ALL: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/proxy", "tests/gdp", "tests/gdp_extensions")
 _TEST_S: Final = 2_400.0  # a mutant that hangs counts as killed
 
 

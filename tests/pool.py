@@ -143,7 +143,7 @@ class _Seconds:
 def folder_of(file: str) -> str:
     """Return the folder whose budget a file belongs to: ``netns_tests``, ``tests/attacks``, ``tests/gdp/switch``."""
     parts = Path(file).parent.parts
-    return "/".join(parts[: 3 if parts[1:2] in (("gdp",), ("proxy",), ("fog",)) else 2])
+    return "/".join(parts[: 3 if parts[1:2] in (("gdp",), ("proxy",), ("fog",), ("gdp_extensions",)) else 2])
 
 
 def _folders(files: Mapping[str, Iterable[float]]) -> dict[str, float]:

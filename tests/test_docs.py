@@ -126,7 +126,7 @@ def test_scripts_that_a_page_names_exist() -> None:
 
 def test_source_files_that_a_page_names_exist() -> None:
     text = "".join(page.read_text() for page in PAGES)
-    for path in re.findall(r"`((?:gdp|proxy|fog)/[\w/]+\.py)`", text):
+    for path in re.findall(r"`((?:gdp|proxy|fog|gdp_extensions)/[\w/]+\.py)`", text):
         assert (ROOT / path).is_file(), path
 
 

@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,10 +16,47 @@ from fog.launch.machines import CloudMachine, filled
 from fog.plan.duration import seconds_from_text
 from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
+from gdp.ros_names import Kind
 
-__all__ = ["ClusterSpec"]
+__all__ = ["ClusterKeywords", "ClusterSpec"]
 
 _NAME: Final = "[a-z0-9][a-z0-9-]{0,31}"
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class ClusterKeywords:
+    """Keywords of a ``FogCluster``.
+
+    Args:
+        cloud_nodes: list of ``Node``.
+        deployments: one machine for each replica.
+        name: of the cluster, for ``fog scale NAME``; empty: the first node's executable.
+        replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
+        services, actions, topics: full name to type of what the nodes offer; without any, services and actions are
+            discovered.
+        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: ``"all"``.
+        timeout_s: time limit of a response; None: the proxy's 5 s.
+        idle: time without a call (seconds, or ``"30min"``) after which the machines are released; None: the site's.
+        budget_usd: cost at which the machines are released; None: the site's.
+        keep: leave the cluster running when the launch ends.
+        availability: instead of ``replicas``, the share of time to serve, such as 0.9995: copies are added until then.
+        scale: instead of ``replicas``, bounds and targets of the number of machines.
+    """
+
+    cloud_nodes: Iterable[object]
+    deployments: Iterable[CloudMachine]
+    name: str = ""
+    replicas: int | None = None
+    services: Offered | None = None
+    actions: Offered | None = None
+    topics: Offered | None = None
+    replication: SomeReplication | None = None
+    timeout_s: float | None = None
+    idle: float | str | None = None
+    budget_usd: float | None = None
+    keep: bool = False
+    availability: float | None = None
+    scale: Mapping[str, object] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,31 +82,17 @@ class ClusterSpec:
     scale: ScalingPolicy | None = None
 
     @classmethod
-    def checked(
-        cls,
-        deployments: Sequence[CloudMachine],
-        *,
-        name: str,
-        replicas: int | None,
-        services: Offered | None,
-        actions: Offered | None,
-        topics: Offered | None,
-        replication: SomeReplication | None,
-        timeout_s: float | None,
-        idle: float | str | None,
-        budget_usd: float | None,
-        keep: bool,
-        availability: float | None = None,
-        scale: Mapping[str, object] | None = None,
-    ) -> ClusterSpec:
+    def checked(cls, keywords: ClusterKeywords) -> ClusterSpec:
         """Check the keywords of a ``FogCluster``."""
+        name, replicas, availability = keywords.name, keywords.replicas, keywords.availability
+        deployments, timeout_s, budget_usd = tuple(keywords.deployments), keywords.timeout_s, keywords.budget_usd
         if name and not re.fullmatch(_NAME, name):
             raise LocalError(f"name {name!r}: expected small letters, digits and hyphens, at most 32")
         if availability is not None and replicas is not None:
             raise LocalError("replicas and availability: say how many there are, or how available they are to be")
         if availability is not None and not 0 < availability < 1:
             raise LocalError(f"availability={availability}: expected a share of time between 0 and 1, such as 0.9995")
-        policy = None if scale is None else policy_from_keys(scale)
+        policy = None if keywords.scale is None else policy_from_keys(keywords.scale)
         if policy is not None and (replicas is not None or availability is not None):
             raise LocalError("scale, replicas and availability: say one of them")
         count = len(deployments) if availability is not None else replicas
@@ -77,26 +100,26 @@ class ClusterSpec:
             count = max(policy.min_machines, len(deployments))
         machines, notes = filled(deployments, count)
         defaults: dict[str, object] = {}
-        if replication is not None:
-            defaults["replication"] = replication_rule(replication)
+        if keywords.replication is not None:
+            defaults["replication"] = replication_rule(keywords.replication)
         if timeout_s is not None:
             defaults["timeout_s"] = _positive("timeout_s", timeout_s)
-        named = None
-        if services is not None or actions is not None or topics is not None:
-            named = (
-                *carried("service", services or {}, defaults),
-                *carried("action", actions or {}, defaults),
-                *carried("topic", topics or {}, defaults),
-            )
-        idle_s = seconds_from_text(idle) if isinstance(idle, str) else idle
+        offered: dict[Kind, Offered | None] = {
+            "service": keywords.services,
+            "action": keywords.actions,
+            "topic": keywords.topics,
+        }
+        is_named = any(each is not None for each in offered.values())
+        named = tuple(each for kind, names in offered.items() for each in carried(kind, names or {}, defaults))
+        idle_s = seconds_from_text(keywords.idle) if isinstance(keywords.idle, str) else keywords.idle
         return cls(
             name=name,
             machines=machines,
-            carried=named,
+            carried=named if is_named else None,
             defaults=defaults,
             idle_s=None if idle_s is None else _positive("idle", idle_s),
             budget_usd=None if budget_usd is None else _positive("budget_usd", budget_usd),
-            keep=keep,
+            keep=keywords.keep,
             notes=notes,
             availability=availability,
             scale=policy,

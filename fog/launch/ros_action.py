@@ -48,6 +48,11 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
     _starting: asyncio.Task[None] | None = None
     _is_begun = False  # set when a cluster may exist that must be ended
 
+    def __post_init__(self) -> None:
+        """Make it an action; check and record the cluster."""
+        Action.__init__(self)
+        super().__post_init__()
+
     def execute(self, context: LaunchContext) -> None:
         """Start or join the cluster without waiting until it serves."""
         if self._starting is not None:

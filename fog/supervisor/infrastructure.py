@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,10 @@ from fog.machine import MachineState
 from fog.providers.local.netlinks import delete
 from fog.providers.local.spawn import spawn_detached
 from fog.providers.provider import AccountProvider, Provider
+from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
+from gdp.extras import Seam
 from gdp.host.run_registry import RunRegistry
 from gdp.intervals import LOOK_S, MINUTE_S
 
@@ -37,6 +39,7 @@ log = logging.getLogger(__name__)
 
 _OWN_SPACE: Final = Path("/proc/self/ns/net")
 _GATEWAY_DAYS: Final = 3_650.0
+_PROVIDERS: Final[Seam[Callable[[SkyPilotConfig], Provider]]] = Seam("fog.provider")
 
 
 def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
@@ -57,9 +60,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
 
             return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
         case "skypilot":
-            from fog.providers.skypilot.provider import SkyPilotProvider
-
-            return SkyPilotProvider(site.skypilot)
+            return _PROVIDERS.get("skypilot", "provider skypilot")(site.skypilot)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:

@@ -115,8 +115,7 @@ def _run(
         members=members,
         provider=provider,
         command=partial(command_of, site),
-        heard=watch.serving_proxies if watch is not None else lambda: None,
-        on_names=watch.reload if watch is not None else lambda: None,
+        watch=watch,
         patience=timeouts,
         software=software,
     )

@@ -5,12 +5,12 @@ I/O; writes the robots' drop-in files.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 from fog.bootstrap.robot_config import add_rules, reload_proxy, remove_rules
 from fog.cluster import ClusterPlan
 from fog.site import Site
+from fog.supervisor.watch import Watch
 
 __all__ = ["RobotAccess"]
 
@@ -18,11 +18,11 @@ _ROBOT_DAYS: Final = 365.0
 
 
 class RobotAccess:
-    """Access control of a site's robots to clusters; ``on_names``: called when the watch needs more names."""
+    """Access control of a site's robots to clusters; ``watch``: needs their names, too."""
 
-    def __init__(self, site: Site, on_names: Callable[[], None]) -> None:
+    def __init__(self, site: Site, watch: Watch | None) -> None:
         self._site = site
-        self._on_names = on_names
+        self._watch = watch
         self._plans: dict[str, ClusterPlan] = {}  # plans to which the robots have access
 
     def has(self, plan: ClusterPlan) -> bool:
@@ -43,7 +43,8 @@ class RobotAccess:
             keys, _ = self._site.watch
             services = [each for each in plan.carried if each.kind != "topic"]
             authority.grant_access(keys, keys / "delegations", services, days=_ROBOT_DAYS)
-            self._on_names()
+            if self._watch is not None:
+                self._watch.reload()
         self._plans[plan.name] = plan
 
     def remove(self, name: str) -> None:

@@ -30,6 +30,7 @@ from fog.supervisor.machine_actions import MachineActions
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
+from fog.supervisor.watch import Watch
 from gdp.errors import GdpError
 from gdp.intervals import WATCH_S
 from gdp.stores.keyring import load_public_key
@@ -49,7 +50,7 @@ class Supervisor:
 
     Args:
         members: of the domain, which machines join.
-        heard: servers that the overlay reports; None: the overlay cannot be queried.
+        watch: reports which servers the overlay has; None: the overlay cannot be queried.
         software: returns the files by which a new machine fetches its software.
     """
 
@@ -61,14 +62,13 @@ class Supervisor:
         members: DomainMembers,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
-        heard: Callable[[], Heard | None],
-        on_names: Callable[[], None] = lambda: None,
+        watch: Watch | None = None,
         patience: Timeouts = PATIENCE,
         software: Callable[[], Mapping[str, bytes]] = dict,
     ) -> None:
         self._site = site
         self._journal = journal
-        self._heard = heard
+        self._watch = watch
         self._patience = patience
         self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
         self._woken = threading.Event()
@@ -87,7 +87,7 @@ class Supervisor:
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)
         self._scaling = Autoscaling(site, journal)
-        self._robots = RobotAccess(site, on_names)
+        self._robots = RobotAccess(site, watch)
         self._known: Heard | None = None  # what the overlay reported at the last reconciliation
         self._settled: set[str] = set()  # clusters that are down without leftovers
         self._owner_key = load_public_key(site.authority.owner_key).compressed
@@ -122,6 +122,9 @@ class Supervisor:
             left_s -= WATCH_S
             beat()
         self._woken.clear()
+
+    def _heard(self) -> Heard | None:
+        return None if self._watch is None else self._watch.serving_proxies()
 
     def _has_news(self) -> bool:
         return self._credentials.has_reports() or self._heard() != self._known
@@ -195,12 +198,7 @@ class Supervisor:
             self._robots.remove(plan.name)
 
     def _observe(
-        self,
-        plan: ClusterPlan,
-        names: Sequence[str],
-        seen: Mapping[str, Machine],
-        heard: Heard | None,
-        now_s: float,
+        self, plan: ClusterPlan, names: Sequence[str], seen: Mapping[str, Machine], heard: Heard | None, now_s: float
     ) -> list[Record]:
         records = []
         for before in self._journal.machines(plan.name, gone=False):

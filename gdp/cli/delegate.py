@@ -14,8 +14,7 @@ from typer.core import TyperGroup
 
 from gdp.cli import options
 from gdp.cli.delegations import described, ls, show_file
-from gdp.cli.doors import rules_of_proxies
-from gdp.cli.extension import ANY_ARGUMENTS
+from gdp.cli.extension import ANY_ARGUMENTS, COMMANDS
 from gdp.cli.output import (
     epochs_from_text,
     rights_from_text,
@@ -73,7 +72,12 @@ OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="wher
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]
 
 
-app.command(_RULES, context_settings=ANY_ARGUMENTS)(rules_of_proxies)
+@app.command(_RULES, context_settings=ANY_ARGUMENTS)
+def rules_of_proxies(context: typer.Context) -> None:
+    """Give each proxy the delegations that the rules of its file need."""
+    COMMANDS.get("delegate", "gdp delegate rules")(context.args)
+
+
 app.command("rights", no_args_is_help=True)(delegate_rights)
 app.command("ls", no_args_is_help=True)(ls)
 app.command("show", no_args_is_help=True)(show_file)

@@ -1,48 +1,39 @@
-"""Group whose further commands come from other packages, through entry points of the group ``gdp.command``.
+"""Group whose further commands come from other packages and extensions: entry points of the group ``gdp.command``.
 
-I/O. Where such a package is not installed, the group's own placeholders say how to install it.
+I/O. Where one is not installed, the group's own placeholders say how to install it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 import typer
 import typer.main
 from typer.core import TyperGroup
 
 from gdp.cli.version import versioned
-from gdp.errors import LocalError
-from gdp.extras import MissingExtraError, find_entry_point
+from gdp.extras import MissingExtraError, Seam, find_entry_point
 
 if TYPE_CHECKING:
     from typer import Context
 
-__all__ = ["ANY_ARGUMENTS", "ExtendedGroup", "load_command", "placeholder"]
+__all__ = ["ANY_ARGUMENTS", "COMMANDS", "ExtendedGroup", "placeholder"]
 
 ANY_ARGUMENTS = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": list[str]()}
+_EXTRAS: Final = {
+    **dict.fromkeys(("delegate", "recording", "rule", "service", "topic", "watch"), "proxy"),
+    **dict.fromkeys(("foxglove", "rosbridge"), "proxy,doors"),
+    **dict.fromkeys(("decrypt-pcap", "wireshark"), "scapy"),
+    "suggest": "proxy,dds",
+}
+COMMANDS: Final[Seam[Any]] = Seam("gdp.command", _EXTRAS)
 
 
 def placeholder(context: typer.Context) -> None:
-    """Run a command of the package proxy, which is not installed, or only without its extras."""
-    raise LocalError(f"{context.command_path} needs the package proxy (run: pip install 'gdp-ros[proxy,doors]')")
-
-
-def load_command(name: str, *, user: str = "", extras: str = "proxy") -> Any:
-    """Return what an entry point of the group ``gdp.command`` refers to.
-
-    Args:
-        user: what needs it, for the error.
-        extras: of this distribution that it needs, for the error.
-
-    Raises:
-        LocalError: its package, or an extra of it, is not installed.
-    """
-    point = find_entry_point("gdp.command", name)
-    if point is None:
-        raise LocalError(f"{user or f'gdp {name}'} needs the package proxy (run: pip install 'gdp-ros[{extras}]')")
-    return point.load()
+    """Run a command that comes from elsewhere, where it or a package that it needs is not installed."""
+    group: Any = context.parent and context.parent.command
+    COMMANDS.get(group.extensions[context.info_name], context.command_path)
 
 
 class ExtendedGroup(TyperGroup):

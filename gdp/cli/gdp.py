@@ -8,16 +8,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
-from gdp.cli import extension
-from gdp.cli.extension import ExtendedGroup
+from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup
 from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.program import Program
 from gdp.cli.version import Version
 
 __all__ = ["app", "main"]
 
-_DOORS: Final = ("foxglove", "rosbridge", "recording", "rule", "service", "watch")  # of the package proxy
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
+
+
+def _elsewhere(text: str) -> LazyCommand:
+    """Return the placeholder of a command of another package or of an extension."""
+    return LazyCommand("gdp.cli.extension:placeholder", no_args_is_help=False, settings=ANY_ARGUMENTS, help=text)
+
+
 _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
     "lab": LazyCommand("gdp.cli.lab:lab"),
@@ -32,17 +37,19 @@ _KNOWN: Final = {
     "status": LazyCommand("gdp.cli.control:status"),
     "drain": LazyCommand("gdp.cli.control:drain"),
     "explain": LazyCommand("gdp.cli.explain:explain"),
-    **{
-        door: LazyCommand(f"gdp.cli.doors:{door}", no_args_is_help=False, settings=extension.ANY_ARGUMENTS)
-        for door in _DOORS
-    },
+    "foxglove": _elsewhere("Let Foxglove see what a node's delegations allow."),
+    "rosbridge": _elsewhere("Let rosbridge clients use what a node's delegations allow."),
+    "recording": _elsewhere("Complete a recording whose writer was killed."),
+    "rule": _elsewhere("Add, remove and list rules of a proxy while it runs."),
+    "service": _elsewhere("Call a service through the overlay, as a member."),
+    "watch": _elsewhere("Print events when publishers, readers and servers of a name appear or go."),
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
     "show": LazyCommand("gdp.cli.show_tables:show_table"),
-    "dashboard": LazyCommand("gdp.cli.dashboard:dashboard", no_args_is_help=False),
-    "wireshark": LazyCommand("gdp.cli.wireshark:wireshark", no_args_is_help=False),
+    "dashboard": _elsewhere("Show domains, links, names, replicas, drops and events live, on one page."),
+    "wireshark": _elsewhere("Print or install a Wireshark dissector for our frames."),
     "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
-    "decrypt-pcap": LazyCommand("gdp.cli.decrypt_pcap:decrypt_pcap"),
+    "decrypt-pcap": _elsewhere("Write a capture with the messages that the given keys open."),
     "top": LazyCommand("gdp.cli.top:top", no_args_is_help=False),
     "completion": LazyCommand("gdp.cli.completion:completion"),
     "keygen": LazyCommand("gdp.cli.keygen:app"),
@@ -58,7 +65,7 @@ _KNOWN: Final = {
 
 
 class _Commands(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {each: each for each in _DOORS}
+    extensions: ClassVar[Mapping[str, str]] = {name: name for name, each in _KNOWN.items() if each.help}
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

@@ -16,7 +16,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
-from gdp.cli.doors import suggest_rules
+from gdp.cli.extension import COMMANDS
 from gdp.cli.machine import (
     BORDER_SEEN_S,
     AtDirectory,
@@ -143,7 +143,7 @@ def up(
     """
     machine = read_machine(path)
     if suggest or _lacks_proxy_file(machine):
-        suggest_rules(machine.directory)
+        COMMANDS.get("suggest", "gdp up --suggest")(machine.directory)
         if suggest:
             return
         machine = read_machine(path)

@@ -12,11 +12,11 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.crypto.keys import SigningKey
 from gdp.errors import LocalError
 from gdp.stores.keyring import storage, store_again
 from gdp.stores.passphrase import FILE_VARIABLE, VARIABLE, new_passphrase
-from gdp.stores.private_keys import Storage
-from gdp.stores.token import TokenKey, generate_token_key, open_token_key
+from gdp.stores.private_keys import TOKEN_KEYS, Storage
 
 __all__ = ["app", "asked_passphrase", "token_key"]
 
@@ -82,7 +82,7 @@ def generate(
     Example:
       gdp key generate 'pkcs11:token=roof;object=node?module-path=/usr/lib/softhsm/libsofthsm2.so'
     """
-    made = generate_token_key(uri)
+    made = TOKEN_KEYS.get("pkcs11", uri).generate_token_key(uri)
     show({"public": made.public.compressed.hex(), "key": uri}, as_json=as_json)
 
 
@@ -95,13 +95,13 @@ def asked_passphrase(wanted: bool) -> bytes | None:
     return new_passphrase() if wanted else None
 
 
-def token_key(uri: str | None) -> TokenKey | None:
+def token_key(uri: str | None) -> SigningKey | None:
     """Return the key in a token that an option names; None: the key is to be made here.
 
     Raises:
         LocalError: there is no such key.
     """
-    return None if uri is None else open_token_key(uri, Path(uri))
+    return None if uri is None else TOKEN_KEYS.get("pkcs11", uri).open_token_key(uri, Path(uri))
 
 
 def _report(found: dict[Path, Storage], *, as_json: bool) -> None:

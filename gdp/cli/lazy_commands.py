@@ -27,11 +27,13 @@ class LazyCommand:
         target: ``module:attribute``; the attribute is a function, or an application with commands of its own.
         no_args_is_help: whether a function without arguments prints its help.
         settings: of the context of a function.
+        help: of a function that stands for more than one command; by default its docstring.
     """
 
     target: str
     no_args_is_help: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    help: str | None = None
 
     def import_as(self, name: str) -> Any:
         """Return the command, named ``name``, with the option ``--version`` on it and on all below it."""
@@ -42,7 +44,8 @@ class LazyCommand:
             command = get_group(found)
         else:
             only = typer.Typer(add_completion=False)
-            only.command(name, no_args_is_help=self.no_args_is_help, context_settings=dict(self.settings))(
+            settings = dict(self.settings)
+            only.command(name, help=self.help, no_args_is_help=self.no_args_is_help, context_settings=settings)(
                 ungrouped(found)
             )
             command = get_command(only)

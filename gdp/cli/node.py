@@ -47,7 +47,7 @@ __all__ = [
 # before the confinement of rights keeps its rights.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-_OURS: Final = ("gdp", "proxy", "fog")
+_OURS: Final = ("gdp", "proxy", "fog", "gdp_extensions")
 WRONG: Final = 2  # exit code of a wrong configuration
 
 Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/reference/configuration.md.")]

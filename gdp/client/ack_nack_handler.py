@@ -113,7 +113,7 @@ class AckNackHandler:
 
     def poll_heartbeat(self, now_s: float, trip_s: float) -> bytes:
         """Return the wire form of the Heartbeat that is due; ``trip_s``: how long a reader's answer may take."""
-        queue, oldest = self._queue, self._window.oldest
+        queue, oldest = self._queue, self._window.cache.oldest
         (sent_number, sent_part), (sent_sequence, oldest_sequence) = queue.sent, queue.sequences
         state = Heartbeat(
             oldest=sent_number if oldest is None else oldest,
@@ -233,12 +233,15 @@ class AckNackHandler:
         reader, queue = self._readers[name], self._queue
         if name not in self._heartbeats.starts and not self._heartbeats.is_full:
             queue.seal_gathered()  # it was published before this reader came
-            oldest = self._window.oldest
+            oldest = self._window.cache.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start.number < oldest
             if reader.start is None or is_gone or not queue.is_acknowledged:
                 since_s = now_s - acknack.held_us / 1e6  # since when it waits
                 number = self._first_of(acknack, since_s)
-                begin = queue.begin_of(number)
+                waiting = number - queue.next_number
+                begin = queue.ledger.begin_of(number, queue.first_waiting)
+                if 0 < waiting < len(queue.deferred):
+                    begin = queue.deferred.sequence_of(waiting)
                 if queue.is_acknowledged and not (queue.depth or acknack.next_number):
                     begin = min(queue.ledger.first_since(since_s), begin)  # what was published in between is lost
                 if reader.start is not None:  # it is a reader since then: what it did not get since is lost
@@ -261,9 +264,12 @@ class AckNackHandler:
         queue = self._queue
         if acknack.next_number and queue.is_acknowledged:
             return min(max(acknack.next_number, queue.oldest), queue.next_number)
-        if not queue.depth:
-            return queue.first_since(since_s) if queue.awaited else queue.next_number
-        return max(queue.oldest, queue.next_number + queue.deferred - queue.depth)
+        if queue.depth:
+            return max(queue.oldest, queue.next_number + len(queue.deferred) - queue.depth)
+        if not queue.awaited:
+            return queue.next_number
+        cached = self._window.cache.first_since(since_s)
+        return queue.next_number + queue.deferred.count_before(since_s) if cached is None else cached
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue

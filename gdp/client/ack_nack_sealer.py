@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.client.identities import ReaderIdentity
+from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.crypto.control_seal import ControlSealer, control_key
+from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.frame.kinds import Kind
 from gdp.intervals import READER
@@ -29,7 +29,6 @@ class AckNackSealer:
     """Sealer of what one reader sends to one writer.
 
     Args:
-        exchange: the writer's X25519 key.
         secrets: topic secrets by epoch.
         introduces: introductions are sent; else the writer has the reader's key from another source.
 
@@ -37,7 +36,7 @@ class AckNackSealer:
         epoch: under which reports are sealed.
 
     Raises:
-        StatementError: MALFORMED, ``exchange`` is no key.
+        StatementError: MALFORMED, the publisher's ``exchange`` is no key.
     """
 
     def __init__(
@@ -45,9 +44,7 @@ class AckNackSealer:
         *,
         topic: Name,
         reader: ReaderIdentity,
-        publisher: Name,
-        incarnation: int,
-        exchange: bytes,
+        publisher: PublisherIdentity,
         secrets: Secrets,
         introduces: bool,
         now_s: float,
@@ -55,10 +52,9 @@ class AckNackSealer:
         self._topic = topic
         self._reader = reader
         self._publisher = publisher
-        self._incarnation = incarnation
         self._introduces = introduces
         self._secrets = secrets
-        self._shared = reader.control_keys.shared(exchange)
+        self._shared = reader.control_keys.shared(publisher.exchange)
         self._sealers: dict[int, ControlSealer] = {}
         self._tried = 0
         self._epoch_at = -1  # number of the message that had this epoch
@@ -112,9 +108,7 @@ class AckNackSealer:
         """
         sealer = self._sealers.get(epoch)
         if sealer is None:
-            reader = self._reader
-            ends = reader.name, reader.incarnation, self._publisher, self._incarnation
-            key = control_key(self._shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
+            key = control_key(self._shared, self._secrets[epoch], *self._context(Kind.ACKNACK))
             sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)
         return sealer
 
@@ -123,22 +117,16 @@ class AckNackSealer:
         if not self._introduces:
             return []
         reader = self._reader
-        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, reader.name, reader.incarnation, self._publisher)
+        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, reader.name, reader.incarnation, self._publisher.name)
         return [self._note_sealer(key, epoch, Kind.INTRODUCTION).seal(reader.introduction())]
 
     def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> ControlSealer:
-        reader = self._reader
-        return ControlSealer(
-            key=key,
-            epoch=epoch,
-            kind=kind,
-            source=reader.name,
-            incarnation=reader.incarnation,
-            destination=self._publisher,
-            topic=self._topic,
-            destination_incarnation=self._incarnation,
-            numbers=reader.note_numbers,
-        )
+        return ControlSealer(key=key, epoch=epoch, context=self._context(kind), numbers=self._reader.note_numbers)
+
+    def _context(self, kind: Kind) -> ControlContext:
+        reader, publisher = self._reader, self._publisher
+        ends = reader.name, reader.incarnation, publisher.name, publisher.incarnation
+        return ControlContext(kind, *ends, self._topic)
 
     def _epoch_to_try(self) -> int:
         """Return the newest epoch, and in turn the others, because the writer may not have the newest yet."""

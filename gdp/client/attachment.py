@@ -32,6 +32,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
@@ -81,6 +82,16 @@ class PendingAdvertisement:
         """Return whether the overlay has accepted or rejected it."""
         return self.is_taken or self.refused is not None
 
+    def next_pause_s(self, renewals: Backoff) -> float:
+        """Count an advertisement that is sent now; return the seconds until it is repeated, unless it is acknowledged.
+
+        A renewal has some five frames, and is lost with any of them.
+        """
+        if not self.is_acknowledged:
+            return _ADVERTISEMENT_AGAIN_S
+        self.renewals += 1
+        return renewals.pause_s(self.renewals)
+
 
 class Attachment:
     """Attachment of one node to the overlay.
@@ -88,6 +99,12 @@ class Attachment:
     Args:
         exchange: X25519 key of this incarnation, for control datagrams about the names that it advertises to publish,
             serve or call; empty: it accepts none.
+
+    Attributes:
+        switch: that this node is attached to; None: there is none.
+        started: number above those of earlier incarnations here, as far as known.
+        clashes: signs of another node with this identity.
+        conflict_at: switch of a newer node with this identity, once it was reported.
     """
 
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings, exchange: bytes = b"") -> None:
@@ -99,59 +116,47 @@ class Attachment:
         first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * settings.lease_s)
         self._renewals = Backoff(first_s, renew_after_s(settings.lease_s))
         self._sequence = settings.first_sequence
-        self.started = settings.first_sequence  # above the numbers of earlier incarnations here, as far as known
+        self.started = settings.first_sequence
         self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
         self.reassembler = ControlReassembler()
+        self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
+        self._now = Timestamps(0.0, 0.0)
         is_rib = identity.member.role is Role.RIB
         self.hello_protocol = HelloProtocol(
             identity, policy, self.fragmenter, settings, rtcert_for=self._rtcert_for if is_rib else None
         )
         self._advertisements: dict[tuple[Name, Right], PendingAdvertisement] = {}
-        self._switch: Neighbour | None = None
+        self._own: PendingAdvertisement | None = None  # of the node's own name
+        self.switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it
         self._last = ZERO  # the switch of the newest attachment, the present one too
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
-        self._rtcerts: dict[Name, tuple[bytes, float]] = {}  # by switch, with the monotonic second of the next one
         self._sync = RevocationSync(
             identity, policy.revoked, self.hello_protocol.neighbours, self._say_revoked, settings.first_sequence
         )
-        self._now = Timestamps(0.0, 0.0)
         self._out: list[OutgoingFrames] = []
         self._in_use_s = 0.0  # since when another node with this identity is accepted instead
-        self.clashes = 0  # signs of another node with this identity
-        self.conflict_at: Name | None = None  # switch of a newer node with this identity, once it was reported
+        self.clashes = 0
+        self.conflict_at: Name | None = None
         self.refusals: Counter[DropReason] = Counter()
-
-    @property
-    def switch(self) -> Neighbour | None:
-        """Return the switch that this node is attached to, or None."""
-        return self._switch
 
     @property
     def is_attached(self) -> bool:
         """Return whether a switch has acknowledged every advertisement, and no other node has this identity."""
         is_judged = all(each.is_acknowledged for each in self._advertisements.values())
-        return self._switch is not None and is_judged and not self.is_in_use
+        return self.switch is not None and is_judged and not self.is_in_use
 
     @property
     def is_in_use(self) -> bool:
         """Return whether this node is refused because an older one with its identity is there."""
-        own = self._own_advertisement
-        return own is not None and own.refused is DropReason.IN_USE
+        return self._own is not None and self._own.refused is DropReason.IN_USE
 
     @property
     def is_revoked(self) -> bool:
         """Return whether the membership of this node is revoked, as far as it has learnt."""
         member = self._identity.member
         return self._policy.revoked.has(member.fingerprint, member.issuer_key)
-
-    @property
-    def _own_advertisement(self) -> PendingAdvertisement | None:
-        for each in self._advertisements.values():
-            if each.right is Right.ATTACH:  # the first one: it is advertised from the start
-                return each
-        return None
 
     @property
     def advertisements(self) -> list[PendingAdvertisement]:
@@ -162,12 +167,6 @@ class Attachment:
     def drops(self) -> Counter[DropReason]:
         """Return the unfinished statements that were given up, by reason."""
         return self.reassembler.drops + self.hello_protocol.drops
-
-    @property
-    def mtu(self) -> int:
-        """Return the MTU of the port to the switch, in bytes after the Ethernet header."""
-        assert self._switch is not None
-        return self.hello_protocol.ports[self._switch.port].mtu
 
     def advertisement(
         self,
@@ -185,9 +184,11 @@ class Attachment:
             paths: over how many disjoint paths its frames are to travel.
             is_session: a session secret may authenticate its unicast streams.
         """
-        self._advertisements[subject.name, right] = PendingAdvertisement(
+        each = self._advertisements[subject.name, right] = PendingAdvertisement(
             subject=subject, right=right, chain=chain, is_global=is_global, paths=paths, is_session=is_session
         )
+        if right is Right.ATTACH:
+            self._own = each
 
     def evidence_of(self, name: Name) -> dict[str, object]:
         """Return the fields that show this node's right on a name that it advertises; empty if it does not."""
@@ -198,31 +199,28 @@ class Attachment:
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
         """Replace the delegation of an advertised name by a newer one, and advertise it at once."""
-        for (its, _), pending_advertisement in self._advertisements.items():
+        for (its, _), each in self._advertisements.items():
             if its == name:
-                pending_advertisement.chain, pending_advertisement.advertisement_at_s, pending_advertisement.refused = (
-                    chain,
-                    0.0,
-                    None,
-                )
+                each.chain, each.advertisement_at_s, each.refused = chain, 0.0, None
 
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
-        if self._advertisements.pop((name, right), None) is not None and self._switch is not None:
-            self._say(
+        if self._advertisements.pop((name, right), None) is not None and self.switch is not None:
+            self.say(
                 Kind.WITHDRAW,
                 Withdrawal(name, right, self._next_sequence()).to_wire(self._identity.name, self._identity.key),
             )
 
     def withdraw_all(self) -> None:
         """Leave: withdraw every advertisement."""
+        self._own = None
         for name, right in list(self._advertisements):
             self.withdraw(name, right)
 
     def send(self, frames: list[bytes]) -> None:
         """Send frames to the switch; without one they are counted as lost."""
-        if self._switch is not None:
-            self._out.append(OutgoingFrames(self._switch.port, self._switch.mac, frames))
+        if self.switch is not None:
+            self._out.append(OutgoingFrames(self.switch.port, self.switch.mac, frames))
         else:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 
@@ -238,7 +236,7 @@ class Attachment:
         if header.kind == Kind.COOKIE:
             self.hello_protocol.receive_cookie(arrival, header)
             return None
-        switch = self._switch
+        switch = self.switch
         if header.kind == Kind.HELLO:
             wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
         elif switch is None or (arrival.port, arrival.mac) != (switch.port, switch.mac):
@@ -281,14 +279,17 @@ class Attachment:
         """Process a revocation that our switch forwarded; return it if it is new.
 
         Args:
-            holds: whether a certificate that a key (33 bytes) issued is held here.
+            holds: whether another certificate that a key (33 bytes) issued is held here than those of own delegations.
 
         Raises:
             StatementError: it is invalid, concerns nothing here, or the store of its issuer is full.
         """
-        if self._switch is None:
+        if self.switch is None:
             return None
-        revocation = self._policy.revoked.receive_revocation(statement, self._switch.name, now, holds)
+        owners = {each.subject.owner_key for each in self._advertisements.values()}
+        revocation = self._policy.revoked.receive_revocation(
+            statement, self.switch.name, now, lambda key: key in owners or holds(key)
+        )
         if revocation is not None:
             self.hello_protocol.recheck(revocation.fingerprint, now)
         return revocation
@@ -299,7 +300,7 @@ class Attachment:
         Raises:
             StatementError: MALFORMED, or REPLAYED.
         """
-        switch, refresh = self._switch, JoinRefresh.from_fields(statement.fields)
+        switch, refresh = self.switch, JoinRefresh.from_fields(statement.fields)
         if switch is None:
             return []
         port = self.hello_protocol.ports[switch.port]
@@ -314,7 +315,7 @@ class Attachment:
                 sequence=self._next_sequence(),
                 is_reply=True,
             )
-            self._say(Kind.JOIN_REFRESH, reply.to_wire(self._identity.name, self._identity.key))
+            self.say(Kind.JOIN_REFRESH, reply.to_wire(self._identity.name, self._identity.key))
         return [known[number] for number in refresh.numbers if number in known]
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
@@ -330,35 +331,26 @@ class Attachment:
         self.reassembler.drop_expired(now.mono_s)
         self._out += self.hello_protocol.hellos_to_send(now.mono_s)
         self._sync.handle_timer(now.mono_s)
-        if self._switch is None:
+        if self.switch is None:
             return
         for each in self._due_advertisements():
             if each.advertisement_at_s <= now.mono_s:
-                each.advertisement_at_s = now.mono_s + self._repeat_s(each)
-                self._say(Kind.ADVERTISE, self._advertisement_wire(each, now))
+                each.advertisement_at_s = now.mono_s + each.next_pause_s(self._renewals)
+                self.say(Kind.ADVERTISE, self._advertisement_wire(each, now))
                 each.sent_sequence = self._sequence
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [time for time in (self.hello_protocol.get_timer(), self._sync.get_timer()) if time is not None]
-        if self._switch is not None:
-            times += [each.advertisement_at_s for each in self._due_advertisements()]
-        return min(times) if times else None
-
-    def _repeat_s(self, each: PendingAdvertisement) -> float:
-        """Count an advertisement that is sent now; return the seconds until it is repeated, unless it is acknowledged.
-
-        A renewal has some five frames, and is lost with any of them.
-        """
-        if not each.is_acknowledged:
-            return _ADVERTISEMENT_AGAIN_S
-        each.renewals += 1
-        return self._renewals.pause_s(each.renewals)
+        due_s = earliest(self.hello_protocol.get_timer(), self._sync.get_timer())
+        if self.switch is not None:
+            for each in self._due_advertisements():
+                if due_s is None or each.advertisement_at_s < due_s:
+                    due_s = each.advertisement_at_s
+        return due_s
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""
-        own = self._own_advertisement
-        return (own,) if own is not None and own.refused is DropReason.IN_USE else self._advertisements.values()
+        return (self._own,) if self._own is not None and self.is_in_use else self._advertisements.values()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
@@ -369,13 +361,13 @@ class Attachment:
         """Attach to the switch over the cheapest link; a new or restarted one receives every advertisement."""
         switches = [each for each in self.hello_protocol.neighbours.all_up() if each.role.is_switch]
         best = min(switches, key=lambda each: (each.cost, each.port), default=None)
-        is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
+        is_same = best is not None and best is self.switch and best.nonce == self._switch_nonce
         if not is_same:
-            if self._switch is not None:
-                self._sync.neighbour_lost(self._switch)
+            if self.switch is not None:
+                self._sync.neighbour_lost(self.switch)
             if best is not None:
                 self._sync.neighbour_up(best, now_s)
-        self._switch = best
+        self.switch = best
         self._switch_nonce = b"" if best is None else best.nonce
         if best is not None and not is_same:
             if best.name != self._last:
@@ -392,11 +384,11 @@ class Attachment:
                 each.joins.clear()
 
     def _advertisement_wire(self, each: PendingAdvertisement, now: Timestamps) -> bytes:
-        assert self._switch is not None
+        assert self.switch is not None
         advertisement = UnverifiedAdvertisement(
             subject=each.subject,
             right=each.right,
-            rtcert=self._rtcert_for(self._switch.name),
+            rtcert=self._rtcert_for(self.switch.name),
             sequence=self._next_sequence(),
             incarnation=self._incarnation,
             lease_ms=round(self._lease_s * MS),
@@ -489,12 +481,13 @@ class Attachment:
             each.advertisement_at_s = now_s + renew_after_s(self._lease_s)
 
     def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
-        if neighbour is self._switch:
-            self._say(Kind.REVOKED, wire)
+        if neighbour is self.switch:
+            self.say(Kind.REVOKED, wire)
 
-    def _say(self, kind: Kind, wire: bytes) -> None:
-        assert self._switch is not None
-        self.send(self.fragmenter.split(kind, wire, self.mtu))
+    def say(self, kind: Kind, wire: bytes, to: Name = ZERO) -> None:
+        """Send a statement to the switch, or through it to another node."""
+        assert self.switch is not None
+        self.send(self.fragmenter.split(kind, wire, self.hello_protocol.ports[self.switch.port].mtu, to))
 
     def _next_sequence(self) -> int:
         self._sequence += 1

@@ -78,4 +78,4 @@ class BlockingReaders:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second at which a reader may be too slow, or None."""
-        return min((block.since_s + self._lag_s for block in self._blocks.values()), default=None)
+        return min(block.since_s for block in self._blocks.values()) + self._lag_s if self._blocks else None

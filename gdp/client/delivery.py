@@ -57,6 +57,7 @@ class Ended(NamedTuple):
         known: the first sequence number of unknown fate: messages between the two were published, and did not arrive.
         resumes: the writer proxy ended without its reader's will: what it misses meanwhile is lost, and requested
             again.
+        is_restarted: it read another incarnation of the publisher: what was published in this one is lost.
     """
 
     number: int = 0
@@ -64,6 +65,7 @@ class Ended(NamedTuple):
     sequence: int = 0
     known: int = 0
     resumes: bool = False
+    is_restarted: bool = False
 
 
 NOT_BEGUN: Final = Ended()
@@ -122,9 +124,7 @@ class Delivery:
         self._gap_at = 0  # ... and the number that is missing
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
 
-    def begin_stream(
-        self, status: Heartbeat, start: StreamStart, before: Ended, *, is_latched: bool, is_restarted: bool
-    ) -> None:
+    def begin_stream(self, status: Heartbeat, start: StreamStart, before: Ended, *, is_latched: bool) -> None:
         """Begin at the publisher's start, and count what came between that and the last message read before."""
         expected = start.number
         if before.resumes or not is_latched:
@@ -132,7 +132,7 @@ class Delivery:
         begun, why = start.confirmed, LossReason.READER_RESTARTED
         if before.resumes and before.sequence:
             begun, why = before.sequence, LossReason.DETACHED
-        elif is_restarted:
+        elif before.is_restarted:
             begun, why = 1, LossReason.PUBLISHER_RESTARTED
         self._gone = status.gone if why is LossReason.DETACHED else ()
         self.sequence = begun or start.sequence
@@ -205,7 +205,8 @@ class Delivery:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next ``handle_timer``; infinity: none."""
-        return min(self._gap_until_s, self._held[0][0] if self._held else _NEVER)
+        held_s = self._held[0][0] if self._held else _NEVER
+        return held_s if held_s < self._gap_until_s else self._gap_until_s
 
     def finish(self) -> None:
         """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""

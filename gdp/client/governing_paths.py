@@ -205,7 +205,7 @@ class GoverningPaths:
         if self._queue.is_acknowledged:
             window, following = self._window, self._queue.sent[0]
             keeping_up = [each for each in names if each in window.readers.active]
-            return [each for each in keeping_up if not window.is_ahead(each, following)] or keeping_up or names
+            return [each for each in keeping_up if not window.readers.is_ahead(each, following)] or keeping_up or names
         readers, paths = self._readers, self._paths
         return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
 
@@ -218,12 +218,12 @@ class GoverningPaths:
         if len(frames) <= again or len(names) < 2 or not self._queue.is_acknowledged:
             return names
         number, _ = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
-        return [name for name in names if not window.is_ahead(name, number)]
+        return [name for name in names if not window.readers.is_ahead(name, number)]
 
     def _present(self) -> list[bytes]:
         """Return the readers whose nodes have not started again since they began to read. Without any, return all."""
         readers, is_former = self._readers, self._paths.is_former
-        everyone = list(readers)
+        everyone = readers.reading()
         if len(everyone) < 2:
             return everyone
         return [name for name in everyone if not is_former(name, readers[name].incarnation_id.started)] or everyone

@@ -1,4 +1,4 @@
-"""Identities of a writer and of a reader in one incarnation of their process, with the keys of each.
+"""Identities of a writer, of a reader and of another publisher in one incarnation of their process, with their keys.
 
 Sans-I/O.
 """
@@ -12,9 +12,11 @@ from itertools import count
 from gdp.client.control_keys import ControlKeys
 from gdp.client.redundancy import CopyBudget, parity_budget
 from gdp.crypto.envelope import Signer
+from gdp.message.reassembly import VerifiesDigest
+from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 
-__all__ = ["ReaderIdentity", "WriterIdentity"]
+__all__ = ["PublisherIdentity", "ReaderIdentity", "WriterIdentity"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,7 @@ class ReaderIdentity:
     Args:
         introduction: returns the wire form of the statement that proves the owner of the keys.
         note_numbers: numbers of the next control datagrams.
+        budget: memory of all its writer proxies.
     """
 
     name: Name
@@ -52,3 +55,19 @@ class ReaderIdentity:
     control_keys: ControlKeys = field(compare=False)
     introduction: Callable[[], bytes] = field(compare=False)
     note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)
+    budget: ReassemblyQuota = field(default_factory=ReassemblyQuota, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherIdentity:
+    """Identity of one incarnation of another publisher, as its advertisement names it.
+
+    Args:
+        key: that must have signed; None: a session secret authenticates its messages, which have no signature.
+        exchange: its X25519 key.
+    """
+
+    name: Name
+    incarnation: int
+    key: VerifiesDigest | None
+    exchange: bytes

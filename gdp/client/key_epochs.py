@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from gdp.client.identities import WriterIdentity
-from gdp.crypto.envelope import Opener, Sealer
+from gdp.crypto.envelope import KeyContext, Opener, Sealer
 from gdp.crypto.parity_seal import ParityOpener, ParitySealer
 from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.kinds import Kind
@@ -102,10 +102,7 @@ class KeyEpochs:
         return Sealer(
             secret=self.secret,
             epoch=self.epoch,
-            kind=kind,
-            source=writer.name,
-            incarnation=writer.incarnation,
-            destination=self._topic,
+            context=KeyContext(kind, writer.name, writer.incarnation, self._topic),
             signer=writer.signer,
             random_bytes=writer.random_bytes,
             address=self._address,

@@ -141,10 +141,6 @@ class Protection:
             return [*frames, *map(second_path_copy, frames)]
         return self._striper.stripe(frames, len(heartbeats) + self.repairs - repaired, self._readers.names())
 
-    def cancel(self, number: int) -> None:
-        """Drop the parity of a message that is cancelled."""
-        self.parity.cancel(number)
-
     def clear(self) -> None:
         """Drop copies and parity that wait: there is no reader any more."""
         self.copies.clear()

@@ -25,6 +25,7 @@ from gdp.client.unicast_stream import Party, PeerIncarnation
 from gdp.client.unicast_streams import UnicastStreams
 from gdp.control.join import Join
 from gdp.crypto.control_seal import topic_of
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header
 from gdp.message.loss import LossReason
@@ -88,13 +89,7 @@ class Publications:
         """Return the publisher of a name, or None."""
         return self._publishers.get(name)
 
-    def add(
-        self,
-        name: Name,
-        secrets: Secrets,
-        description: bytes,
-        settings: PublisherSettings,
-    ) -> Publisher:
+    def add(self, name: Name, secrets: Secrets, description: bytes, settings: PublisherSettings) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
             topic=name,
@@ -112,7 +107,7 @@ class Publications:
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
-        self._requests[name] = RequestStreams(public, partial(self._stream_to, name), paths_to)
+        self._requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to)
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -146,13 +141,16 @@ class Publications:
             if each is not None:
                 each.renew(secrets, now_s)
 
-    def send_to(self, service: Name, party: Name, message: bytes, now_s: float) -> None:
-        """Send a message to one other party of a service alone.
+    def stream_to(self, service: Name, party: Name, now_s: float) -> Publisher:
+        """Return the unicast stream to a party of a service.
 
         Raises:
-            LocalError: it is not connected, there are too many, or the message is above the limits.
+            LocalError: it is not connected, or there are too many.
         """
-        self._stream_to(service, party, now_s).publish(message)
+        streams, heard = self._private.get(service), self._heard(service, party)
+        if streams is None or heard is None:
+            raise LocalError(f"{party.short} is not heard on {service.short}")
+        return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
 
     def requests(self, service: Name) -> RequestStreams | None:
         """Return the requests to the servers of a name, or None."""
@@ -229,20 +227,10 @@ class Publications:
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due()]
-        times += [requests.get_timer() for requests in self._requests.values()]
-        return min((time for time in times if time is not None), default=None)
-
-    def _stream_to(self, service: Name, party: Name, now_s: float) -> Publisher:
-        """Return the unicast stream to a party of a service.
-
-        Raises:
-            LocalError: it is not connected, or there are too many.
-        """
-        streams, heard = self._private.get(service), self._heard(service, party)
-        if streams is None or heard is None:
-            raise LocalError(f"{party.short} is not heard on {service.short}")
-        return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
+        due_s = earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due())
+        if self._requests:
+            due_s = earliest(due_s, *(requests.get_timer() for requests in self._requests.values()))
+        return due_s
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

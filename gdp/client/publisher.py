@@ -28,6 +28,7 @@ from gdp.client.send_options import RELIABLE, PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
@@ -140,7 +141,7 @@ class Publisher:
         """Send nothing more of a message, and repair nothing; bundled ones are small, and leave."""
         number = self.queue.ledger.number_of(sequence)
         if number is not None and self._window.cancel(number):
-            self.protection.cancel(number)
+            self.protection.parity.cancel(number)
             self.acknowledgements.lose_ended([number])
             self.published(self)
 
@@ -330,12 +331,18 @@ class Publisher:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._window.next_probe(), self._window.readers.next_slow(), self.matched.next_silent()]
-        times += [self.protection.late.get_timer(), self.governing_paths.blocking.get_timer()]
-        times += [self._awaits_until_s] if self._awaits_until_s < _NEVER else []
-        if self.matched and self.queue.mtu is not None:
-            times += [self._heartbeats.get_timer(), self.protection.copies.get_timer()]
-        return min((time for time in times if time is not None), default=None)
+        window, protection = self._window, self.protection
+        due_s = earliest(
+            window.next_probe(),
+            window.readers.next_slow(),
+            self.matched.next_silent(),
+            protection.late.get_timer(),
+            self.governing_paths.blocking.get_timer(),
+            self._awaits_until_s if self._awaits_until_s < _NEVER else None,
+        )
+        if not self.matched or self.queue.mtu is None:
+            return due_s
+        return earliest(due_s, self._heartbeats.get_timer(), protection.copies.get_timer())
 
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.

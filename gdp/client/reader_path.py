@@ -276,6 +276,8 @@ class ReaderPaths:
     def governing(self, readers: Iterable[bytes], now_s: float) -> list[ReaderPath]:
         """Return the paths that govern what leaves for these readers: silent ones only if all are."""
         paths = [self._paths.get(reader) or self.path(reader, now_s) for reader in readers]
+        if len(paths) < 2:
+            return paths
         return [path for path in paths if not path.is_silent] or paths[:1]
 
     def fastest(self, readers: Iterable[bytes], now_s: float) -> list[bytes]:

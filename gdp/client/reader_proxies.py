@@ -53,6 +53,7 @@ class ReaderTimeouts(NamedTuple):
 TOPICS: Final = ReaderTimeouts(READER.lease_s, READER.lease_s, READER.refresh_s)
 # other replicas must not wait for a dead one
 CALLS: Final = ReaderTimeouts(READER.refresh_s, SERVER.lease_s, SERVER.refresh_s, fastest_governs=True)
+_NEVER: Final = float("inf")
 
 
 class _Incarnation:
@@ -137,7 +138,11 @@ class ReaderProxies:
         return self._readers[name]
 
     def __iter__(self) -> Iterator[bytes]:
-        return iter(list(self._readers))
+        return iter(self.reading())
+
+    def reading(self) -> list[bytes]:
+        """Return the names of those that are not suspended."""
+        return [*self._readers]
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
@@ -161,10 +166,14 @@ class ReaderProxies:
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
-        due_s = [reading.heard_s + READER.lease_s for reading in self._readers.values()]
-        for readers in (self._readers, self._suspended):
-            due_s += [each.behind_s + FORGET_S for each in readers.values() if each.behind_s is not None]
-        return min(due_s) + 0.001 if due_s else None
+        due_s = _NEVER
+        for readers, lease_s in ((self._readers, READER.lease_s), (self._suspended, _NEVER)):
+            for each in readers.values():
+                behind_s = _NEVER if each.behind_s is None else each.behind_s + FORGET_S
+                heard_s = each.heard_s + lease_s
+                earlier_s = behind_s if behind_s < heard_s else heard_s
+                due_s = earlier_s if earlier_s < due_s else due_s
+        return None if due_s == _NEVER else due_s + 0.001
 
     def suspend(self, name: bytes, now_s: float) -> None:
         """Suspend a silent reader, until it reports again or is forgotten."""

@@ -122,7 +122,11 @@ class Redundancy:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second at which a copy is due, or None."""
-        return min((waiting[0][0] for waiting in self._waiting if waiting), default=None)
+        due_s: float | None = None
+        for waiting in self._waiting:
+            if waiting and (due_s is None or waiting[0][0] < due_s):
+                due_s = waiting[0][0]
+        return due_s
 
     def clear(self) -> None:
         """Drop the copies that wait: there is no reader any more."""

@@ -16,6 +16,7 @@ from gdp.control.fragments import ControlReassembler
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -96,9 +97,8 @@ class RibHost:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer(), self.rib.get_timer(), self._channels.get_timer()]
-        times.append(self.diagnostics.get_timer())
-        return min((time for time in times if time is not None), default=None)
+        of_channels = earliest(self._channels.get_timer(), self.diagnostics.get_timer())
+        return earliest(self.attachment.get_timer(), self.rib.get_timer(), of_channels)
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
@@ -162,10 +162,6 @@ class RibHost:
             if outgoing.kind is Kind.RIB_REQUEST:
                 self._channels.send_query(outgoing.to, outgoing.statement, self._now_s)
             elif not self._channels.send_response(outgoing.to, outgoing.statement):
-                self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
+                self.attachment.say(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
         for each in self._channels.records_to_send():
-            self._send(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)
-
-    def _send(self, kind: Kind, statement: bytes, to: Name) -> None:
-        attachment = self.attachment
-        attachment.send(attachment.fragmenter.split(kind, statement, attachment.mtu, to))
+            self.attachment.say(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)

@@ -17,6 +17,7 @@ from collections import Counter, deque
 from typing import Final
 
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
+from gdp.client.deferred_messages import DeferredMessages
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.parity_sender import PARITY_BYTES, is_protected
 from gdp.client.send_options import PublisherSettings, SendOptions
@@ -50,6 +51,7 @@ class SendQueue:
         past: last numbers of an earlier one.
 
     Attributes:
+        deferred: messages that wait for the first reader.
         is_acknowledged: readers acknowledge what they get (reliable or latched topics).
         depth: latched messages for late joiners.
         awaited: messages kept for readers that waited before they were published.
@@ -76,8 +78,7 @@ class SendQueue:
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
-        self._deferred = deque[tuple[int, bytes, float | None]]()  # (sequence number, message, since when)
-        self._deferred_bytes = 0
+        self.deferred = DeferredMessages(self.ledger)
         self._gathered = Gathered()
         self.options = options = settings.options
         self.bytes_s: float | None = None
@@ -88,7 +89,7 @@ class SendQueue:
     @property
     def is_empty(self) -> bool:
         """Return whether nothing waits outside the window."""
-        return not (self._deferred or self._gathered or self._best_effort)
+        return not (self.deferred or self._gathered or self._best_effort)
 
     def has_space(self) -> bool:
         """Return whether a message may be added without evicting an unacknowledged one."""
@@ -97,20 +98,15 @@ class SendQueue:
     @property
     def oldest(self) -> int:
         """Return the first message number that is cached, or will be."""
-        oldest = self._window.oldest
+        oldest = self._window.cache.oldest
         return self.next_number if oldest is None else oldest
 
     @property
     def first_waiting(self) -> int:
         """Return the first sequence number that has no message number yet, or the next one."""
-        if self._deferred:
-            return self._deferred[0][0]
+        if self.deferred:
+            return self.deferred.sequence_of(0)
         return self._gathered.first if self._gathered else self.ledger.last + 1
-
-    @property
-    def deferred(self) -> int:
-        """Return how many latched messages wait for the first reader."""
-        return len(self._deferred)
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -123,7 +119,7 @@ class SendQueue:
     @property
     def sequences(self) -> tuple[int, int]:
         """Return the sequence numbers of what is sent next, and of what is cached first."""
-        waiting, oldest = self._best_effort.oldest, self._window.oldest
+        waiting, oldest = self._best_effort.oldest, self._window.cache.oldest
         if not self.is_acknowledged:
             sent = self.first_waiting if waiting is None else waiting.sequence
         else:
@@ -134,21 +130,6 @@ class SendQueue:
     def kept(self) -> int:
         """Return how many messages stay for readers that come later."""
         return max(self.depth, self.awaited)
-
-    def first_since(self, since_s: float) -> int:
-        """Return the number of the first message that is kept and was published since a second, or the next one."""
-        cached = self._window.first_since(since_s)
-        if cached is not None:
-            return cached
-        times = [added_s for _, _, added_s in self._deferred if added_s is None or added_s < since_s]
-        return self.next_number + len(times)
-
-    def begin_of(self, number: int) -> int:
-        """Return the sequence number with which a message begins, or will."""
-        waiting = number - self.next_number
-        if 0 < waiting < len(self._deferred):
-            return self._deferred[waiting][0]
-        return self.ledger.begin_of(number, self.first_waiting)
 
     def await_readers(self, awaited: int) -> None:
         """Change how many messages are kept for readers that waited before they were published."""
@@ -161,15 +142,14 @@ class SendQueue:
         Args:
             added_s: when it is published; None: it does not age.
         """
-        self._deferred.append((self.ledger.next(added_s), message, added_s))
-        self._deferred_bytes += len(message)
-        self._drop_deferred(self.kept, added_s)
+        self.deferred.add(message, added_s)
+        self.deferred.drop_beyond(self.kept, self.options, added_s, is_latched=self.depth > 0)
 
     def drop_aged(self, now_s: float) -> None:
         """Drop what is too old for late joiners."""
         if self.options.history_age_s is not None:
             self._window.release_aged(now_s)
-            self._drop_deferred(self.kept, now_s)
+            self.deferred.drop_beyond(self.kept, self.options, now_s, is_latched=self.depth > 0)
 
     def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None) -> None:
         """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
@@ -207,7 +187,8 @@ class SendQueue:
         self.seal_gathered()
         self._note_depth(depth)
         self._window.set_history_depth(self.kept, self.next_number)
-        self.drops[DropReason.NO_READER] += self._drop_deferred(self.kept)
+        dropped = self.deferred.drop_beyond(self.kept, self.options, None, is_latched=self.depth > 0)
+        self.drops[DropReason.NO_READER] += dropped
 
     def _note_depth(self, depth: int) -> None:
         self.depth = depth
@@ -217,9 +198,8 @@ class SendQueue:
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
-        while self._deferred:
-            sequence, message, added_s = self._deferred.popleft()
-            self._deferred_bytes -= len(message)
+        while self.deferred:
+            sequence, message, added_s = self.deferred.pop()
             self._seal_message(message, sequence, added_s=added_s)
 
     def seal_gathered(self) -> None:
@@ -255,10 +235,12 @@ class SendQueue:
         frames = self._best_effort.poll_frames(max(limit, 1))
         if not self._gathered or self._window.has_frames:
             frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
-        while self._gathered and len(frames) < limit and not self._has_unsent():
+        sends_window = self.is_acknowledged
+        while self._gathered and len(frames) < limit:
+            if self._window.sent[0] < self.next_number if sends_window else self._best_effort:
+                break
             self._seal_next()
             left = limit - len(frames)
-            sends_window = self.is_acknowledged
             frames += self._window.frames_to_send(now_s, left) if sends_window else self._best_effort.poll_frames(left)
         return frames
 
@@ -278,7 +260,11 @@ class SendQueue:
         Returns:
             the renumbering, or None if nothing is sealed again.
         """
-        cached = [(number, each) for number, each in self._window.cached() if isinstance(each, Sealed)]
+        cached = [
+            (number, each.frames)
+            for number, each in self._window.cache.messages.items()
+            if isinstance(each.frames, Sealed)
+        ]
         if not cached or not (is_forced or any(each.largest > mtu for _, each in cached)):
             return None
         first, end = cached[0][0], self.next_number
@@ -297,11 +283,9 @@ class SendQueue:
 
     def close(self) -> None:
         """Drop what waits; nothing is sent any more."""
-        self.drops[DropReason.NO_READER] += len(self._gathered) + self._drop_deferred(0)
+        deferred = self.deferred.drop_beyond(0, self.options, None, is_latched=self.depth > 0)
+        self.drops[DropReason.NO_READER] += len(self._gathered) + deferred
         self._gathered, self._best_effort = Gathered(), BestEffortQueue(self.options.deadline_s)
-
-    def _has_unsent(self) -> bool:
-        return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
 
     def _bundle_capacity(self) -> int:
         """Return the largest bundle in bytes.
@@ -342,24 +326,3 @@ class SendQueue:
         """Count messages that no reader gets."""
         self.drops[drop_reason] += messages
         self.ledger.lose(sequence, sequence + messages - 1, reason)
-
-    def _drop_deferred(self, keep: int, now_s: float | None = None) -> int:
-        """Drop the oldest deferred messages above ``keep``, and beyond the history; return how many."""
-        dropped = 0
-        while self._deferred and (len(self._deferred) > keep or self._is_beyond_history(now_s)):
-            sequence, message, _ = self._deferred.popleft()
-            self._deferred_bytes -= len(message)
-            self.ledger.lose(sequence, sequence, LossReason.NO_READER)
-            dropped += 1
-        return dropped
-
-    def _is_beyond_history(self, now_s: float | None) -> bool:
-        """Return whether the oldest deferred message is one too many by bytes, or too old."""
-        options, added_s = self.options, self._deferred[0][2]
-        if not self.depth and self._deferred_bytes > WINDOW_BYTES and len(self._deferred) > 1:
-            return True
-        if options.history_bytes is not None and self._deferred_bytes > options.history_bytes:
-            return True
-        if options.history_age_s is None or added_s is None or now_s is None:
-            return False
-        return now_s - added_s >= options.history_age_s

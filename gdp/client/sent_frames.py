@@ -113,8 +113,9 @@ class SentFrames:
                 if number in self._runs:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
-        self._add(frames[:again], names, now_s, is_repair=True)
-        self._add(frames[again:], names, now_s, is_repair=False)
+        if again:
+            self._add(frames[:again], names, now_s, is_repair=True)
+        self._add(frames[again:] if again else frames, names, now_s, is_repair=False)
         if not names or len(self._runs) > _MESSAGES_MAX:
             self._forget_places()
 
@@ -142,9 +143,8 @@ class SentFrames:
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
-        (number, part), (last_number, last_part) = (
-            NUMBER_AND_PART.unpack_from(frame, NUMBER_AT) for frame in (frames[0], frames[-1])
-        )
+        number, part = NUMBER_AND_PART.unpack_from(frames[0], NUMBER_AT)
+        last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
         if not is_repair and number == last_number and last_part - part == len(frames) - 1:  # of one message, in order
             self._runs.setdefault(number, []).append(_Run(part, last_part, place, False))
             return

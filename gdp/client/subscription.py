@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from gdp.client.delivery import Delivered, Ended
-from gdp.client.identities import ReaderIdentity
+from gdp.client.delivery import NOT_BEGUN, Delivered, Ended
+from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.client.unicast_stream import PeerIncarnation, UnicastReceiver, private_incarnation, private_name
+from gdp.client.unicast_stream import Party, PeerIncarnation, UnicastReceiver, private_incarnation, private_name
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.control.query import Response
 from gdp.errors import DropReason, StatementError
@@ -26,7 +26,6 @@ from gdp.frame.codec import Header
 from gdp.intervals import SERVER
 from gdp.message.loss import Losses, LossReason, LostRange
 from gdp.message.reassembly import VerifiesDigest
-from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.trust.advertisement import Advertisement
@@ -39,7 +38,6 @@ __all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
 
 ENDED_MAX: Final = 4_096  # closed writer proxies whose end is remembered
 ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may return
-_NOWHERE: Final = Ended()
 
 
 class Message(NamedTuple):
@@ -135,10 +133,10 @@ class Subscription:
         writer_proxy, topic = self.writer_proxies.get(source), self.topic.name
         if writer_proxy is None:
             return []
-        messages = [Message(topic, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
+        messages = [Message(topic, each, writer_proxy.description) for each in writer_proxy.delivery.poll()]
         private = self.private.get(source)
         if private is not None and writer_proxy.state is WriterProxyState.LIVE:
-            messages += [Message(topic, each, writer_proxy.description, True) for each in private.poll_delivered()]
+            messages += [Message(topic, each, writer_proxy.description, True) for each in private.delivery.poll()]
         return messages
 
 
@@ -165,7 +163,6 @@ class Subscriptions:
     def __init__(self, reader: ReaderIdentity, verifier: AdvertisementVerifier) -> None:
         self._reader = reader
         self._verifier = verifier
-        self._budget = ReassemblyQuota()
         self._by_name: dict[Name, Subscription] = {}
         self._routes: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as in frame headers
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
@@ -178,7 +175,7 @@ class Subscriptions:
     @property
     def held_bytes(self) -> int:
         """Return how much memory unfinished messages hold."""
-        return self._budget.held_bytes
+        return self._reader.budget.held_bytes
 
     def lost(self) -> Counter[LossReason]:
         """Return how many messages were lost, by reason."""
@@ -187,6 +184,31 @@ class Subscriptions:
     def get(self, name: Name) -> Subscription | None:
         """Return the subscription of a name, or None."""
         return self._by_name.get(name)
+
+    def writer_proxies(self) -> Iterator[WriterProxy]:
+        """Yield the writer proxies: one for each publisher of each topic, and those of unicast streams."""
+        for subscription in self:
+            yield from subscription.all()
+
+    def writer_proxies_of(self, topic: Name) -> list[WriterProxy]:
+        """Return the writer proxies of one topic, without unicast streams."""
+        subscription = self._by_name.get(topic)
+        return [] if subscription is None else list(subscription.writer_proxies.values())
+
+    def losses_of(self, name: Name) -> Losses:
+        """Return what was lost of a name's messages since it was subscribed."""
+        subscription = self._by_name.get(name)
+        return Losses() if subscription is None else subscription.losses()
+
+    def party_of(self, service: Name, party: bytes) -> Party | None:
+        """Return another party of a service that is connected now."""
+        subscription = self._by_name.get(service)
+        writer_proxy = None if subscription is None else subscription.writer_proxies.get(party)  # type: ignore[call-overload]
+        if subscription is None or writer_proxy is None:
+            return None
+        incarnation_id = PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation)
+        is_session = subscription.has_session(writer_proxy)
+        return Party(incarnation_id, writer_proxy.exchange, writer_proxy.second_path_s, is_session)
 
     def add(self, topic: Topic, right: Right, now_s: float, paths: int = 1, *, is_session: bool = False) -> None:
         """Read a name from now on.
@@ -251,7 +273,7 @@ class Subscriptions:
                 return change
             if is_restarted:
                 writer_proxy.delivery.finish()
-            rest = [Message(response.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
+            rest = [Message(response.name, each, writer_proxy.description) for each in writer_proxy.delivery.poll()]
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 
@@ -286,8 +308,8 @@ class Subscriptions:
         return [writer_proxy for subscription in self._by_name.values() for writer_proxy in self._end_all(subscription)]
 
     def _open(self, subscription: Subscription, advertisement: Advertisement, now_s: float) -> list[WriterProxy]:
-        topic, reader, party = subscription.topic, self._reader, advertisement.node
-        ended = self._ended.get(topic.name + _key(party, advertisement.incarnation)) or _NOWHERE
+        topic, party = subscription.topic, advertisement.node
+        ended = self._ended.get(topic.name + _key(party, advertisement.incarnation)) or NOT_BEGUN
         incarnation_id, before = subscription.absent.get(party, (advertisement.incarnation, ended))
         if incarnation_id == advertisement.incarnation:
             ended = before
@@ -296,16 +318,13 @@ class Subscriptions:
             subscription.forget_absent(party, LossReason.PUBLISHER_RESTARTED)
         writer_proxy = WriterProxy(
             topic=topic.name,
-            reader=reader,
-            publisher=party,
-            incarnation=advertisement.incarnation,
-            writer=advertisement.member.key,
-            exchange=advertisement.exchange,
+            reader=self._reader,
+            publisher=PublisherIdentity(
+                party, advertisement.incarnation, advertisement.member.key, advertisement.exchange
+            ),
             secrets=topic.secrets,
-            budget=self._budget,
             now_s=now_s,
-            ended=ended,
-            restarted=incarnation_id != advertisement.incarnation,
+            before=ended._replace(is_restarted=incarnation_id != advertisement.incarnation),
             waits_since_s=subscription.since_s,
         )
         subscription.writer_proxies[party] = writer_proxy
@@ -323,16 +342,15 @@ class Subscriptions:
         subscription, writer = route.subscription, route.writer
         writer_proxy = subscription.private.get(writer)
         if writer_proxy is None:
-            public, ended = subscription.writer_proxies[writer], self._ended.get(route.stream) or _NOWHERE
+            public, ended = subscription.writer_proxies[writer], self._ended.get(route.stream) or NOT_BEGUN
             writer_proxy = subscription.private[writer] = UnicastReceiver(
                 name=route.stream,
                 reader=self._reader,
                 public=public,
                 verifier=route.verifier,
                 secrets=subscription.topic.secrets,
-                budget=self._budget,
                 now_s=now_s,
-                ended=ended,
+                before=ended,
             )
             writer_proxy.paths = public.paths
         return writer_proxy

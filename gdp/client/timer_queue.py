@@ -35,9 +35,10 @@ class TimerQueue(Generic[T]):
 
     def next_due(self) -> float | None:
         """Return the monotonic second at which the first is due, or None."""
-        for each in self._touched:
-            self._queue.put(each, each.get_timer())
-        self._touched.clear()
+        if self._touched:
+            for each in self._touched:
+                self._queue.put(each, each.get_timer())
+            self._touched.clear()
         return self._queue.next_due()
 
     def poll_due(self, now_s: float) -> list[T]:

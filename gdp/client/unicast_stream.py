@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from gdp.client.delivery import Ended
-from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.identities import PublisherIdentity, ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
@@ -33,7 +33,6 @@ from gdp.frame.codec import Header
 from gdp.intervals import FORGET_S
 from gdp.limits import MTU_MIN_BYTES, PRIVATE_WAIT_BYTES
 from gdp.message.reassembly import VerifiesDigest
-from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 
 __all__ = [
@@ -110,12 +109,11 @@ class UnicastStream(Publisher):
         mtu: int | None,
         settings: PublisherSettings,
         past: SequenceState,
-        now_s: float,
         reader_paths: ReaderPaths | None = None,
     ) -> None:
         self.reader = party.incarnation_id
         self._exchange = party.exchange
-        self._touched_s = now_s
+        self._touched_s = float("-inf")
         own = PeerIncarnation(writer.name, writer.incarnation)
         name = private_name(service, own, self.reader, is_session=party.is_session)
         source = replace(writer, incarnation=private_incarnation(name))
@@ -133,7 +131,6 @@ class UnicastStream(Publisher):
             address=self.reader.name,
             reader_paths=reader_paths,
         )
-        self.note_second_path(party.second_path_s)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def note_second_path(self, came_s: float) -> None:
@@ -173,7 +170,7 @@ class UnicastReceiver(WriterProxy):
         public: the writer proxy of the same writer's stream to all.
         verifier: of the writer's signatures; None: a session secret authenticates the stream.
         secrets: of the service.
-        ended: where the same stream ended before, in this incarnation.
+        before: where the same stream ended before, in this incarnation.
     """
 
     def __init__(
@@ -184,9 +181,8 @@ class UnicastReceiver(WriterProxy):
         public: WriterProxy,
         verifier: VerifiesDigest | None,
         secrets: Secrets,
-        budget: ReassemblyQuota,
         now_s: float,
-        ended: Ended,
+        before: Ended,
     ) -> None:
         self._public = public
         self._shared: bytes | None = None  # with the writer, if a session secret authenticates the stream
@@ -196,14 +192,10 @@ class UnicastReceiver(WriterProxy):
         super().__init__(
             topic=name,
             reader=reader,
-            publisher=public.publisher,
-            incarnation=private_incarnation(name),
-            writer=verifier,
-            exchange=public.exchange,
+            publisher=PublisherIdentity(public.publisher, private_incarnation(name), verifier, public.exchange),
             secrets=secrets,
-            budget=budget,
             now_s=now_s,
-            ended=ended,
+            before=before,
             introduces=False,
         )
 

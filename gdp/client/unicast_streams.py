@@ -109,7 +109,6 @@ class UnicastStreams:
                 settings=self._settings,
                 reader_paths=self._reader_paths,
                 past=past,
-                now_s=now_s,
             )
             stream.published = self._published
         stream.note_second_path(party.second_path_s)

@@ -25,8 +25,8 @@ from typing import Final
 
 from gdp.client.ack_nack_schedule import AckNackSchedule
 from gdp.client.ack_nack_sealer import AckNackSealer
-from gdp.client.delivery import NOT_BEGUN, Delivered, Delivery, Ended
-from gdp.client.identities import ReaderIdentity
+from gdp.client.delivery import NOT_BEGUN, Delivery, Ended
+from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
@@ -45,8 +45,7 @@ from gdp.message.acknack import FRAMES_MASK, AckNack, AckNackFlag, MissingRange
 from gdp.message.frame_recovery import FrameRecovery
 from gdp.message.heartbeat import Heartbeat
 from gdp.message.late_repairs import LateRepairs
-from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
-from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.reassembly import ReassembledMessage, Reassembler
 from gdp.message.receipts import RECEIPTS_MASK
 from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.message.striping import StripedPaths
@@ -73,12 +72,9 @@ class WriterProxy:
     """Reader's state of one incarnation of one publisher of a topic.
 
     Args:
-        writer: the key that must have signed; None: ``secrets`` are of a session, and messages have no signature.
-        exchange: the publisher's X25519 key, as its advertisement names it.
-        budget: memory of all writer proxies.
-        ended: where an earlier writer proxy of the same ended. A latched topic's last messages come again, as its
+        secrets: of the topic, or of a session.
+        before: where an earlier writer proxy of the same ended. A latched topic's last messages come again, as its
             publisher announces in a new Heartbeat, unless this writer proxy resumes that one.
-        restarted: this reader read another incarnation of the publisher before: what was published in this one is lost.
         waits_since_s: when the topic was subscribed.
         introduces: the publisher gets the reader's key by an introduction, and announces where to begin. Else it knows
             the key already, and the stream is reliable and begins at the first message.
@@ -93,7 +89,7 @@ class WriterProxy:
         second_path_s: when a frame of the publisher last came by a second path.
 
     Raises:
-        StatementError: MALFORMED, ``exchange`` is no key.
+        StatementError: MALFORMED, the publisher's ``exchange`` is no key.
     """
 
     def __init__(
@@ -101,49 +97,35 @@ class WriterProxy:
         *,
         topic: Name,
         reader: ReaderIdentity,
-        publisher: Name,
-        incarnation: int,
-        writer: VerifiesDigest | None,
-        exchange: bytes,
+        publisher: PublisherIdentity,
         secrets: Secrets,
-        budget: ReassemblyQuota,
         now_s: float,
-        ended: Ended = NOT_BEGUN,
-        restarted: bool = False,
+        before: Ended = NOT_BEGUN,
         waits_since_s: float | None = None,
         introduces: bool = True,
     ) -> None:
-        self.publisher = publisher
-        self.incarnation = incarnation
+        self.publisher = name = publisher.name
+        self.incarnation = incarnation = publisher.incarnation
         self.topic = topic
-        self.exchange = exchange
+        self.exchange = publisher.exchange
         self._reader = reader
-        self._keys = Openers(secrets, publisher, incarnation, topic, is_signed=writer is not None)
-        self._before = ended
-        self._is_restarted = restarted
+        self._keys = Openers(secrets, name, incarnation, topic, is_signed=publisher.key is not None)
+        self._before = before
         self._waits_since_s = now_s if waits_since_s is None else waits_since_s
         self._described = 0  # number of the Heartbeat that brought it
-        self.recovery = FrameRecovery(publisher, budget)
+        self.recovery = FrameRecovery(name, reader.budget)
         self._sealer = AckNackSealer(
-            topic=topic,
-            reader=reader,
-            publisher=publisher,
-            incarnation=incarnation,
-            exchange=exchange,
-            secrets=secrets,
-            introduces=introduces,
-            now_s=now_s,
+            topic=topic, reader=reader, publisher=publisher, secrets=secrets, introduces=introduces, now_s=now_s
         )
-        self._data = Reassembler(
-            publisher, partial(self._keys.opener, Kind.DATA), writer, budget, head_bytes=SEQUENCE_BYTES
-        )
-        self._status = Reassembler(publisher, partial(self._keys.opener, Kind.HEARTBEAT), writer, budget)
+        key, budget, opener = publisher.key, reader.budget, self._keys.opener
+        self._data = Reassembler(name, partial(opener, Kind.DATA), key, budget, head_bytes=SEQUENCE_BYTES)
+        self._status = Reassembler(name, partial(opener, Kind.HEARTBEAT), key, budget)
         self.schedule = AckNackSchedule(self._data, now_s)
         self._copies: SecondCopies | StripedPaths | None = None
         self._deferred = DeferredRequests()
         self._late = LateRepairs(self._data, self._lag_s, self.recovery.awaited_s)
         self.delivery = Delivery(
-            publisher, incarnation, budget, data=self._data, recovery=self.recovery, late=self._late, lag_s=self._lag_s
+            name, incarnation, budget, data=self._data, recovery=self.recovery, late=self._late, lag_s=self._lag_s
         )
         self.losses = self.delivery.losses
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
@@ -155,7 +137,7 @@ class WriterProxy:
         if not introduces:
             self.state = WriterProxyState.LIVE
             self._set_reliable(_WAITING)
-            self.delivery.begin_at(max(ended.number, 1), max(ended.sequence, 1))
+            self.delivery.begin_at(max(before.number, 1), max(before.sequence, 1))
             self.schedule.due_s = now_s + READER.refresh_s
 
     @property
@@ -233,9 +215,11 @@ class WriterProxy:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
-        expiries = [self._status.next_expiry(), self._data.next_expiry()]
         due_s = min(self.schedule.due_s, self.delivery.get_timer(), self._late.get_timer(), self.recovery.next_expiry())
-        return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
+        for expiry in (self._status.next_expiry(), self._data.next_expiry()):
+            if expiry is not None and expiry < due_s:
+                due_s = expiry
+        return due_s
 
     def is_report_due(self, now_s: float) -> bool:
         """Return whether ``control_to_send`` has a report now."""
@@ -269,10 +253,6 @@ class WriterProxy:
             (self._data.frames - self.recovery.recovered) & FRAMES_MASK, schedule.receipts & RECEIPTS_MASK,
         )  # fmt: skip
         return self._over_paths(self._sealer.seal_all(acknack, now_s))
-
-    def poll_delivered(self) -> list[Delivered]:
-        """Remove and return the messages that are ready, in order."""
-        return self.delivery.poll()
 
     def close(self) -> list[bytes]:
         """Release all memory; return the frames of the goodbye."""
@@ -391,9 +371,7 @@ class WriterProxy:
             if start is None or start.incarnation != self._reader.incarnation:
                 return
             is_latched = bool(reassembled.flags & _LATCHED)
-            self.delivery.begin_stream(
-                status, start, self._before, is_latched=is_latched, is_restarted=self._is_restarted
-            )
+            self.delivery.begin_stream(status, start, self._before, is_latched=is_latched)
             self.state = WriterProxyState.LIVE
         if status.description and reassembled.number > self._described:
             self.description, self._described = status.description, reassembled.number

@@ -43,19 +43,22 @@ from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port, split_host_port
-from gdp.intervals import ADVERTISEMENT, NEIGHBOUR
-from gdp.limits import (
-    COST_AUTO,
-    COST_DEFAULT,
+from gdp.intervals import (
+    ADVERTISEMENT,
     DETECT_MULTIPLIER,
     KEEPALIVE_MS,
     LEASE_MAX_S,
     LEASE_MIN_S,
+    NEIGHBOUR,
+    SCAPY_KEEPALIVE_MS,
+)
+from gdp.limits import (
+    COST_AUTO,
+    COST_DEFAULT,
     RELAY_RATE_MAX,
     RELAY_RATE_MIN,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
-    SCAPY_KEEPALIVE_MS,
     TABLE_MAX,
 )
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT

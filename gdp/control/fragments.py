@@ -9,7 +9,6 @@ fragments arrive at once.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -80,18 +79,17 @@ class _PartialStatement:
 
 
 class ControlReassembler:
-    """Reassembly of statements of any source."""
+    """Reassembly of statements of any source.
+
+    Attributes:
+        unfinished: the unfinished statements, keyed by (origin, kind, incarnation, number).
+    """
 
     def __init__(self) -> None:
         self._budget = ReassemblyQuota(CONTROL_JOIN_BYTES, CONTROL_JOIN_SOURCE_BYTES)
-        self._unfinished: dict[_Key, _PartialStatement] = {}
+        self.unfinished: dict[_Key, _PartialStatement] = {}
         self._by_source: dict[bytes, dict[_Key, None]] = {}  # in order of their first fragment
         self.drops: Counter[DropReason] = Counter()
-
-    @property
-    def unfinished(self) -> Mapping[_Key, object]:
-        """Return the unfinished statements, keyed by (origin, kind, incarnation, number)."""
-        return self._unfinished
 
     @property
     def held_bytes(self) -> int:
@@ -117,10 +115,10 @@ class ControlReassembler:
         self.drop_expired(now_s)
         origin = header.source + via
         key = (origin, header.kind, header.incarnation, header.number)
-        waiting = self._unfinished.get(key)
+        waiting = self.unfinished.get(key)
         if waiting is None:
             self._reserve(origin, _COST_BYTES)
-            waiting = self._unfinished[key] = _PartialStatement(header.parts, now_s)
+            waiting = self.unfinished[key] = _PartialStatement(header.parts, now_s)
             self._by_source.setdefault(origin, {})[key] = None
         if waiting.parts != header.parts:
             raise FrameError(DropReason.BAD_PARTS, "the number of parts changed")
@@ -130,7 +128,7 @@ class ControlReassembler:
             self._drop(key)
             raise FrameError(DropReason.TOO_BIG, "statement")
         self._reserve(origin, len(payload))
-        if key not in self._unfinished:  # it was the oldest itself
+        if key not in self.unfinished:  # it was the oldest itself
             self._budget.release(origin, len(payload))
             raise FrameError(DropReason.MEMORY_FULL, "statements")
         waiting.held_bytes += len(payload)
@@ -142,8 +140,8 @@ class ControlReassembler:
 
     def drop_expired(self, now_s: float) -> None:
         """Drop statements that waited longer than ``CONTROL_PATIENCE_S``."""
-        while self._unfinished:
-            key, oldest = next(iter(self._unfinished.items()))
+        while self.unfinished:
+            key, oldest = next(iter(self.unfinished.items()))
             if now_s - oldest.begun_s < CONTROL_PATIENCE_S:
                 break
             self._drop(key)
@@ -153,14 +151,14 @@ class ControlReassembler:
         """Reserve memory; where none is left, evict the oldest statement of this source or of all."""
         while not self._budget.reserve(source, size):
             mine = self._by_source.get(source)
-            held = sum(self._unfinished[key].held_bytes for key in mine or ())
+            held = sum(self.unfinished[key].held_bytes for key in mine or ())
             is_mine = held + size > CONTROL_JOIN_SOURCE_BYTES
-            self._drop(next(iter(mine if mine and is_mine else self._unfinished)))
+            self._drop(next(iter(mine if mine and is_mine else self.unfinished)))
             self.drops[DropReason.MEMORY_FULL] += 1
 
     def _drop(self, key: _Key) -> None:
         source = key[0]
-        self._budget.release(source, self._unfinished.pop(key).held_bytes)
+        self._budget.release(source, self.unfinished.pop(key).held_bytes)
         del self._by_source[source][key]
         if not self._by_source[source]:
             del self._by_source[source]

@@ -17,8 +17,7 @@ from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.control.settings import NodeSettings
-from gdp.intervals import NEVER_S
-from gdp.limits import HELLO_IDLE
+from gdp.intervals import HELLO_IDLE, NEVER_S
 from gdp.names import Name
 
 __all__ = ["LivenessMonitor"]

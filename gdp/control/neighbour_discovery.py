@@ -52,8 +52,8 @@ from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
-from gdp.intervals import UPKEEP_S
-from gdp.limits import COST_AUTO, HELLO_IDLE, MTU_MIN_BYTES
+from gdp.intervals import HELLO_IDLE, UPKEEP_S
+from gdp.limits import COST_AUTO, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
@@ -62,6 +62,7 @@ __all__ = ["HelloProtocol"]
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
+_NEVER: Final = float("inf")
 
 
 class HelloProtocol:
@@ -101,7 +102,7 @@ class HelloProtocol:
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
         self._incarnation = settings.incarnation
-        self._due_s = float("inf")  # when the next call was requested
+        self._due_s = _NEVER  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
         self._digest_for = digest_for
         self._incarnation_id = settings.incarnation_id
@@ -395,7 +396,7 @@ class HelloProtocol:
             port.nonce, port.exchange_key = _new_session(self._random_bytes)
             port.ended.clear()
             port.joins.clear()
-            port.answer_at_s, port.credit_bytes = float("inf"), 0
+            port.answer_at_s, port.credit_bytes = _NEVER, 0
             port.hurry(now_s)
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
@@ -411,7 +412,7 @@ class HelloProtocol:
     def drop_silent(self, now_s: float) -> list[Change]:
         """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
         self.liveness.note_call(self._due_s, now_s)
-        self._due_s, self._next_s = float("inf"), None
+        self._due_s, self._next_s = _NEVER, None
         self.reception.drop_expired(now_s)
         changes: list[Change] = []
         for port in self.ports.values():
@@ -463,8 +464,9 @@ class HelloProtocol:
         """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
         if self._next_s is None:
             self._next_s = self._find_next()
-        self._due_s = min(self._next_s, self.reception.reply_at_s)
-        return None if self._due_s == float("inf") else self._due_s
+        reply_at_s = self.reception.reply_at_s
+        self._due_s = reply_at_s if reply_at_s < self._next_s else self._next_s
+        return None if self._due_s == _NEVER else self._due_s
 
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
@@ -499,7 +501,7 @@ class HelloProtocol:
 
     def _answer(self, port: HelloPort, now_s: float) -> list[bytes]:
         """Return a hello for the candidates, or nothing if they have sent fewer bytes."""
-        port.answer_at_s = float("inf")
+        port.answer_at_s = _NEVER
         frames = self._hello(port, now_s)
         size = sum(map(len, frames))
         port.owes_answer = size > port.credit_bytes
@@ -510,7 +512,7 @@ class HelloProtocol:
 
     def _hello(self, port: HelloPort, now_s: float) -> list[bytes]:
         port.sequence += 1
-        port.said_s, port.answer_at_s = now_s, float("inf")
+        port.said_s, port.answer_at_s = now_s, _NEVER
         heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(

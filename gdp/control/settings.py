@@ -9,8 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gdp.control.hello import Timing
-from gdp.intervals import ADVERTISEMENT, NEIGHBOUR
-from gdp.limits import DETECT_MULTIPLIER, KEEPALIVE_MS
+from gdp.intervals import ADVERTISEMENT, DETECT_MULTIPLIER, KEEPALIVE_MS, NEIGHBOUR
 
 __all__ = ["NodeSettings"]
 

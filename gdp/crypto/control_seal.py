@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
@@ -28,7 +28,15 @@ from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["JUMP_MAX", "ControlOpener", "ControlReplayWindow", "ControlSealer", "control_key", "topic_of"]
+__all__ = [
+    "JUMP_MAX",
+    "ControlContext",
+    "ControlOpener",
+    "ControlReplayWindow",
+    "ControlSealer",
+    "control_key",
+    "topic_of",
+]
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
@@ -36,6 +44,17 @@ _INCARNATION: Final = struct.Struct("!Q")
 JUMP_MAX: Final = 4_096
 _NUMBERS_PER_S: Final = 100_000  # more than one process sends
 _BODY_AT: Final = HEADER_BYTES + NAME_BYTES
+
+
+class ControlContext(NamedTuple):
+    """What a key is bound to: control messages about one topic from one node's incarnation to another's."""
+
+    kind: int
+    source: bytes
+    incarnation: int
+    destination: bytes
+    destination_incarnation: int
+    topic: bytes
 
 
 def control_key(
@@ -67,26 +86,15 @@ def topic_of(header: Header, frame: bytes) -> bytes:
 
 
 class ControlSealer:
-    """Seals control messages of one source's incarnation about one topic to one incarnation of a destination.
+    """Seals the control messages of one context.
 
     Args:
         key: 32 bytes.
         numbers: rising, from 1 on, and one iterator for all sealers of the source's incarnation: some share a key.
     """
 
-    def __init__(
-        self,
-        *,
-        key: bytes,
-        epoch: int,
-        kind: int,
-        source: bytes,
-        incarnation: int,
-        destination: bytes,
-        topic: bytes,
-        destination_incarnation: int,
-        numbers: Iterator[int],
-    ) -> None:
+    def __init__(self, *, key: bytes, epoch: int, context: ControlContext, numbers: Iterator[int]) -> None:
+        kind, source, incarnation, destination, destination_incarnation, topic = context
         self._aead = AESGCMSIV(key)
         self._header = Header(kind, Flag.LAST, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source)
         self._topic = topic

@@ -22,7 +22,7 @@ import hashlib
 import struct
 from collections.abc import Callable, Sequence
 from itertools import islice
-from typing import Final, Protocol, overload
+from typing import Final, NamedTuple, Protocol, overload
 
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
@@ -43,6 +43,7 @@ __all__ = [
     "SEAL_BYTES",
     "SIGNATURE_BYTES",
     "TAG_BYTES",
+    "KeyContext",
     "MessageKeys",
     "Opener",
     "Sealed",
@@ -71,6 +72,15 @@ class Signer(Protocol):
 
     def sign_digest(self, digest: bytes) -> bytes:
         """Return 64 bytes, r || s, over a SHA-256 digest."""
+
+
+class KeyContext(NamedTuple):
+    """What a key is bound to: one kind of message of one source's incarnation towards one destination."""
+
+    kind: int
+    source: bytes
+    incarnation: int
+    destination: bytes
 
 
 def seal_key(secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> bytes:
@@ -140,13 +150,13 @@ def digest_of(header: Header, salt: bytes) -> hashlib._Hash:
 
 
 class Sealer:
-    """Seals one kind of message of one source towards one destination, under one epoch's key.
+    """Seals the messages of one context, under one epoch's key.
 
     Args:
         random_bytes: the system's randomness, drawn for each message and never ahead: values drawn before a machine was
             copied are no longer random.
         signer: None: the messages are not signed, which is for a session secret alone.
-        address: the destination in the headers; None: ``destination``, which the key is bound to.
+        address: the destination in the headers; None: that of the context.
     """
 
     def __init__(
@@ -154,18 +164,16 @@ class Sealer:
         *,
         secret: bytes,
         epoch: int,
-        kind: int,
-        source: bytes,
-        incarnation: int,
-        destination: bytes,
+        context: KeyContext,
         signer: Signer | None,
         random_bytes: Callable[[int], bytes],
         address: bytes | None = None,
     ) -> None:
-        self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
+        self._keys = MessageKeys(seal_key(secret, *context))
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._random_bytes = random_bytes
+        kind, source, incarnation, destination = context
         self._fixed = (epoch, kind, incarnation, destination if address is None else address, source)
         self._last_number = -1
 

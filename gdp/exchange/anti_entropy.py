@@ -127,6 +127,8 @@ class AntiEntropy(Generic[P]):
         self._drawn: dict[bytes, _Drawn] = {}
         self._news: dict[tuple[bytes, bytes], None] = {}
         self._out: list[tuple[P, SyncMessage]] = []
+        self._is_moved = True  # something may be due at another time than ``_due_s``
+        self._due_s: float | None = None
         self.compared: set[bytes] = set()
 
     @property
@@ -140,10 +142,12 @@ class AntiEntropy(Generic[P]):
         Args:
             name: whose bounds it uses; one node may be several peers.
         """
+        self._is_moved = True
         self._peers[peer] = _Peer(name, self._soon(name, now_s))
 
     def remove_peer(self, peer: P) -> None:
         """Forget a peer that is gone, with what was not sent yet."""
+        self._is_moved = True
         self._peers.pop(peer, None)
         self._out = [each for each in self._out if each[0] != peer]
 
@@ -154,11 +158,13 @@ class AntiEntropy(Generic[P]):
 
     def announce(self, now_s: float) -> None:
         """Send totals to all peers now."""
+        self._is_moved = True
         for state in self._peers.values():
             state.total_at_s = now_s
 
     def took(self, peer: P, now_s: float) -> None:
         """Note that an item of a peer was news which was not pushed; the others get totals after a delay."""
+        self._is_moved = True
         for other, state in self._peers.items():
             if other != peer:
                 state.total_at_s = min(max(state.total_at_s, now_s), now_s + self._pace.fetch_s)
@@ -167,6 +173,7 @@ class AntiEntropy(Generic[P]):
 
     def receive_message(self, peer: P, message: SyncMessage, now_s: float) -> tuple[bytes, ...]:
         """Handle a peer's message; return the items in it, for the caller to verify and to store."""
+        self._is_moved = True
         state = self._peers[peer]
         fetch = state.fetch
         if not message.is_last or (fetch is not None and not self._is_barren(fetch)):
@@ -188,6 +195,7 @@ class AntiEntropy(Generic[P]):
 
     def handle_timer(self, now_s: float) -> None:
         """Send totals and replies that are due; give up fetches without progress."""
+        self._is_moved = True
         for peer, state in self._peers.items():
             fetch = state.fetch
             if fetch is not None and self._end_of(fetch) <= now_s:
@@ -200,6 +208,11 @@ class AntiEntropy(Generic[P]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
+        if self._is_moved:
+            self._due_s, self._is_moved = self._find_next(), False
+        return self._due_s
+
+    def _find_next(self) -> float | None:
         times: list[float] = []
         fetched = self._fetched()
         for state in self._peers.values():

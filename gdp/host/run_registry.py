@@ -95,10 +95,14 @@ class Record:
 
 
 class Run:
-    """An active run: a scratch directory of its own, and a record that grows with its resources."""
+    """An active run: a scratch directory of its own, and a record that grows with its resources.
+
+    Attributes:
+        record: the resources recorded until now.
+    """
 
     def __init__(self, record: Record, path: Path, directory: Path) -> None:
-        self._record = record
+        self.record = record
         self._path = path
         self.directory = directory
         self._save()
@@ -108,38 +112,33 @@ class Run:
     def resumed(cls, record: Record, path: Path) -> Run:
         """Return the run of an existing record."""
         run = cls.__new__(cls)
-        run._record, run._path, run.directory = record, path, Path(record.files[0])
+        run.record, run._path, run.directory = record, path, Path(record.files[0])
         return run
 
     @property
     def id(self) -> str:
         """Return the id of the run, six hex digits."""
-        return self._record.run
-
-    @property
-    def record(self) -> Record:
-        """Return the resources recorded until now."""
-        return self._record
+        return self.record.run
 
     def plan_namespace(self, path: Path) -> None:
         """Record a namespace that is about to be made."""
-        self._record.namespaces.append(str(path))
+        self.record.namespaces.append(str(path))
         self._save()
 
     def plan_cgroup(self, name: str) -> None:
         """Record a control group that is about to be made."""
-        self._record.cgroups.append(name)
+        self.record.cgroups.append(name)
         self._save()
 
     def plan_mount(self, path: Path) -> None:
         """Record a path that a file system is about to be mounted on."""
-        self._record.mounts.append(str(path))
+        self.record.mounts.append(str(path))
         self._save()
 
     def note_process(self, pid: int) -> None:
         """Record a process that was just started as the leader of its group, unless it has already ended."""
         with suppress(ProcessLookupError):
-            self._record.processes.append(Process.from_pid(pid))
+            self.record.processes.append(Process.from_pid(pid))
             self._save()
 
     def retain(self, *, passive: bool = False) -> None:
@@ -148,13 +147,13 @@ class Run:
         Args:
             passive: the run has namespaces and devices only; it is dead after a reboot, and never before.
         """
-        self._record.kept = True
-        self._record.passive = passive
+        self.record.kept = True
+        self.record.passive = passive
         self._save()
 
     def end(self) -> None:
         """Remove everything that the record names, and the record."""
-        _take_down(self._record, self._path)
+        _take_down(self.record, self._path)
 
     def _save(self) -> None:
         fresh = self._path.with_suffix(_FRESH)
@@ -164,7 +163,7 @@ class Run:
             _make_directory(fresh.parent)
             descriptor = os.open(fresh, _WRITE, 0o600)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(self._record.to_text())
+            file.write(self.record.to_text())
         fresh.replace(self._path)
 
 

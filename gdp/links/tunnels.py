@@ -125,6 +125,9 @@ class Tunnels:
     Args:
         underlays: a WireGuard device for each uplink.
         relay_rate: bytes per second into each tunnel; None: unlimited.
+
+    Attributes:
+        underlays: the WireGuard devices, by uplink.
     """
 
     def __init__(
@@ -139,7 +142,7 @@ class Tunnels:
         self._me = identity.name
         self._switch = switch
         self._runtime = runtime
-        self._underlays = underlays
+        self.underlays = underlays
         self._relay_rate = relay_rate
         self._tunnels: dict[TunnelId, Tunnel] = {}
         self._device_due_s = float("-inf")
@@ -153,11 +156,6 @@ class Tunnels:
             runtime.after_receive(self._look_at_polled)
 
     @property
-    def underlays(self) -> tuple[WireGuardDevice, ...]:
-        """Return the WireGuard devices, by uplink."""
-        return self._underlays
-
-    @property
     def all(self) -> Mapping[TunnelId, Tunnel]:
         """Return the tunnels that exist."""
         return MappingProxyType(self._tunnels)
@@ -169,7 +167,7 @@ class Tunnels:
 
     def has_route(self, uplink: int) -> Callable[[Endpoint], bool]:
         """Return the function that says whether an uplink has a route to an endpoint."""
-        return partial(_has_route, fwmark=self._underlays[uplink].fwmark)
+        return partial(_has_route, fwmark=self.underlays[uplink].fwmark)
 
     def open(
         self,
@@ -187,7 +185,7 @@ class Tunnels:
             endpoint: to dial; None: the peer dials this switch.
             now_s: monotonic seconds.
         """
-        underlay = self._underlays[tunnel.uplink]
+        underlay = self.underlays[tunnel.uplink]
         ifname, key = tunnel_ifname(self._me, tunnel), record.keys[tunnel.peer_uplink]
         if not self._make_way(tunnel, key, now_s):
             return False
@@ -236,7 +234,7 @@ class Tunnels:
 
     def dial(self, tunnel: TunnelId, endpoint: Endpoint | None) -> None:
         """Send a handshake to an endpoint, or to the last one again."""
-        found, device = self._tunnels[tunnel], self._underlays[tunnel.uplink]
+        found, device = self._tunnels[tunnel], self.underlays[tunnel.uplink]
         found.dialled_s = time.monotonic()
         try:
             self._set_preshared(device, found)
@@ -250,7 +248,7 @@ class Tunnels:
         """Send nothing to a peer until it sends, or is dialled."""
         for tunnel, found in self._tunnels.items():
             if tunnel.peer == peer and found.is_direct:
-                device = self._underlays[tunnel.uplink]
+                device = self.underlays[tunnel.uplink]
                 try:
                     device.remove_peer(found.key)
                     device.set_peer(found.key, inner=found.inner, endpoint=None, keepalive_s=found.keepalive_s)
@@ -271,13 +269,13 @@ class Tunnels:
         try:
             remove_link(ifname, _alias(self._me))
             if not any(tunnel.uplink == uplink and each.key == key for tunnel, each in self._tunnels.items()):
-                self._underlays[uplink].remove_peer(key)
+                self.underlays[uplink].remove_peer(key)
         except LocalError as error:
             log.error("tunnel not removed ifname=%s reason=%s", ifname, error)
 
     def rebind(self, uplink: int) -> None:
         """Let an uplink send from another UDP port."""
-        device = self._underlays[uplink]
+        device = self.underlays[uplink]
         try:
             device.rebind()
         except LocalError as error:
@@ -294,7 +292,7 @@ class Tunnels:
         """Remove all tunnels, and stop watching the devices."""
         for tunnel in list(self._tunnels):
             self.close(tunnel, now_s)
-        for device in self._underlays:
+        for device in self.underlays:
             self._runtime.unwatch(device)
 
     def handle_timer(self, now: Timestamps) -> list[TunnelId]:
@@ -303,7 +301,7 @@ class Tunnels:
         is_device_due = now.mono_s >= self._device_due_s
         if is_device_due:
             self._device_due_s = now.mono_s + UPKEEP_S
-            for uplink, device in enumerate(self._underlays):
+            for uplink, device in enumerate(self.underlays):
                 self._read_s[uplink] = now.mono_s
                 if device.poll():
                     self._remake(device)
@@ -311,7 +309,7 @@ class Tunnels:
             for tunnel, found in self._tunnels.items():
                 if self.is_up(tunnel):
                     self._follow_mtu(tunnel, found)
-        for uplink, device in enumerate(self._underlays):
+        for uplink, device in enumerate(self.underlays):
             if is_device_due:
                 self._observe_all(uplink, device.known_peers())
             elif self._is_read_due[uplink] or self._has_unknown(uplink, now.mono_s):
@@ -325,7 +323,7 @@ class Tunnels:
         """Let WireGuard have the preshared key that both ends have, and none from when the peer is lost."""
         for tunnel, found in list(self._tunnels.items()):
             try:
-                self._set_preshared(self._underlays[tunnel.uplink], found)
+                self._set_preshared(self.underlays[tunnel.uplink], found)
             except LocalError as error:
                 log.error("no preshared key peer=%s reason=%s; the tunnel is made again", tunnel.peer.short, error)
                 self.close(tunnel, time.monotonic())
@@ -359,7 +357,7 @@ class Tunnels:
 
     def _read_states(self, uplink: int, now_s: float) -> None:
         self._read_s[uplink], self._is_read_due[uplink] = now_s, False
-        self._observe_all(uplink, _states_of(self._underlays[uplink]))
+        self._observe_all(uplink, _states_of(self.underlays[uplink]))
 
     def _observe_all(self, uplink: int, states: Mapping[bytes, PeerState]) -> None:
         for tunnel, found in self._tunnels.items():
@@ -381,20 +379,20 @@ class Tunnels:
     # devices
 
     def _handle_events(self, uplink: int) -> None:
-        device = self._underlays[uplink]
+        device = self.underlays[uplink]
         if device.handle_events():
             self._remake(device)
         self._report_move(uplink)
 
     def _report_move(self, uplink: int) -> None:
         """Probe the neighbours over an uplink whose address has changed."""
-        if self._underlays[uplink].poll_move():
+        if self.underlays[uplink].poll_move():
             self._switch.hello_protocol.probe_uplink(uplink, time.monotonic())
 
     def _remake(self, device: WireGuardDevice) -> None:
         """Make the VXLAN devices on a device that was made again; their ports open when they appear."""
         for tunnel, found in list(self._tunnels.items()):
-            if self._underlays[tunnel.uplink] is device:
+            if self.underlays[tunnel.uplink] is device:
                 try:
                     self._make_vxlan(tunnel, found.ifname, found.mtu)
                 except LocalError as error:
@@ -408,7 +406,7 @@ class Tunnels:
             vni=tunnel_vni(local, remote),
             local=local,
             remote=remote,
-            underlay=self._underlays[tunnel.uplink].ifname,
+            underlay=self.underlays[tunnel.uplink].ifname,
             mtu=mtu,
             alias=_alias(self._me),
         )
@@ -416,7 +414,7 @@ class Tunnels:
             limit_rate(ifname, self._relay_rate)
 
     def _follow_mtu(self, tunnel: TunnelId, found: Tunnel) -> None:
-        outer = self._underlays[tunnel.uplink].path_mtu(found.key)
+        outer = self.underlays[tunnel.uplink].path_mtu(found.key)
         if outer is None or found.endpoint is None:  # not known now
             return
         wireguard_mtu, mtu = tunnel_mtu(outer, is_ipv6=":" in found.endpoint.address)
@@ -434,7 +432,7 @@ class Tunnels:
     def _widen(self, uplink: int, wireguard_mtu: int) -> None:
         """Set the MTU of a WireGuard device to that of its widest tunnel; each VXLAN device has its own."""
         others = (each.wireguard_mtu for tunnel, each in self._tunnels.items() if tunnel.uplink == uplink)
-        self._underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
+        self.underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
 
 
 def _states_of(device: WireGuardDevice) -> dict[bytes, PeerState]:

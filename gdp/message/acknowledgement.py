@@ -83,13 +83,25 @@ class ReaderPositions:
         """Return every position, active ones first."""
         return [*self.active.values(), *self.suspended.values()]
 
+    def is_ahead(self, reader: bytes, number: int) -> bool:
+        """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
+        position = self.active.get(reader)
+        return position is not None and position.next_number > number
+
     def acked_at(self, otherwise: int) -> int:
         """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
-        return min([each.acked_at for each in self.active.values()], default=otherwise)
+        least: int | None = None
+        for each in self.active.values():
+            if least is None or each.acked_at < least:
+                least = each.acked_at
+        return otherwise if least is None else least
 
     def least_active(self) -> int:
         """Return the lowest message number that an active reader lacks."""
-        return min([each.next_number for each in self.active.values()], default=_BEYOND_ALL)
+        least = _BEYOND_ALL
+        for each in self.active.values():
+            least = min(least, each.next_number)
+        return least
 
     def most_active(self) -> int:
         """Return the highest message number before which an active reader lacks nothing."""
@@ -131,6 +143,8 @@ class ReaderPositions:
 
     def next_slow(self) -> float | None:
         """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
+        if len(self.active) < 2:
+            return None
         first_at = self.first_at()
         behind = [each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at]
         mark_s = min(behind, default=None)

@@ -36,6 +36,7 @@ _MESSAGES_MAX: Final = 16
 _OVERHEAD_BYTES: Final = 128  # of a kept frame, in addition to its bytes
 _PARITY: Final = int(Flag.PARITY)
 _SHARED_FLAGS: Final = 0xFF & ~int(Flag.LAST)
+_NEVER: Final = float("inf")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -154,7 +155,9 @@ class FrameRecovery:
 
     def next_expiry(self) -> float:
         """Return the monotonic second at which ``drop_expired`` has something to do; infinity: none."""
-        return min((message.last_s for message in self._messages.values()), default=float("inf")) + _FORGET_S
+        if not self._messages:
+            return _NEVER
+        return min(message.last_s for message in self._messages.values()) + _FORGET_S
 
     def close(self) -> None:
         """Release everything."""

@@ -81,6 +81,10 @@ class HistoryCache:
         """Return the lowest number, or None."""
         return next(iter(self.messages), None)
 
+    def first_since(self, since_s: float) -> int | None:
+        """Return the number of the first message that was added since a second, or None."""
+        return next((number for number, each in self.messages.items() if each.added_s >= since_s), None)
+
     def add(self, number: int, frames: Sequence[bytes], size: int, added_s: float = 0.0) -> None:
         """Add the newest message, of ``size`` bytes."""
         self.messages[number] = CachedMessage(frames=frames, begin_at=self.end_at, size=size, added_s=added_s)

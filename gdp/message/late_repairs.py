@@ -115,7 +115,7 @@ class LateRepairs:
 
     def get_timer(self) -> float:
         """Return the monotonic second at which a request may be due, or a wait ends."""
-        return min(self._due_s, self._hold_s)
+        return self._due_s if self._due_s < self._hold_s else self._hold_s
 
     def is_due(self, now_s: float) -> bool:
         """Return whether ``poll_missing`` may return something."""

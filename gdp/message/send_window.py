@@ -45,6 +45,8 @@ class SendWindow:
     Attributes:
         readers: what each has acknowledged, and which block nothing.
         governing: the reader that alone governs what leaves; None: all do, and the slowest decides.
+        cache: what can be sent again.
+        retransmissions: fragments that were sent again.
         evicted: messages removed from a full window before every reader had them.
     """
 
@@ -57,7 +59,7 @@ class SendWindow:
         lag_s: float = READER.lease_s,
     ) -> None:
         self._budget_bytes = budget_bytes
-        self._cache = HistoryCache(history_depth)
+        self.cache = HistoryCache(history_depth)
         self._flow = FlowControl()
         self.readers = ReaderPositions(lag_s)
         self._repairs = RetransmissionQueue()
@@ -69,32 +71,18 @@ class SendWindow:
         self._now_s = 0.0  # of the latest event
         self._sent_before = 0  # messages before this one were sent, if under an old number
         self.governing: bytes | None = None
+        self.retransmissions = 0
         self.evicted = 0
-
-    @property
-    def oldest(self) -> int | None:
-        """Return the lowest message number that is cached, or None."""
-        return self._cache.oldest
-
-    @property
-    def retransmissions(self) -> int:
-        """Return how many fragments were sent again."""
-        return self._repairs.retransmissions + self._late_repairs.retransmissions
-
-    def is_ahead(self, reader: bytes, number: int) -> bool:
-        """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
-        position = self.readers.active.get(reader)
-        return position is not None and position.next_number > number
 
     def has_space(self) -> bool:
         """Return whether ``add`` would evict no message that a reader waits for."""
         is_idle = bool(self.readers.suspended) and not self.readers.active
-        return is_idle or self._cache.end_at - self._acked_at() < self._budget_bytes
+        return is_idle or self.cache.end_at - self.readers.acked_at(self._sent_at) < self._budget_bytes
 
     def is_acknowledged(self) -> bool:
         """Return whether every reader has everything, suspended ones included."""
         has_all = all(each.next_number > self._newest for each in self.readers.suspended.values())
-        return has_all and self._acked_at() == self._cache.end_at
+        return has_all and self.readers.acked_at(self._sent_at) == self.cache.end_at
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -106,25 +94,21 @@ class SendWindow:
         """Return the highest message number that every reader, suspended or not, has acknowledged."""
         return min(self.readers.least(), self._newest + 1) - 1
 
-    def first_since(self, since_s: float) -> int | None:
-        """Return the number of the first cached message that was added since a second, or None."""
-        return next((number for number, each in self._cache.messages.items() if each.added_s >= since_s), None)
-
     def set_history_depth(self, depth: int, next_number: int) -> None:
         """Change how many messages stay for late joiners; ``next_number`` is the lowest that ``add`` will get."""
-        self._cache.depth = depth
+        self.cache.depth = depth
         self._newest = max(self._newest, next_number - 1)
         self._release_acknowledged()
 
     def set_history_bounds(self, depth_bytes: int | None, age_s: float | None) -> None:
         """Change how many bytes stay for late joiners, and for how many seconds; None: the depth alone counts."""
-        self._cache.depth_bytes, self._cache.age_s = depth_bytes, age_s
+        self.cache.depth_bytes, self.cache.age_s = depth_bytes, age_s
         self._release_acknowledged()
 
     def release_aged(self, now_s: float) -> None:
         """Release what is too old for late joiners."""
         self._now_s = now_s
-        if self._cache.age_s is not None:
+        if self.cache.age_s is not None:
             self._release_acknowledged()
 
     def add(self, number: int, frames: Sequence[bytes], size: int, added_s: float | None = None) -> list[int]:
@@ -137,16 +121,16 @@ class SendWindow:
             the numbers of messages that were evicted for it before every reader had them.
         """
         evicted = []
-        while self._cache and self._cache.held_bytes + size > self._budget_bytes:
-            if self._cache.held_bytes + size <= self._budget_now():
+        while self.cache and self.cache.held_bytes + size > self._budget_bytes:
+            if self.cache.held_bytes + size <= self._budget_now():
                 break
-            oldest = next(iter(self._cache.messages))
+            oldest = next(iter(self.cache.messages))
             if oldest >= self.readers.least():
                 evicted.append(oldest)
             self._release(oldest)
         self.evicted += len(evicted)
         self._newest = number
-        self._cache.add(number, frames, size, self._now_s if added_s is None else added_s)
+        self.cache.add(number, frames, size, self._now_s if added_s is None else added_s)
         self._unsent.append((number, 0))
         return evicted
 
@@ -155,7 +139,7 @@ class SendWindow:
 
         One that was sent whole is on its way: readers lack it only if they request something of it.
         """
-        message, waiting = self._cache.messages.get(number), self._unsent
+        message, waiting = self.cache.messages.get(number), self._unsent
         if message is None:
             return False
         if number < self.sent[0]:
@@ -175,10 +159,6 @@ class SendWindow:
             self._forget(number)
         return sorted(lacked)
 
-    def cached(self) -> list[tuple[int, Sequence[bytes]]]:
-        """Return the numbers and frames that are cached, oldest first."""
-        return [(number, message.frames) for number, message in self._cache.messages.items()]
-
     def renumber(self, move: Renumbering, frames: Sequence[tuple[int, Sequence[bytes], int]]) -> None:
         """Replace all that is cached, under new numbers; what all readers have is not sent again.
 
@@ -186,8 +166,8 @@ class SendWindow:
             frames: number, frames and their size; as in ``add``.
         """
         self._sent_before = move.new_number(max(self._sent_before, self.sent[0]))
-        ages_s = {move.new_number(number): each.added_s for number, each in self._cache.messages.items()}
-        for number in list(self._cache.messages):
+        ages_s = {move.new_number(number): each.added_s for number, each in self.cache.messages.items()}
+        for number in list(self.cache.messages):
             self._release(number)
         self._repairs.clear()
         self._late_repairs.clear()
@@ -205,7 +185,7 @@ class SendWindow:
 
     def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
         """Make a reader active from a message on."""
-        message = self._cache.messages.get(first_number)
+        message = self.cache.messages.get(first_number)
         acked_at = min(message.begin_at, self._sent_at) if message else self._sent_at
         self.readers.add(reader, acked_at, first_number, now_s)
 
@@ -225,11 +205,13 @@ class SendWindow:
             trip_s: round trip of its path; 0: not known. Repairs give none here, so it may be known there alone.
         """
         self._now_s = now_s
-        message = self._cache.messages.get(acknack.next_number)
-        position = message.position(acknack.next_part) if message else self._cache.begin_of(acknack.next_number)
+        message = self.cache.messages.get(acknack.next_number)
+        position = message.position(acknack.next_part) if message else self.cache.begin_of(acknack.next_number)
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
-            if self.readers.active and position < self._acked_at():  # the others must not wait for it
+            if self.readers.active and position < self.readers.acked_at(
+                self._sent_at
+            ):  # the others must not wait for it
                 suspended.next_number = max(suspended.next_number, acknack.next_number)
                 self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()
@@ -239,9 +221,9 @@ class SendWindow:
         state = self.readers.active[reader]
         state.next_number = max(state.next_number, acknack.next_number)
         self._skip_received()
-        before = self._acked_at()
+        before = self.readers.acked_at(self._sent_at)
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
-        acked_at = self._acked_at()
+        acked_at = self.readers.acked_at(self._sent_at)
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
         self._request_repairs(reader, acknack, now_s, trip_s)
         self._release_acknowledged()
@@ -257,14 +239,14 @@ class SendWindow:
         frames: list[bytes] = []
         if self._repairs and (frames := self._repaired_frames(limit, now_s, self._repairs)):
             self._flow.round_trip.discard_sample()
-        acked_at = self._acked_at()
+        acked_at = self.readers.acked_at(self._sent_at)
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
         if self._unsent:
             self.readers.reset_stall_timers(self._sent_at, now_s)
             first_at = self.readers.first_at() if self.governing is not None else acked_at
             frames += self._new_frames(first_at + self._flow.window_bytes, limit - len(frames))
-        if frames and not self._cache.repaired:
+        if frames and not self.cache.repaired:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
         if not self.readers.active and not self._unsent:
             self._release_acknowledged()
@@ -279,27 +261,24 @@ class SendWindow:
 
     def probe_due(self, now_s: float) -> bool:
         """Return whether readers have been silent for too long while something is under way; backs off."""
-        return self._is_probing() and self._flow.probe_due(now_s)
+        return self.next_probe() is not None and self._flow.probe_due(now_s)
 
     def next_probe(self) -> float | None:
         """Return the monotonic second at which ``probe_due`` may be true next, or None."""
-        return self._flow.next_probe() if self._is_probing() else None
-
-    def _is_probing(self) -> bool:
-        return bool(self.readers.active) and self._sent_at != self._acked_at()
-
-    def _acked_at(self) -> int:
-        return self.readers.acked_at(self._sent_at)
+        is_under_way = self.readers.active and self._sent_at != self.readers.acked_at(self._sent_at)
+        return self._flow.next_probe() if is_under_way else None
 
     def _repaired_frames(self, limit: int, now_s: float, repairs: RetransmissionQueue) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
-        messages, acked_at = self._cache.messages, self._acked_at()
+        messages, acked_at = self.cache.messages, self.readers.acked_at(self._sent_at)
         least = self.readers.least() if self.readers.suspended else 0
 
         def is_lacked(number: int, part: int) -> bool:
             return messages[number].position(part) >= acked_at or number >= least > 0
 
-        return repairs.frames_to_send(self._cache, limit, now_s, is_lacked)
+        frames = repairs.frames_to_send(self.cache, limit, now_s, is_lacked)
+        self.retransmissions += len(frames)
+        return frames
 
     def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
@@ -308,7 +287,7 @@ class SendWindow:
         below = least + FLIGHT_MESSAGES_MAX
         while self._unsent and self._sent_at < may_reach and len(frames) < limit and self._unsent[0][0] < below:
             number, part = self._unsent[0]
-            message, begin_at = self._cache.messages[number].frames, self._cache.messages[number].begin_at
+            message, begin_at = self.cache.messages[number].frames, self.cache.messages[number].begin_at
             self._sent_at = max(self._sent_at, begin_at)  # what lies before it was cancelled
             count = min(max(1, (may_reach - self._sent_at) // len(message[0])), limit - len(frames))
             batch = message[part : part + count]
@@ -319,21 +298,21 @@ class SendWindow:
             else:
                 self._unsent.popleft()
         if not self._unsent:
-            self._sent_at = self._cache.end_at
+            self._sent_at = self.cache.end_at
         return frames
 
     def _skip_received(self) -> None:
         """Do not send again, under its new number, what every active reader has received under its old one."""
         least = min(self.readers.least_active(), self._sent_before) if self.readers.active else 0
         while self._unsent and self._unsent[0][0] < least:
-            self._sent_at = self._cache.messages[self._unsent.popleft()[0]].end_at
+            self._sent_at = self.cache.messages[self._unsent.popleft()[0]].end_at
             for reader in self.readers.active.values():
                 reader.acked_at = max(reader.acked_at, self._sent_at)
 
     def _budget_now(self) -> int:
         """Return how many bytes may be cached: fewer if the oldest message is cached for suspended readers alone."""
-        oldest, readers = self._cache.oldest, self.readers
-        is_spare = len(self._cache.messages) > self._cache.depth
+        oldest, readers = self.cache.oldest, self.readers
+        is_spare = len(self.cache.messages) > self.cache.depth
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
@@ -344,7 +323,7 @@ class SendWindow:
         (self._late_repairs if is_late else self._repairs).request(
             acknack.missing,
             position.allowance,
-            self._cache,
+            self.cache,
             sent_at=self._sent_at,
             rtt_s=max(self._flow.round_trip.rtt_s or 0.0, trip_s),
             round_bytes=REPAIRS_MAX_BYTES,
@@ -353,8 +332,8 @@ class SendWindow:
 
     def _release_acknowledged(self) -> None:
         least = self.readers.least()
-        for number in self._cache.beyond_depth(self._now_s):
-            is_unsent = self.readers.active and self._cache.messages[number].end_at > self._sent_at
+        for number in self.cache.beyond_depth(self._now_s):
+            is_unsent = self.readers.active and self.cache.messages[number].end_at > self._sent_at
             if number >= least or is_unsent:
                 break
             self._release(number)
@@ -367,4 +346,4 @@ class SendWindow:
 
     def _forget(self, number: int) -> CachedMessage:
         self._cancelled.discard(number)
-        return self._cache.remove(number)
+        return self.cache.remove(number)

@@ -9,10 +9,12 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final, Protocol
 
 from gdp.client.rib_host import RibHost
 from gdp.config.config import RibConfig
 from gdp.crypto.certificates import Role
+from gdp.extras import Seam
 from gdp.links.uplink import load_plane, open_uplink
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
@@ -31,12 +33,22 @@ from gdp.state.name_lookup import rib_lookup
 from gdp.state.node_state import RibState
 from gdp.state.snapshot import rib_snapshot
 from gdp.state.state_answers import answer_for_rib
+from gdp.stores.cluster_address import ClusterAddress
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
 __all__ = ["rib_handlers", "rib_sources", "run_rib"]
 
 log = logging.getLogger(__name__)
+
+
+class _OpenStore(Protocol):
+    """Opens a store outside of the RIB's process, with its upkeep."""
+
+    def __call__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> Upkeep: ...
+
+
+_STORES: Final[Seam[_OpenStore]] = Seam("gdp.store")
 
 
 def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | None = None) -> None:
@@ -60,7 +72,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         stack.callback(upkeep.close)
         rib = RibCore(identity, policy, upkeep.store, _settings(config))
         host = RibHost(identity, policy, rib, fresh_settings(config.lease_s))
-        upkeep.begin(rib, now())
+        upkeep.start(rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
@@ -98,9 +110,8 @@ def _settings(config: RibConfig) -> RibSettings:
 def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     if config.store == "memory":
         return MemoryUpkeep(config.snapshot)
-    from gdp.nodes.rib_cluster import ClusterUpkeep  # the client library is an optional extra
-
-    return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
+    open_store = _STORES.get("cluster", "store: cluster")
+    return open_store(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
 
 
 def rib_handlers(state: RibState, sources: Sources, store: Store) -> ControlHandlers:

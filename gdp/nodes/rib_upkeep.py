@@ -37,7 +37,7 @@ class Upkeep:
     every_s: float
     sources: Sequence[HasFileno] = ()
 
-    def begin(self, rib: RibCore, now: Timestamps) -> None:
+    def start(self, rib: RibCore, now: Timestamps) -> None:
         """Fill the store with what an earlier run stored."""
 
     def work(self, now: Timestamps) -> None:
@@ -57,7 +57,7 @@ class MemoryUpkeep(Upkeep):
         self._snapshot = None if path is None else Snapshot(path)
         self._rib: RibCore | None = None
 
-    def begin(self, rib: RibCore, now: Timestamps) -> None:
+    def start(self, rib: RibCore, now: Timestamps) -> None:
         """Load the snapshot, whose entries are verified again."""
         self._rib = rib
         if self._snapshot is None:

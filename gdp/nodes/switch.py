@@ -108,7 +108,7 @@ def run_switch(
         handlers = replace(
             handlers,
             reload=reload,
-            drain=lambda: runtime.drain(lambda: not switch.resolver.pending_frames, DRAIN_MAX_S),
+            drain=lambda: runtime.drain(lambda: not len(switch.resolver.pending), DRAIN_MAX_S),
             is_drained=lambda: runtime.has_drained,
         )
         node.follow_clients(runtime, handlers, config.control_socket)
@@ -243,7 +243,7 @@ def switch_sources(state: SwitchState, chosen: Chosen, loop: Loop) -> Sources:
         frames=frames,
         table_entries=lambda: len(switch.table),
         entries=chosen.entry_counts,
-        pending_frames=lambda: switch.resolver.pending_frames,
+        pending_frames=lambda: len(switch.resolver.pending),
         two_paths=lambda: two_paths,
         clashes=lambda: switch.hello_protocol.conflicts.clashes,
     )

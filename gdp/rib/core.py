@@ -18,6 +18,7 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import NAME, Keyed
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.names import Name
 from gdp.rib.advertisements import forward_due, receive_ack, receive_advertisement, receive_presence, receive_withdrawal
@@ -128,9 +129,10 @@ class RibCore:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         state = self.state
-        times = [state.store.next_expiry(), state.upstream_queries.next_due(), state.upstream.next_due()]
-        times += [state.exchange.get_timer(), state.endpoints.get_timer()]
-        return min((time for time in times if time is not None), default=None)
+        of_tier_above = earliest(state.upstream_queries.next_due(), state.upstream.next_due())
+        return earliest(
+            state.store.next_expiry(), of_tier_above, state.exchange.get_timer(), state.endpoints.get_timer()
+        )
 
     def statements_to_send(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""

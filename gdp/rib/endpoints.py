@@ -19,18 +19,17 @@ from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of, re
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, check_sequence, parse
-from gdp.due_queue import DueQueue
+from gdp.due_queue import DueQueue, earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage, pages
 from gdp.exchange.sync_set import SyncSet, line_of, rank_in
 from gdp.frame.kinds import Kind
-from gdp.intervals import ENDPOINT
+from gdp.intervals import ENDPOINT, LEASE_MIN_S
 from gdp.limits import (
     ENDPOINT_QUERIES_RATE,
     ENDPOINT_RECORDS_MAX,
     ENDPOINT_RECORDS_OF_OTHERS_MAX,
     ENDPOINT_RECORDS_RATE,
-    LEASE_MIN_S,
     RIB_WATCHES_MAX,
 )
 from gdp.names import NAME_BYTES, Name
@@ -217,8 +216,7 @@ class RibEndpoints:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._changes.next_due(), self._ends.next_due()]
-        return min((each for each in times if each is not None), default=None)
+        return earliest(self._changes.next_due(), self._ends.next_due())
 
     def poll_statements(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""

@@ -15,7 +15,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MIN_S, NEGATIVE_LEASE_S
+from gdp.intervals import LEASE_MIN_S, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store

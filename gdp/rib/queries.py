@@ -14,7 +14,7 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError, StoreError
 from gdp.frame.kinds import Kind
-from gdp.limits import LEASE_MIN_S
+from gdp.intervals import LEASE_MIN_S
 from gdp.names import Name
 from gdp.rib.replication import is_cold
 from gdp.rib.revocations import send_lacked

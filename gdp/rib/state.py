@@ -18,8 +18,8 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
-from gdp.intervals import Rate
-from gdp.limits import ANSWER_BYTES_RATE, LEASE_MAX_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
+from gdp.intervals import LEASE_MAX_S, Rate
+from gdp.limits import ANSWER_BYTES_RATE, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
+from gdp.due_queue import earliest
 from gdp.intervals import LOOK_S
 from gdp.limits import COST_DEFAULT
 from gdp.ports.plane import HasFileno, Plane
@@ -198,8 +199,7 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        times = [self._machine.get_timer(), *(each.due_s for each in self._periodic)]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self._machine.get_timer(), *(each.due_s for each in self._periodic))
 
     def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
 
-from gdp.due_queue import DueQueue
+from gdp.due_queue import DueQueue, earliest
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.budget import HedgeBudget
@@ -104,6 +104,7 @@ class Dispatch(Generic[A]):
     Attributes:
         late: responses that came for a call that had ended.
         unexpected: responses of servers that were not asked, or that refused or declined before.
+        held_bytes: the bytes that the requests of calls under way use.
     """
 
     def __init__(
@@ -121,7 +122,7 @@ class Dispatch(Generic[A]):
         self._unicasts = unicasts
         self._calls: Calls[_Call[A]] = Calls(calls_max, start)
         self._held_max_bytes = held_max_bytes
-        self._held_bytes = 0
+        self.held_bytes = 0
         self._servers: dict[Name, bool] = {}  # whether it is leaving
         self._latencies = Latencies()
         self._budget = HedgeBudget(replication.budget)
@@ -143,11 +144,6 @@ class Dispatch(Generic[A]):
     def servers(self) -> list[Name]:
         """Return the servers that are there, leaving ones included."""
         return list(self._servers)
-
-    @property
-    def held_bytes(self) -> int:
-        """Return the bytes that the requests of calls under way use."""
-        return self._held_bytes
 
     def begin(
         self,
@@ -173,12 +169,12 @@ class Dispatch(Generic[A]):
         chosen = [server for server in first if server in self._servers]
         if not self._servers:
             raise LocalError("no server is there")
-        if self._held_bytes >= self._held_max_bytes:
-            raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
+        if self.held_bytes >= self._held_max_bytes:
+            raise LocalError(f"requests of {self.held_bytes} bytes are under way: no more at once")
         call = _Call(answered=answered, failed=failed, begun_s=now_s)
         number = self._calls.add_call(now_s, timeout_s, call)
         call.request = write(number)
-        self._held_bytes += len(call.request)
+        self.held_bytes += len(call.request)
         self._budget.earn()
         mode = self._replication.mode
         if mode is Mode.ALL and not chosen and not (self._unicasts and len(self._servers) == 1):
@@ -258,9 +254,8 @@ class Dispatch(Generic[A]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._calls.get_timer(), self._hedges.next_due()]
-        times.append(next(iter(self._ended.values())).stop_at_s if self._ended else None)
-        return min((time for time in times if time is not None), default=None)
+        stop_at_s = next(iter(self._ended.values())).stop_at_s if self._ended else None
+        return earliest(self._calls.get_timer(), self._hedges.next_due(), stop_at_s)
 
     def fail_all(self, reason: str) -> None:
         """End every call, because no server is asked any more."""
@@ -339,7 +334,7 @@ class Dispatch(Generic[A]):
         return max(min(late_s, HEDGE_LATER_MAX * soon_s), _HEDGE_MIN_S)
 
     def _release(self, number: int, call: _Call[A]) -> None:
-        self._held_bytes -= len(call.request)
+        self.held_bytes -= len(call.request)
         if self._stops:
             self._effects.append(End(number))
         self._late.pop(number, None)

@@ -81,6 +81,9 @@ class Follower:
 
     Args:
         tells: whether its state can be read and written.
+
+    Attributes:
+        sequencer: the sequencer whose log it follows.
     """
 
     def __init__(self, *, tells: bool) -> None:
@@ -89,7 +92,7 @@ class Follower:
         self._log = NO_LOG
         self._index = 0
         self._is_lost = False
-        self._sequencer: Name | None = None
+        self.sequencer: Name | None = None
         self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not applied yet
         self._held_bytes = 0
         self._reported_gap = -1
@@ -97,11 +100,6 @@ class Follower:
         self._asked_state = False
         self._effects: list[Effect] = []
         self.doing = Doing.NOTHING
-
-    @property
-    def sequencer(self) -> Name | None:
-        """Return the sequencer whose log it follows."""
-        return self._sequencer
 
     def poll_effects(self) -> list[Effect]:
         """Return, once, what to do, in order."""
@@ -111,13 +109,13 @@ class Follower:
     def handle_message(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
         """Handle a sequencer's message."""
         if isinstance(word, ReplicaProbe):
-            if client == self._sequencer and word.incarnation_id != self._log.incarnation_id and self._follow is None:
-                self._sequencer = None  # the sequencer keeps this log no more
-            if self._follow is None or client != self._sequencer:
+            if client == self.sequencer and word.incarnation_id != self._log.incarnation_id and self._follow is None:
+                self.sequencer = None  # the sequencer keeps this log no more
+            if self._follow is None or client != self.sequencer:
                 self._say(client)
         elif isinstance(word, AttachReplica):
             self._take_follow(client, word)
-        elif client != self._sequencer or word.log != self._log or not self._can_tell or self._is_lost:
+        elif client != self.sequencer or word.log != self._log or not self._can_tell or self._is_lost:
             self._effects.append(Say(client, Snapshot(word.log, 0, None)))
         else:
             self._asked_state = True
@@ -126,8 +124,8 @@ class Follower:
     def entry(self, client: Name, call: int, request: bytes) -> None:
         """Handle an entry, or a request that a client sent as one."""
         incarnation_id, index = place_of(call)
-        if client != self._sequencer:
-            reason = UNKEPT if self._sequencer is None else f"kept in order by {self._sequencer.short}"
+        if client != self.sequencer:
+            reason = UNKEPT if self.sequencer is None else f"kept in order by {self.sequencer.short}"
             self._effects.append(Refuse(client, call, reason))
             return
         if incarnation_id != self._log.incarnation_id or self._is_lost or index <= self._index or index in self._held:
@@ -162,8 +160,8 @@ class Follower:
         self._end(Doing.TELLING)
         self._asked_state = False
         self._can_tell = self._can_tell and state is not None
-        if self._sequencer is not None:
-            self._effects.append(Say(self._sequencer, Snapshot(self._log, self._index, state)))
+        if self.sequencer is not None:
+            self._effects.append(Say(self.sequencer, Snapshot(self._log, self._index, state)))
         self._go_on()
 
     def loaded(self, *, is_done: bool) -> None:
@@ -189,29 +187,29 @@ class Follower:
         self._follow, self._asked_state, self._can_tell = None, False, self._tells
         self._log, self._index, self._is_lost = NO_LOG, 0, is_doubtful
         self._clear()
-        if self._sequencer is not None:
-            self._say(self._sequencer)
+        if self.sequencer is not None:
+            self._say(self.sequencer)
 
     def sequencer_lost(self) -> None:
         """Record that the sequencer is gone: another may come. Held entries are still applied."""
-        self._sequencer = None
+        self.sequencer = None
 
     def _take_follow(self, client: Name, word: AttachReplica) -> None:
-        if self._sequencer not in {None, client}:
+        if self.sequencer not in {None, client}:
             self._say(client)
         elif self._follow is not None:
             pass  # the sequencer gets a status when the server has loaded its snapshot
         elif word.state is None:
             at = (self._log, self._index) == (word.log_before, word.at_before)
             if at and not self._is_lost and self.doing is Doing.NOTHING:
-                self._sequencer = client
+                self.sequencer = client
                 self._set_log(word.log, word.at)
             else:
                 self._say(client)
         elif not self._can_tell or word.log < self._log or (word.log == self._log and word.at < self._index):
             self._say(client)
         else:
-            self._sequencer, self._follow = client, word
+            self.sequencer, self._follow = client, word
             self._clear()
 
     def _go_on(self) -> None:
@@ -228,7 +226,7 @@ class Follower:
             self.doing = Doing.APPLYING
             call, request = self._held[self._index + 1]
             # An entry whose client is gone is applied as well, without a response.
-            self._effects.append(Apply(self._sequencer or _ABSENT, call, request))
+            self._effects.append(Apply(self.sequencer or _ABSENT, call, request))
 
     def _set_log(self, log: LogId, index: int) -> None:
         """Set the log and the position in it; held entries of this log stay."""
@@ -237,14 +235,14 @@ class Follower:
         self._log, self._index, self._is_lost = log, index, False
         for done in [each for each in self._held if each <= index]:
             self._held_bytes -= len(self._held.pop(done)[1])
-        if self._sequencer is not None:
-            self._say(self._sequencer)
+        if self.sequencer is not None:
+            self._say(self.sequencer)
 
     def _lose(self) -> None:
         self._log, self._index, self._is_lost = NO_LOG, 0, True
         self._clear()
-        if self._sequencer is not None and self._follow is None:
-            self._say(self._sequencer)
+        if self.sequencer is not None and self._follow is None:
+            self._say(self.sequencer)
 
     def _clear(self) -> None:
         """Discard held entries, except the one that the server is applying."""
@@ -264,7 +262,7 @@ class Follower:
         return reach
 
     def _say(self, client: Name) -> None:
-        kept_by = None if self._sequencer in {None, client} else self._sequencer
+        kept_by = None if self.sequencer in {None, client} else self.sequencer
         said = ReplicaStatus(self._log, self._index, self._reach(), self._is_lost, self._can_tell, kept_by)
         self._effects.append(Say(client, said))
 

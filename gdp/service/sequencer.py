@@ -36,7 +36,6 @@ from gdp.service.replication_messages import (
     ReplicaProbe,
     ReplicaStatus,
     Snapshot,
-    SnapshotRequest,
     call_of,
     place_of,
 )
@@ -66,13 +65,11 @@ class Sequencer(Generic[A]):
         late: responses that came for a call that had ended: those of all replicas but the first.
         unexpected: responses of replicas that do not follow.
         hedged: always none; every replica gets every request.
+        log: the log that it keeps; of generation 0 before it begins.
     """
 
     def __init__(
-        self,
-        *,
-        incarnation_id: Callable[[], int],
-        entries: Callable[[], ReplicatedLog] = ReplicatedLog,
+        self, *, incarnation_id: Callable[[], int], entries: Callable[[], ReplicatedLog] = ReplicatedLog
     ) -> None:
         self._incarnation_id = incarnation_id
         self._new_entries = entries
@@ -86,13 +83,13 @@ class Sequencer(Generic[A]):
 
     def _restart(self) -> None:
         """Discard the log; no replica follows it."""
-        self._log = LogId(0, self._incarnation_id() or 1)
-        self._calls = Pending[A](call_of(self._log, 1))
+        self.log = LogId(0, self._incarnation_id() or 1)
+        self._calls = Pending[A](call_of(self.log, 1))
         self._entries = self._new_entries()
         self._replication = LogReplication(
-            log=self._log, entries=self._entries, replicas=self._replicas, effects=self._effects
+            log=self.log, entries=self._entries, replicas=self._replicas, effects=self._effects
         )
-        self._snapshots = SnapshotRequests()
+        self._snapshots = SnapshotRequests(self._effects)
         self._base = (NO_LOG, 0)  # position of a replica at which the log begins
         self._is_keeping = False
         for replica in self._replicas.values():
@@ -103,12 +100,7 @@ class Sequencer(Generic[A]):
 
     def __contains__(self, number: int) -> bool:
         incarnation_id, index = place_of(number)
-        return incarnation_id == self._log.incarnation_id and index in self._entries
-
-    @property
-    def log(self) -> LogId:
-        """Return the log that it keeps; of generation 0 before it begins."""
-        return self._log
+        return incarnation_id == self.log.incarnation_id and index in self._entries
 
     @property
     def servers(self) -> list[Name]:
@@ -233,7 +225,7 @@ class Sequencer(Generic[A]):
     def _ask(self, server: Name, replica: Replica, now_s: float) -> None:
         replica.quiet_until_s = now_s + (STALL_S if replica.follows else AGAIN_S)
         replica.is_offered = False
-        self._effects.append(ReplicaCommand(server, ReplicaProbe(self._log.incarnation_id)))
+        self._effects.append(ReplicaCommand(server, ReplicaProbe(self.log.incarnation_id)))
 
     def _let_go(self, server: Name) -> None:
         self._replicas.pop(server, None)
@@ -251,11 +243,11 @@ class Sequencer(Generic[A]):
             return
         if not self._replicas.is_kept_otherwise():
             self._election.leader = None
-        is_ours = self._is_keeping and position.log == self._log
+        is_ours = self._is_keeping and position.log == self.log
         replica.follows = is_ours and self._replication.can_serve(position.held)
         if replica.follows:
             self._replication.follow(server, replica, position.held, now_s)
-        elif self._is_keeping and position.log > self._log:
+        elif self._is_keeping and position.log > self.log:
             self._calls.fail_all(Failure.REFUSED, "another kept this service in order meanwhile")
             self._election.restart(now_s)
             self._restart()
@@ -264,7 +256,7 @@ class Sequencer(Generic[A]):
 
     def _handle_leader(self, leader: Name, log: LogId, now_s: float) -> None:
         """Record that a replica follows another sequencer, and yield to it if its log wins."""
-        if not self._election.must_yield(log, self._log, self._replicas):
+        if not self._election.must_yield(log, self.log, self._replicas):
             return
         self._election.leader = leader
         self._calls.fail_all(Failure.REFUSED, f"kept in order by {leader.short}")
@@ -274,20 +266,20 @@ class Sequencer(Generic[A]):
 
     def _begin_log(self, now_s: float) -> None:
         """Begin the log with the elected replica, if there is one."""
-        elected = self._election.elect(self._replicas, self._log.incarnation_id)
+        elected = self._election.elect(self._replicas, self.log.incarnation_id)
         if elected is None:
             return
         best = elected.position
-        self._log = self._replication.log = elected.log
+        self.log = self._replication.log = elected.log
         if (
-            best.log.incarnation_id != self._log.incarnation_id
+            best.log.incarnation_id != self.log.incarnation_id
         ):  # otherwise it accepted this log, and its status was lost
             self._base = best.log, best.at
         self._is_keeping, self._election.leader = True, None
         for replica in self._replicas.values():
             replica.why_not = ""
         root = elected.root
-        self._follow(root, self._replicas[root], AttachReplica(self._log, 0, best.log, best.at, None), now_s)
+        self._follow(root, self._replicas[root], AttachReplica(self.log, 0, best.log, best.at, None), now_s)
 
     def _follow(self, server: Name, replica: Replica, word: AttachReplica, now_s: float) -> None:
         replica.quiet_until_s, replica.is_offered = now_s + LOAD_S, True
@@ -300,35 +292,28 @@ class Sequencer(Generic[A]):
             return  # the root comes first
         if position.tells and (position.is_fresh or not is_level):
             if state is not None:
-                word = AttachReplica(self._log, state.at, position.log, position.at, state.state)
+                word = AttachReplica(self.log, state.at, position.log, position.at, state.state)
                 self._follow(server, replica, word, now_s)
                 return
-            if self._snapshots.is_pending or self._request_snapshot(now_s):
+            if self._snapshots.is_pending or self._snapshots.request(self.log, self._replicas, self._entries, now_s):
                 return  # it is admitted when the snapshot is here
         if is_level:
-            self._follow(server, replica, AttachReplica(self._log, 0, position.log, position.at, None), now_s)
+            self._follow(server, replica, AttachReplica(self.log, 0, position.log, position.at, None), now_s)
         else:
             replica.why_not = _UNKNOWN if position.is_lost else _UNLIKE
 
     def _is_level(self, position: ReplicaStatus) -> bool:
         """Return whether a replica is where the log begins."""
-        is_begun = position.log.incarnation_id == self._log.incarnation_id and position.at == 0
+        is_begun = position.log.incarnation_id == self.log.incarnation_id and position.at == 0
         return not position.is_lost and (is_begun or (position.log, position.at) == self._base)
 
     def _request_snapshot_if_wanted(self, now_s: float) -> None:
         """Request a snapshot when the log has grown, or to begin with."""
         if self._is_keeping and not self._snapshots.is_pending and self._entries.wants_state:
-            self._request_snapshot(now_s)
-
-    def _request_snapshot(self, now_s: float) -> bool:
-        """Request a snapshot; return whether there is a replica to ask."""
-        server = self._snapshots.request(self._replicas, self._entries, now_s)
-        if server is not None:
-            self._effects.append(ReplicaCommand(server, SnapshotRequest(self._log)))
-        return server is not None
+            self._snapshots.request(self.log, self._replicas, self._entries, now_s)
 
     def _handle_state(self, server: Name, replica: Replica, word: Snapshot, now_s: float) -> None:
-        if not self._snapshots.handle_state(server, word, self._log, self._entries):
+        if not self._snapshots.handle_state(server, word, self.log, self._entries):
             return
         if word.state is None:
             if replica.position is not None:

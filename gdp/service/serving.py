@@ -17,6 +17,7 @@ from collections.abc import Sized
 from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.message.fair_queue import FairQueue
 from gdp.names import Name
@@ -234,8 +235,7 @@ class Serving(Generic[R]):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timeout of a call, or of a stall, or None."""
-        times = [self._calls.get_timer(), None if self._window is None else self._window.get_timer()]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self._calls.get_timer(), None if self._window is None else self._window.get_timer())
 
     def fail_all(self) -> list[Asked]:
         """End every call; return them."""

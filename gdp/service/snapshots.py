@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import Final
 
 from gdp.names import Name
+from gdp.service.dispatch import Ask
 from gdp.service.replicas import Replicas
 from gdp.service.replicated_log import ReplicatedLog
-from gdp.service.replication_messages import LogId, Snapshot
+from gdp.service.replication_messages import LogId, ReplicaCommand, Snapshot, SnapshotRequest
 
 __all__ = ["LOAD_S", "SnapshotRequests"]
 
@@ -18,9 +19,14 @@ LOAD_S: Final = 10.0  # until a replica counts as silent that has a snapshot to 
 
 
 class SnapshotRequests:
-    """At most one request at a time."""
+    """At most one request at a time.
 
-    def __init__(self) -> None:
+    Args:
+        effects: requests to send are appended here.
+    """
+
+    def __init__(self, effects: list[Ask | ReplicaCommand]) -> None:
+        self._effects = effects
         self._server: Name | None = None
         self._until_s = 0.0
 
@@ -29,15 +35,16 @@ class SnapshotRequests:
         """Return whether a replica is asked now."""
         return self._server is not None
 
-    def request(self, replicas: Replicas, entries: ReplicatedLog, now_s: float) -> Name | None:
-        """Return the replica to ask: the furthest that has a newer state; None: there is none."""
+    def request(self, log: LogId, replicas: Replicas, entries: ReplicatedLog, now_s: float) -> bool:
+        """Ask the furthest replica that has a newer state; return whether there is one."""
         tellers = replicas.tellers()
         server = max(tellers, key=lambda name: tellers[name], default=None)
         if server is None or (entries.state is not None and tellers[server] <= entries.state.at):
-            return None
+            return False
         self._server = server
         self._until_s = now_s + LOAD_S
-        return server
+        self._effects.append(ReplicaCommand(server, SnapshotRequest(log)))
+        return True
 
     def handle_state(self, server: Name, state: Snapshot, log: LogId, entries: ReplicatedLog) -> bool:
         """Return whether a snapshot is the one that was requested; if so, the request is over."""

@@ -36,11 +36,12 @@ def participant_tables(state: MemberState) -> dict[str, TableSource]:
 
     def peers(_now: Timestamps) -> list[Row]:
         writers = [
-            peer(each.topic, each.publisher, "writer", each.state.name.lower()) for each in member.writer_proxies()
+            peer(each.topic, each.publisher, "writer", each.state.name.lower())
+            for each in member.subscriptions.writer_proxies()
         ]
         readers = [
             peer(each.topic, reader, "reader", "silent" if each.matched.is_suspended(reader) else "live")
-            for each in member.publishers()
+            for each in list(member.publications)
             for reader in map(Name, each.matched.names())
         ]
         return sorted(writers + readers, key=lambda row: (str(row["local"]), row["is"], row["peer"]))

@@ -151,10 +151,10 @@ def member_snapshot(member: Participant, flows: Iterable[Mapping[str, object]] =
     ]
     sent = {
         short_id(each.topic): {"messages": each.messages, "readers": each.readers}
-        for each in islice(member.publishers(), FLOWS_MAX)
+        for each in islice(list(member.publications), FLOWS_MAX)
     }
     received: dict[str, dict[str, int]] = {}
-    for proxy in islice(member.writer_proxies(), FLOWS_MAX):
+    for proxy in islice(member.subscriptions.writer_proxies(), FLOWS_MAX):
         sums = received.setdefault(short_id(proxy.topic), {"messages": 0, "bytes": 0, "lost": 0, "publishers": 0})
         sums["messages"] += proxy.delivery.delivered
         sums["bytes"] += proxy.delivery.delivered_bytes

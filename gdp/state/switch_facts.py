@@ -46,7 +46,7 @@ def switch_facts(state: SwitchState, name: Name, now: Timestamps) -> SwitchFacts
         branches=sum(len(tree.branches) for tree in trees),
         is_joined=any(tree.upstream is not None for tree in trees),
         drops={reason.label: count for reason, count in switch.drops().items() if count},
-        pending=switch.resolver.pending_frames,
+        pending=len(switch.resolver.pending),
     )
 
 

@@ -1,6 +1,6 @@
 """Address of the cluster that stores a RIB's routes.
 
-It does no I/O; the client library, an optional extra, is imported by ``cluster_link.py`` alone.
+Sans-I/O; the extension ``cluster`` connects to it.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ I/O, through ``files``. The content of a file shows its form::
 
     -----BEGIN PRIVATE KEY-----             a signing key, PKCS #8, guarded by the file's mode alone
     -----BEGIN ENCRYPTED PRIVATE KEY-----   the same under a passphrase (``gdp/crypto/pbes2``)
-    pkcs11:token=...;object=...             the key is in a token (``token``), and the file names it
+    pkcs11:token=...;object=...             the key is in a token (extension ``pkcs11``), and the file names it
     32 or 96 bytes                          an owner's master secret, a node's KEM key
     -----BEGIN ENCRYPTED GDP SECRET-----    the same under a passphrase
 
@@ -17,15 +17,41 @@ from __future__ import annotations
 import secrets
 from enum import Enum
 from pathlib import Path
+from typing import Final, Protocol
 
 from gdp.crypto.keys import WRONG_PASSPHRASE, SigningKey, is_encrypted
 from gdp.crypto.pbes2 import KEY_LABEL, RANDOM_BYTES, SECRET_LABEL, is_own_form, is_secret, open_secret, protect
 from gdp.errors import GdpError, LocalError
+from gdp.extras import Seam
 from gdp.stores.files import NewFile, private, read_private
 from gdp.stores.passphrase import passphrase_for
-from gdp.stores.token import SCHEME, open_token_key
 
-__all__ = ["Storage", "key_file", "read_secret", "read_signing_key", "secret_file", "storage_of"]
+__all__ = [
+    "SCHEME",
+    "TOKEN_KEYS",
+    "Storage",
+    "TokenKeys",
+    "key_file",
+    "read_secret",
+    "read_signing_key",
+    "secret_file",
+    "storage_of",
+]
+
+SCHEME: Final = "pkcs11:"  # RFC 7512
+
+
+class TokenKeys(Protocol):
+    """Signing keys in tokens, named by URIs."""
+
+    def open_token_key(self, text: str, file: Path) -> SigningKey:
+        """Return the key of a URI, which a file holds."""
+
+    def generate_token_key(self, text: str) -> SigningKey:
+        """Make the key that a URI describes."""
+
+
+TOKEN_KEYS: Final[Seam[TokenKeys]] = Seam("gdp.token_keys")
 
 
 class Storage(str, Enum):
@@ -47,7 +73,7 @@ def read_signing_key(path: Path) -> SigningKey:
     storage = _storage(data)
     try:
         if storage is Storage.TOKEN:
-            return open_token_key(data.decode("utf-8", "replace").strip(), path)
+            return TOKEN_KEYS.get("pkcs11", str(path)).open_token_key(data.decode("utf-8", "replace").strip(), path)
         if storage is Storage.PASSPHRASE and is_own_form(data):
             return _opened_key(open_secret(data, passphrase_for(path)))
         return SigningKey.from_pem(data, passphrase_for(path) if storage is Storage.PASSPHRASE else None)

@@ -107,7 +107,7 @@ class AdvertisementHandler:
                 raise
             self._state.dependents.record_advertisement(advertisement, at)
             if is_first:
-                self._state.resolver.watch(advertisement.name, now.mono_s)
+                self._state.resolver.queries.watch(advertisement.name, now.mono_s)
             for location in cache.of(advertisement.name, now.mono_s):
                 self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         is_alone = (
@@ -203,7 +203,7 @@ class AdvertisementHandler:
         if withdrawal.sequence <= self._sequence_of(name, neighbour):
             raise StatementError(DropReason.STALE, "a withdrawal of what was advertised again")
         if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
-            self._state.resolver.unwatch(name)
+            self._state.resolver.queries.unwatch(name)
         if right is not Right.READ and self._state.attached.remove(name, neighbour.name) is not None:
             self._unicast.remove(name)
             self._rib_client.relay(statement.wire, now.mono_s)

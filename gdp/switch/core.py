@@ -262,7 +262,7 @@ class SwitchCore:
         for attachment in self.attached.expire(now_s):
             self.unicast.remove(attachment.advertisement.name)
         for topic in self.multicast.handle_timer(now_s):
-            self.resolver.unwatch(topic)
+            self.resolver.queries.unwatch(topic)
         self.relocations.handle_timer(now_s)
         self.rib_client.send_due(now_s)
         self._revoker.sync.handle_timer(now_s)
@@ -297,7 +297,7 @@ class SwitchCore:
 
     def query_name(self, name: Name, now_s: float) -> None:
         """Query a name at the RIB at once, known or not, for a tool of this machine."""
-        self.resolver.request_again(name, now_s)
+        self.resolver.queries.request(name, now_s)
         self.rib_client.send_due(now_s)
         self._rest_due_s = None
 

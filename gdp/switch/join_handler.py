@@ -69,7 +69,7 @@ class JoinHandler:
         self._check(neighbour, statement, now.mono_s, _REFRESH_TOKENS)
         self._state.neighbours.ports[neighbour.port].receive_join(refresh, neighbour)
         if is_reply:
-            self._multicast.join_unknown(refresh, neighbour, now.mono_s)
+            self._multicast.upstream.join_unknown(refresh, neighbour, now.mono_s)
         else:
             self._multicast.refresh(refresh, neighbour, now.mono_s)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from gdp.due_queue import DueQueue
+from gdp.due_queue import DueQueue, earliest
 from gdp.errors import DropReason, StatementError
 from gdp.limits import ATTACHED_MAX
 from gdp.message.shares import Shares
@@ -156,8 +156,7 @@ class LocalAdvertisements:
 
     def next_event(self) -> float | None:
         """Return the monotonic second of the next relay or lease end, or None."""
-        times = self._relays.next_due(), self._ends.next_due()
-        return min((each for each in times if each is not None), default=None)
+        return earliest(self._relays.next_due(), self._ends.next_due())
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next lease end, or None."""

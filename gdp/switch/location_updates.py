@@ -99,7 +99,7 @@ class LocationUpdates:
         """
         location, now_s = self._state.evidence.from_relay(statement, now), now.mono_s
         if location.right in HEARS and self._multicast.reader_moved(location):
-            self._state.resolver.unwatch(location.name)
+            self._state.resolver.queries.unwatch(location.name)
         self.acknowledge_relocation(location, now_s)
         if location.right is not Right.READ and self.is_newer(location):
             self.receive(location, statement.wire, now_s)

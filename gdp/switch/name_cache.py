@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gdp.intervals import ADVERTISEMENT
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import Right

@@ -20,6 +20,7 @@ from collections.abc import Set as AbstractSet
 from typing import Final, NamedTuple
 
 from gdp.control.neighbour import Neighbour
+from gdp.due_queue import earliest
 from gdp.errors import DropReason
 from gdp.intervals import ADVERTISEMENT
 from gdp.limits import QUESTIONS_RATE, SWITCH_QUESTIONS_RATE
@@ -57,14 +58,16 @@ class NameResolver:
         lease_s: seconds for which the RIB keeps a watch; see ``NameQueries``.
 
     Attributes:
-        cache: the locations that are known; other classes only read it.
+        cache: the locations that are known.
+        queries: to the RIB; readers attached here watch names by them.
+        pending: frames that wait for a response.
     """
 
     def __init__(self, me: Name, lease_s: float = ADVERTISEMENT.lease_s) -> None:
         self._me = me
         self.cache = NameCache(lease_s)
-        self._queries = NameQueries(lease_s)
-        self._pending = PendingFrames()
+        self.queries = NameQueries(lease_s)
+        self.pending = PendingFrames()
         self._rates = {
             _FROM_NODE: TokenBuckets(*QUESTIONS_RATE),
             _FROM_SWITCH: TokenBuckets(*SWITCH_QUESTIONS_RATE),
@@ -74,12 +77,7 @@ class NameResolver:
     @property
     def drops(self) -> Counter[DropReason]:
         """Return how many frames were dropped instead of being released, by reason."""
-        return self._refused + self._pending.drops
-
-    @property
-    def pending_frames(self) -> int:
-        """Return how many frames wait for a response."""
-        return len(self._pending)
+        return self._refused + self.pending.drops
 
     @staticmethod
     def owner_of(neighbour: Neighbour) -> bytes:
@@ -102,7 +100,7 @@ class NameResolver:
             accepting = [node]
         elsewhere = [location for location in accepting if location.switch != self._me]
         if elsewhere:
-            self._queries.use(name, now_s)
+            self.queries.use(name, now_s)
             return Resolution(elsewhere)
         if accepting or not (known or self.cache.is_negative(name, now_s)):  # it has left this switch, or is unknown
             self._request(name, now_s, owner)
@@ -117,7 +115,7 @@ class NameResolver:
         """
         known = self.cache.of(name, now_s)
         if known:
-            self._queries.use(name, now_s)
+            self.queries.use(name, now_s)
             return Resolution(known)
         if self.cache.is_negative(name, now_s):
             return Resolution([], DropReason.NO_ROUTE)
@@ -132,24 +130,8 @@ class NameResolver:
     def _request(self, name: Name, now_s: float, owner: bytes) -> None:
         """Open a query within the rate of its owner."""
         rate = self._rates.get(owner[:1])
-        if rate is None or name in self._queries or rate.spend(owner, now_s):
-            self._queries.request(name, now_s, owner)
-
-    def request_again(self, name: Name, now_s: float) -> None:
-        """Query a name for this switch itself, known or not."""
-        self._queries.request(name, now_s)
-
-    def is_asking(self, name: Name) -> bool:
-        """Return whether a query for a name has no response yet."""
-        return self._queries.is_open(name)
-
-    def watch(self, name: Name, now_s: float) -> None:
-        """Query a name and watch it for attached readers."""
-        self._queries.watch(name, now_s)
-
-    def unwatch(self, name: Name) -> None:
-        """End the watch of a name: it has no attached reader any more."""
-        self._queries.unwatch(name)
+        if rate is None or name in self.queries or rate.spend(owner, now_s):
+            self.queries.request(name, now_s, owner)
 
     # -- pending frames
 
@@ -158,14 +140,10 @@ class NameResolver:
 
         The frame is dropped where no query for the name is open, too many are, or its owner exceeds its rate.
         """
-        if name in self._queries:
-            self._pending.park(name, frame, now_s, until_s, owner=owner)
+        if name in self.queries:
+            self.pending.park(name, frame, now_s, until_s, owner=owner)
         else:
             self._refused[DropReason.PENDING_FULL] += 1
-
-    def release_frames(self, name: Name) -> list[tuple[bytes, float, bytes]]:
-        """Remove and return the frames that wait for a name, in order, each with its ``until_s`` and owner."""
-        return self._pending.release(name)
 
     # -- receive a response
 
@@ -183,11 +161,11 @@ class NameResolver:
         before = self.cache.put(location)
         is_repeated = before is not None and before.advertisement == location.advertisement
         if not has_left and (not is_ours or is_repeated):
-            self._queries.receive_answer(location.name, now_s)
+            self.queries.receive_answer(location.name, now_s)
 
     def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
         """Remove one advertiser of a name: it has withdrawn, or its proofs are no longer valid."""
-        self._queries.receive_answer(name, now_s)
+        self.queries.receive_answer(name, now_s)
         self.cache.remove(name, advertiser)
 
     def receive_negative(self, name: Name, now_s: float, *, keep: bool = False) -> None:
@@ -196,48 +174,35 @@ class NameResolver:
         Args:
             keep: known locations take precedence over this response of a RIB that has just started.
         """
-        self._queries.receive_answer(name, now_s)
+        self.queries.receive_answer(name, now_s)
         if not (keep and self.cache.of(name, now_s)):
             self.cache.put_negative(name, now_s)
-            self._pending.drop(name, DropReason.NO_ROUTE)
+            self.pending.drop(name, DropReason.NO_ROUTE)
 
     def receive_unknown(self, name: Name, rib: Name, now_s: float, others: AbstractSet[Name]) -> None:
         """Keep the locations of a name that a RIB does not know, and query the other RIBs, one after the other."""
         self.cache.extend(name, now_s)
-        self._queries.receive_unknown(name, rib, now_s, others)
-
-    def passed_over(self, name: Name) -> AbstractSet[Name]:
-        """Return the RIBs that do not know a name, of this round of queries."""
-        return self._queries.passed_over(name)
+        self.queries.receive_unknown(name, rib, now_s, others)
 
     # -- time and the RIB
 
     def queries_to_send(self, now_s: float) -> list[tuple[Name, float]]:
         """Return the queries that are due, as (name, seconds to watch it); drop the frames of names that failed."""
-        queries, failed = self._queries.poll_due(now_s)
+        queries, failed = self.queries.poll_due(now_s)
         for name in failed:
-            self._pending.drop(name, DropReason.NO_ROUTE)
+            self.pending.drop(name, DropReason.NO_ROUTE)
         return queries
 
     def rib_changed(self, now_s: float, *, has_rib: bool) -> None:
         """Send every query again at once; without a RIB, serve entries beyond their leases."""
         self.cache.serve_stale(not has_rib, now_s)
-        self._queries.repeat_all(now_s)
-
-    def serve_stale(self, now_s: float, *, stale: bool) -> None:
-        """Begin, or end, to serve entries beyond their leases: the RIB does not respond, or responds again."""
-        self.cache.serve_stale(stale, now_s)
+        self.queries.repeat_all(now_s)
 
     def expire(self, now_s: float) -> list[Location]:
         """Drop the frames that waited too long and the entries whose leases ended; return the locations among them."""
-        self._pending.expire(now_s)
+        self.pending.expire(now_s)
         return self.cache.expire(now_s)
 
     def next_expiry(self) -> float | None:
         """Return a monotonic second that is no later than the next expiry, or None."""
-        times = (self._pending.next_expiry(), self.cache.next_expiry())
-        return min((time for time in times if time is not None), default=None)
-
-    def next_query(self) -> float | None:
-        """Return a monotonic second that is no later than the next query, or None."""
-        return self._queries.next_due()
+        return earliest(self.pending.next_expiry(), self.cache.next_expiry())

@@ -10,6 +10,7 @@ from typing import Final
 
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
+from gdp.due_queue import earliest
 from gdp.intervals import UPKEEP_S
 from gdp.switch.flooding import Flooding
 from gdp.switch.forwarding_state import ForwardingState
@@ -97,7 +98,7 @@ class PathUpdates:
             times.append(self._followed_s)  # in the past: due at once
         if self._state.paths.refused_elsewhere():
             times.append(self._conflicts_sought_s + UPKEEP_S)
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
     def _find_conflicts(self, now_s: float) -> None:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""

@@ -158,7 +158,7 @@ class RevocationHandler:
                 self._doubt(holder, now)
         self._hello_protocol.recheck(revocation.fingerprint, now)
         for topic in orphaned:
-            self._state.resolver.unwatch(topic)
+            self._state.resolver.queries.unwatch(topic)
 
     def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> list[Name]:
         attachment = self._state.attached.get(holder.name, holder.node)

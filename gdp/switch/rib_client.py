@@ -28,6 +28,7 @@ from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
@@ -113,7 +114,7 @@ class RibClient:
 
     def _rib_for(self, name: Name, now_s: float) -> Name | None:
         """Return the RIB to query for a name."""
-        passed_over = self._state.resolver.passed_over(name)
+        passed_over = self._state.resolver.queries.passed_over(name)
         left = [rib for rib in self._others if rib.name not in passed_over] or self._others
         if not left:
             return self.rib
@@ -155,7 +156,7 @@ class RibClient:
         self._avoided[silent] = self._review_s = now_s + REFUSED_S
         self._owed.pop(silent, None)
         if silent == self.rib:
-            self._state.resolver.serve_stale(now_s, stale=True)
+            self._state.resolver.cache.serve_stale(True, now_s)
             if [rib.name for rib in self._reached(now_s)[:1]] != [silent]:
                 self.links_changed(now_s)
 
@@ -257,7 +258,7 @@ class RibClient:
         self._avoided.pop(rib, None)
         self._owed.pop(rib, None)
         if rib == self.rib:
-            self._state.resolver.serve_stale(now_s, stale=False)
+            self._state.resolver.cache.serve_stale(False, now_s)
 
     def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
@@ -312,13 +313,7 @@ class RibClient:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
+        of_names = earliest(self._state.attached.next_event(), self._state.resolver.queries.next_due(), self._review_s)
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
-        times = [
-            self._state.attached.next_event(),
-            self._state.resolver.next_query(),
-            owed_s,
-            self._review_s,
-            self.endpoints.get_timer(),
-            self._channels.get_timer(),
-        ]
-        return None if self.rib is None else min((time for time in times if time is not None), default=None)
+        due_s = earliest(of_names, owed_s, self.endpoints.get_timer(), self._channels.get_timer())
+        return None if self.rib is None else due_s

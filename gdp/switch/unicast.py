@@ -17,8 +17,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
-from gdp.intervals import LINK_STATE
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.intervals import LINK_STATE, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
@@ -88,7 +87,7 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Retry the frames that wait for a name."""
-        for frame, until_s, owner in self._state.resolver.release_frames(name):
+        for frame, until_s, owner in self._state.resolver.pending.release(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 

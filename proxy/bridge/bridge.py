@@ -11,10 +11,11 @@ from __future__ import annotations
 import logging
 import secrets
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gdp.client.participant import Message, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.names import Name
@@ -122,6 +123,11 @@ class Bridge:
         endpoints: numbered as in the rules, in the order of the configuration's ``ros`` section.
         status_topic: where local nodes read the parties of names; None: nowhere.
         look_s: seconds of observation before any flow begins: graphs need them to show the other proxies.
+
+    Attributes:
+        held: the delegations in use.
+        rules: the present ones.
+        problems: why names that rules name are not carried at present.
     """
 
     def __init__(
@@ -135,8 +141,8 @@ class Bridge:
         status_topic: StatusTopicConfig | None = None,
     ) -> None:
         self._context = context
-        self._config = config
-        self._held = held
+        self.rules = config
+        self.held = held
         self._me = proxy_node_name(context.member.name.to_text())
         self._dispatchers = [EndpointDispatcher(endpoint) for endpoint in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
@@ -149,7 +155,7 @@ class Bridge:
         self._flow_begun_s: dict[_Key, float] = {}
         self._failed: dict[_Key, ConfigProblem] = {}  # flows that this graph does not allow at present
         self._undelegated: dict[_Key, FlowSpec] = {}  # failed flows that wait for a delegation
-        self._complaints: set[ConfigProblem] = set()
+        self.problems: set[ConfigProblem] = set()
         self._ended = deque[TopicStats](maxlen=_ENDED_MAX)
         self._changes = deque[FlowChange](maxlen=_CHANGES_MAX)
         self._is_stale = True
@@ -174,21 +180,6 @@ class Bridge:
     def flows(self) -> list[tuple[FlowSpec, Flow]]:
         """Return the present flows."""
         return list(self._flows.values())
-
-    @property
-    def rules(self) -> BridgeRules:
-        """Return the present rules."""
-        return self._config
-
-    @property
-    def held(self) -> DelegationStore:
-        """Return the delegations in use."""
-        return self._held
-
-    @property
-    def problems(self) -> Collection[ConfigProblem]:
-        """Return why names that rules name are not carried at present."""
-        return self._complaints
 
     def graphs(self) -> list[Graph]:
         """Return the entities of each graph, in the order of the configuration."""
@@ -227,7 +218,7 @@ class Bridge:
 
     def publishers_of(self, name: Name) -> list[Name]:
         """Return the remote publishers of a topic that is read here, as far as they have introduced themselves."""
-        return [each.publisher for each in self._context.member.writer_proxies_of(name)]
+        return [each.publisher for each in self._context.member.subscriptions.writer_proxies_of(name)]
 
     @property
     def undelegated(self) -> list[FlowSpec]:
@@ -249,8 +240,8 @@ class Bridge:
         found = list[DeniedName]()
         for at, dispatcher in enumerate(self._dispatchers):
             graph = dispatcher.endpoint.graph()
-            for rules, is_exposed in ((self._config.expose, True), (self._config.imports, False)):
-                here = [rule for rule in rules if self._config.endpoint_of(rule) == at]
+            for rules, is_exposed in ((self.rules.expose, True), (self.rules.imports, False)):
+                here = [rule for rule in rules if self.rules.endpoint_of(rule) == at]
                 found += denied(here, graph, is_exposed=is_exposed)
         return found
 
@@ -327,12 +318,11 @@ class Bridge:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
         times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._probed)]
-        times += [self._tick_at_s] if has_ticks else []
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times, self._tick_at_s if has_ticks else None)
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""
-        self._config, self._held = config, held
+        self.rules, self.held = config, held
         for key, (flow_spec, flow) in list(self._flows.items()):
             topic = held.find(flow_spec.name, _right(flow_spec))
             if topic is None:
@@ -360,7 +350,7 @@ class Bridge:
     @property
     def is_finished(self) -> bool:
         """Return whether readers have confirmed the last messages of all flows that ended."""
-        return all(self._context.member.is_acknowledged(name) for name in self._finishing)
+        return all(self._context.member.publications.is_acknowledged(name) for name in self._finishing)
 
     def close(self) -> None:
         """End every flow; endpoints stay open."""
@@ -485,15 +475,15 @@ class Bridge:
             flow.follow(view.ends(Role.SERVES, flow_spec), now_s)
 
     def _flow_specs(self, at: int, graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
-        config = self._config
+        config = self.rules
         yield from exposed([rule for rule in config.expose if config.endpoint_of(rule) == at], graph, complaints)
         rules = [rule for rule in config.imports if config.endpoint_of(rule) == at]
-        held = [*self._held.described(Right.READ), *self._held.described(Right.CALL)]
+        held = [*self.held.described(Right.READ), *self.held.described(Right.CALL)]
         yield from imported(rules, graph, held, complaints)
 
     def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
         """Begin a flow, or record why this graph does not allow it."""
-        topic = self._held.find(flow_spec.name, _right(flow_spec))
+        topic = self.held.find(flow_spec.name, _right(flow_spec))
         if topic is None:
             self._undelegated[key] = flow_spec
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
@@ -527,8 +517,8 @@ class Bridge:
     def _may_finish(self, key: _Key) -> bool:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
         flow_spec, _ = self._flows[key]
-        rules = self._config.expose if flow_spec.is_exposed else self._config.imports
-        return flow_spec.rule in rules and self._held.find(flow_spec.name, _right(flow_spec)) is not None
+        rules = self.rules.expose if flow_spec.is_exposed else self.rules.imports
+        return flow_spec.rule in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
 
     def _finish(self, key: _Key) -> None:
         """End a flow; the last messages of an exposed one stay until readers have confirmed them."""
@@ -567,12 +557,14 @@ class Bridge:
 
     def _close_finished(self, now_s: float) -> None:
         for name, each in list(self._finishing.items()):
-            if now_s >= each.ends_s or self._context.member.is_acknowledged(name):
+            if now_s >= each.ends_s or self._context.member.publications.is_acknowledged(name):
                 self._close_finishing(name)
 
     def _close_finishing(self, name: Name) -> None:
         flow_spec, flow, _ = self._finishing.pop(name)
-        if not self._context.member.is_acknowledged(name) and (count := self._context.member.unacknowledged(name)):
+        if not self._context.member.publications.is_acknowledged(name) and (
+            count := self._context.member.publications.unacknowledged(name)
+        ):
             detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
             self._context.faults.report(flow_spec.local, Fault.UNCONFIRMED, detail)
         self._close(flow_spec, flow)
@@ -586,19 +578,19 @@ class Bridge:
     def _how_to_delegate(self, flow_spec: FlowSpec) -> str:
         return (
             f"no delegation to {_right(flow_spec).value} [{flow_spec.type_name}] as {flow_spec.name.to_text()} in"
-            f" {self._held.directory}; the owner makes all that this proxy needs with"
+            f" {self.held.directory}; the owner makes all that this proxy needs with"
             " 'gdp delegate --owner OWNER --live FILE' (FILE: its proxy.yaml)"
         )
 
     def _tell(self, complaints: Sequence[ConfigProblem]) -> None:
         """Report new configuration problems; a problem that ended may be reported again later."""
         now = set(complaints)
-        for complaint in self._complaints - now:
+        for complaint in self.problems - now:
             if complaint.fault is not Fault.UNKNOWN_TYPE and complaint.fault is not Fault.NO_DELEGATION:
                 self._context.faults.clear(complaint.local, complaint.fault)
-        for complaint in now - self._complaints:
+        for complaint in now - self.problems:
             self._context.faults.report(complaint.local, complaint.fault, complaint.detail)
-        self._complaints = now
+        self.problems = now
 
 
 def _shown_as(flow_spec: FlowSpec) -> str:

@@ -159,7 +159,7 @@ class ExposedService(ServiceFlow):
         """Process requests that waited for their description, and check which clients are still present."""
         self._look_at_clients(now_s)
         if self._kept is not None:
-            self._kept.update_sequencer(self.context.member.peers(self.name), now_s)
+            self._kept.update_sequencer(self.context.member.services.peers(self.name), now_s)
         self.handle_timer(now_s)
 
     def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
@@ -193,7 +193,7 @@ class ExposedService(ServiceFlow):
         if is_closed and self._kept is not None:
             self._kept.close()
         is_idle = not self._serving and (self._kept is None or self._kept.is_idle)
-        return is_closed and is_idle and self.context.member.is_acknowledged(self.name)
+        return is_closed and is_idle and self.context.member.publications.is_acknowledged(self.name)
 
     def finish(self, now_s: float) -> None:
         """Fail the calls under way, and refuse requests from now on."""
@@ -219,14 +219,14 @@ class ExposedService(ServiceFlow):
 
     def _look_at_clients(self, now_s: float) -> None:
         """Process requests that waited for their description; drop the calls of clients that left."""
-        writer_proxies = self.context.member.writer_proxies_of(self.name)
+        writer_proxies = self.context.member.subscriptions.writer_proxies_of(self.name)
         known = {bytes(writer_proxy.publisher): writer_proxy.description for writer_proxy in writer_proxies}
         for _ in range(self._early.forget_all_but(known.keys())):
             self._drop_early("a client left before its description came")
         for client, description in known.items():
             for message in self._early.poll_messages(client):
                 self.receive(message._replace(description=description), now_s)
-        here = {self.context.member.name, *self.context.member.connected_peers(self.name)}
+        here = {self.context.member.name, *self.context.member.services.connected_peers(self.name)}
         for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
             self._cancellation.handle_client_gone(client)
 

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Final
 
 from gdp.client.participant import Message, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
@@ -158,9 +159,8 @@ class ImportedService(ServiceFlow):
         """Return the monotonic second of the next timer, or None."""
         if self._sender.is_ready:
             return 0.0
-        times = [dispatch.get_timer() for dispatch in self._calls]
-        times.append(self._virtual_server.get_timer(self._now_s))
-        return min((time for time in times if time is not None), default=None)
+        of_calls = (dispatch.get_timer() for dispatch in self._calls)
+        return earliest(self._virtual_server.get_timer(self._now_s), *of_calls)
 
     def close(self, now_s: float) -> None:
         """Close the virtual server; calls under way fail."""

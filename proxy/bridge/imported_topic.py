@@ -53,6 +53,7 @@ class ImportedTopic:
         local_readers: how many there are on this machine.
         thinned: messages that the rule's rate left out.
         last_s: monotonic second of the newest message that arrived; None: there was none.
+        is_joined: whether it is subscribed: a local node reads it.
 
     Raises:
         LocalError: this graph does not accept a publisher of it.
@@ -66,7 +67,7 @@ class ImportedTopic:
         self._topic = topic
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
-        self._is_joined = False
+        self.is_joined = False
         self.local_readers = 0
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
@@ -84,10 +85,10 @@ class ImportedTopic:
         """Update the local readers."""
         self.local_readers = len(ends)
         self._tell_unmatched(ends)
-        if ends and not self._is_joined:
-            self._is_joined = True
+        if ends and not self.is_joined:
+            self.is_joined = True
             self._context.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
-        elif not ends and self._is_joined:
+        elif not ends and self.is_joined:
             self._leave()
             self._output.drop_kept()
         self._output.receive_readers(ends)
@@ -117,14 +118,9 @@ class ImportedTopic:
         if isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
-    @property
-    def is_joined(self) -> bool:
-        """Return whether it is subscribed: a local node reads it."""
-        return self._is_joined
-
     def parties(self, now_s: float) -> list[Party]:
         """Return the publishers that are known now."""
-        names = [each.publisher for each in self._context.member.writer_proxies_of(self._topic.name)]
+        names = [each.publisher for each in self._context.member.subscriptions.writer_proxies_of(self._topic.name)]
         self._heard_s = {name: self._heard_s[name] for name in names if name in self._heard_s}
         ago_s = {name: now_s - heard_s for name, heard_s in self._heard_s.items()}
         return [Party("publisher", name.to_text(), ago_s.get(name)) for name in names]
@@ -132,7 +128,7 @@ class ImportedTopic:
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
         del now_s
-        if self._is_joined:
+        if self.is_joined:
             self._leave()
         self.count_losses()
         self._output.close()
@@ -140,7 +136,7 @@ class ImportedTopic:
     def renew(self, topic: Topic) -> None:
         """Replace the delegation."""
         self._topic = topic
-        if self._is_joined:
+        if self.is_joined:
             self._context.member.renew(topic)
 
     def set_offered(self, flow_spec: FlowSpec) -> None:
@@ -152,12 +148,12 @@ class ImportedTopic:
         """Update the losses in the topic's statistics."""
         self.stats.losses = losses = Losses()
         losses.update(self._past_losses)
-        if self._is_joined:
-            losses.update(self._context.member.losses_of(self._topic.name))
+        if self.is_joined:
+            losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
 
     def _leave(self) -> None:
-        self._is_joined = False
-        self._past_losses.update(self._context.member.losses_of(self._topic.name))
+        self.is_joined = False
+        self._past_losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
         self._context.member.unsubscribe(self._topic.name)
 
     def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:

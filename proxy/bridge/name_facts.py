@@ -236,7 +236,7 @@ def _rights(
 def _overlay(member: Participant, name: Name, right: Right, now: Timestamps) -> dict[str, object]:
     """Return what is known of the far ends of a name."""
     del now
-    proxies = member.writer_proxies_of(name)
+    proxies, subscription = member.subscriptions.writer_proxies_of(name), member.subscriptions.get(name)
     drops: dict[str, int] = {}
     for each in proxies:
         for reason, count in each.drops.items():
@@ -244,15 +244,15 @@ def _overlay(member: Participant, name: Name, right: Right, now: Timestamps) -> 
     known: dict[str, object] = {
         "writers": len(proxies),
         "live": sum(each.state is WriterProxyState.LIVE for each in proxies),
-        "absent": member.absent_writers(name),
+        "absent": 0 if subscription is None else len(subscription.absent),
         "is_reliable": not any(each.delivery.is_reliable is False for each in proxies),
         "drops": drops,
     }
     if right in (Right.SERVE, Right.CALL):
         known |= {
-            "connected": len(member.peers(name)),
-            "silent": len(member.silent_peers(name)),
-            "readers": len(member.connected_peers(name)),
+            "connected": len(member.services.peers(name)),
+            "silent": len(member.services.silent_peers(name)),
+            "readers": len(member.services.connected_peers(name)),
         }
     return known
 

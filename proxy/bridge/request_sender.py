@@ -63,7 +63,7 @@ class RequestSender:
             while effects := dispatch.poll_effects():
                 for effect in effects:
                     if isinstance(effect, End):
-                        self._flow.context.member.end_call(self._flow.name, (part, effect.call))
+                        self._flow.context.member.services.end_call(self._flow.name, (part, effect.call))
                         continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):
@@ -85,7 +85,7 @@ class RequestSender:
             if call is None:
                 self._publisher.publish(wire)
             else:
-                self._flow.context.member.send_requests(self._flow.name, wire, call)
+                self._flow.context.member.services.send_requests(self._flow.name, wire, call)
             self._flow.context.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:
@@ -100,7 +100,9 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._flow.context.member.send_request(self._flow.name, server, wire, self._key_of(part, effect))
+                self._flow.context.member.services.send_request(
+                    self._flow.name, server, wire, self._key_of(part, effect)
+                )
                 self._flow.context.traffic.sent(len(wire))
             self._trace(part, effect, [server])
         except LocalError as error:

@@ -55,7 +55,7 @@ class ResponseSender:
     def send_wire(self, client: Name, wire: bytes) -> None:
         """Send bytes to one client; nothing is sent to a client that has gone."""
         try:
-            self._flow.context.member.respond(self._flow.name, client, wire)
+            self._flow.context.member.services.respond(self._flow.name, client, wire)
         except LocalError:
             self._flow.context.traffic.unread += 1  # the client is gone
             return

@@ -59,8 +59,8 @@ class ServerDiscovery:
         """Compare the servers with those that are reachable now, and report each change to the calls."""
         member = self._flow.context.member
         # If no server keeps up, waiting for one that may recover is better than giving up.
-        peers = set(member.peers(self._flow.name) or member.connected_peers(self._flow.name))
-        writer_proxies = member.writer_proxies_of(self._flow.name) if peers else []
+        peers = set(member.services.peers(self._flow.name) or member.services.connected_peers(self._flow.name))
+        writer_proxies = member.subscriptions.writer_proxies_of(self._flow.name) if peers else []
         heard = {
             writer_proxy.publisher: writer_proxy for writer_proxy in writer_proxies if writer_proxy.publisher in peers
         }

@@ -84,8 +84,8 @@ class ServiceFlow(ABC):
     def parties(self, now_s: float) -> list[Party]:
         """Return the far parties that are known now."""
         del now_s
-        silent = set(self.context.member.silent_peers(self.name))
-        names = dict.fromkeys([*self.context.member.connected_peers(self.name), *silent])
+        silent = set(self.context.member.services.silent_peers(self.name))
+        names = dict.fromkeys([*self.context.member.services.connected_peers(self.name), *silent])
         return [Party(self.far_role, each.to_text(), is_silent=each in silent) for each in names]
 
     def renew(self, topic: Topic) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from gdp.due_queue import earliest
 from proxy.bridge.core.action_interface import PROFILES
 from proxy.bridge.local_responses import LocalResponses
 from proxy.bridge.service_flow import ServiceFlow
@@ -86,8 +87,7 @@ class VirtualServer:
 
     def get_timer(self, now_s: float) -> float | None:
         """Return the monotonic second at which ``flush`` has something to do, or None."""
-        times = [self._responses.get_timer(now_s), self._ends_s]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self._responses.get_timer(now_s), self._ends_s)
 
     def _end_closing(self) -> None:
         self._responses.flush_all()

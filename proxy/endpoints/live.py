@@ -6,12 +6,16 @@ I/O. Only the named ones are imported, because each endpoint needs packages of i
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
+from gdp.extras import Seam
 from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import RosEndpoint
 
 __all__ = ["open_endpoint", "open_endpoints"]
+
+_ENDPOINTS: Final[Seam[Callable[[int, str], RosEndpoint]]] = Seam("gdp.endpoint")
 
 
 def open_endpoint(end: RosGraphConfig, node: str) -> RosEndpoint:
@@ -25,9 +29,7 @@ def open_endpoint(end: RosGraphConfig, node: str) -> RosEndpoint:
 
         return Ros1Endpoint(end.master_uri, node)
     if end.endpoint == "dds":
-        from proxy.endpoints.dds import DdsEndpoint
-
-        return DdsEndpoint(end.domain_id, node)
+        return _ENDPOINTS.get("dds", "endpoint dds")(end.domain_id, node)
     from proxy.endpoints.ros2 import Ros2Endpoint
 
     return Ros2Endpoint(end.domain_id, node)

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from itertools import count
 
 from gdp.errors import LocalError
-from proxy.doors.types import known_channel
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, RequestReceived, Role
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos
+from proxy.serial.known_types import known_channel
 from proxy.serial.service import Service
 
 __all__ = ["Probe"]

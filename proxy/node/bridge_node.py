@@ -7,33 +7,37 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
 from gdp.errors import LocalError
+from gdp.extras import Seam
 from gdp.intervals import TICK_S
+from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge, FlowChange
+from proxy.bridge.call_tracer import CallTracer
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.topic_stats import percentile
-from proxy.config.config import ProxyConfig
+from proxy.config.config import ProxyConfig, Traces
 from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
 from proxy.node.node import ProxyNode, run_node
-from proxy.node.otel_tracer import open_tracer
 from proxy.node.proxy_state import described
 from proxy.node.state_answer import answer_for_proxy
 
-__all__ = ["run"]
+__all__ = ["open_tracer", "run"]
 
 log = logging.getLogger(__name__)
 
 _LOOK_S: Final = 2.0  # with less, a new proxy may not detect yet that another proxy of its graph carries the same
 DRAIN_MAX_S: Final = 10.0  # after this time a leaving server abandons unanswered requests
 _TURN_S: Final = 0.0002  # longest wait of an endpoint's thread for the interpreter; Python's default is 5 ms
+_TRACERS: Final[Seam[Callable[[Traces, Name, str], CallTracer]]] = Seam("gdp.tracer")
 
 
 def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
@@ -87,6 +91,17 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                     echo(f"  {sent_stats.words()}")
             traffic, faults = state.context.traffic, state.context.faults
             echo(f"{traffic.messages_out} messages sent, {traffic.messages_in} received, {faults.total} faults")
+
+
+def open_tracer(traces: Traces | None, node: Name, label: str) -> CallTracer:
+    """Return the tracer that a configuration asks for.
+
+    Raises:
+        MissingExtraError: it asks for one, and the extra ``otel`` is not installed.
+    """
+    if traces is None:
+        return CallTracer()
+    return _TRACERS.get("otel", "traces")(traces, node, label)
 
 
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:

@@ -46,8 +46,8 @@ def answer_for_proxy(state: ProxyState, bridge: Bridge) -> None:
         )
 
     def holders(name: Name, _now_s: float) -> set[Name]:
-        publishers = (each for each in member.publishers() if each.topic == name)
+        publishers = (each for each in list(member.publications) if each.topic == name)
         readers = {reader for each in publishers for reader in map(Name, each.matched.names())}
-        return readers | {each.publisher for each in member.writer_proxies_of(name)}
+        return readers | {each.publisher for each in member.subscriptions.writer_proxies_of(name)}
 
     answer_state(member.diagnostics, policy, gather, holders)

@@ -22,11 +22,11 @@ from gdp.nodes.membership import load_member
 from gdp.stores.keyring import CARD
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
+from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.probe import Probe
-from proxy.node.door import door_config
+from proxy.node.member_config import member_config
 from proxy.node.node import run_node
 
 __all__ = ["Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
@@ -104,7 +104,7 @@ def find_access(node: Path, iface: str | None, delegations: Path | None, wanted:
     Raises:
         LocalError: the node does not exist or lacks the right, which the text says how to get; or several names fit.
     """
-    config, directory = door_config(node, iface, delegations)
+    config, directory = member_config(node, iface, delegations)
     identity, _ = load_member(config.identity, config.domain, Role.PROXY)
     held = DelegationStore(directory, identity)
     found = [topic for topic in held if wanted.fits(topic)]
@@ -136,10 +136,10 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
     """
     rule = access.rule if timeout_s is None else access.rule.model_copy(update={"timeout_s": timeout_s})
     with run_node(access.config) as node:
-        state, bridge = node.state, Bridge(node.state.context, DoorRules((), [rule]), [probe], access.held)
+        state, bridge = node.state, Bridge(node.state.context, DelegatedRules((), [rule]), [probe], access.held)
         state.bridge, state.shows_held = bridge, False
         node.on_reload = lambda: bridge.reload(
-            DoorRules((), [rule]), DelegationStore(access.held.directory, node.identity)
+            DelegatedRules((), [rule]), DelegationStore(access.held.directory, node.identity)
         )
         node.runtime.watch(probe)
         attach_by_s = time.monotonic() + ATTACH_S
@@ -164,7 +164,7 @@ def names_held(node: Path, right: Right) -> Iterator[str]:
     Raises:
         GdpError: the node cannot be read.
     """
-    config, directory = door_config(node, None, None)
+    config, directory = member_config(node, None, None)
     identity, _ = load_member(config.identity, config.domain, Role.PROXY)
     for metadata, _ in DelegationStore(directory, identity).described(right):
         yield str(metadata["name"])

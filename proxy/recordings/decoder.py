@@ -74,6 +74,9 @@ class BagDecoder:
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or a rosbag2 folder.
 
+    Attributes:
+        channels: every topic of every publisher, in the recording's order.
+
     Raises:
         ConfigError: it cannot be read.
     """
@@ -85,13 +88,8 @@ class BagDecoder:
         except _FOREIGN as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
         checked = [_checked(channel) for channel in self._source.channels]
-        self._channels = [channel for channel, _ in checked]
+        self.channels = [channel for channel, _ in checked]
         self._opaque = [reason for _, reason in checked if reason]
-
-    @property
-    def channels(self) -> list[Channel]:
-        """Return every topic of every publisher, in the recording's order."""
-        return self._channels
 
     @property
     def count(self) -> int:

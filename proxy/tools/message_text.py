@@ -12,9 +12,9 @@ import orjson
 import yaml
 
 from gdp.errors import DropReason, LocalError, RemoteError
-from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.serial.channel import Channel
 from proxy.serial.json_dialect import JsonDialect
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.schema import DefinitionError, Number, parse
 from proxy.serial.serializer import Codec, native_codec
 

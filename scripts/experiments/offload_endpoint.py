@@ -74,7 +74,7 @@ class _CycloneEnd:
     """Node of ROS 2 on Cyclone DDS."""
 
     def __init__(self, domain: int) -> None:
-        from proxy.endpoints.dds.endpoint import DdsEndpoint
+        from gdp_extensions.dds.endpoint import DdsEndpoint
 
         self._endpoint = DdsEndpoint(domain, "offload")
         self._heard: dict[int, Callable[[bytes], None]] = {}

@@ -20,8 +20,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.validity import Validity
-from gdp.intervals import ADVERTISEMENT, NEIGHBOUR
-from gdp.limits import SCAPY_KEEPALIVE_MS
+from gdp.intervals import ADVERTISEMENT, NEIGHBOUR, SCAPY_KEEPALIVE_MS
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore

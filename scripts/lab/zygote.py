@@ -49,7 +49,7 @@ _PRELOADED: Final = (
     "pyroute2.netns",
 )
 _STARTERS: Final = ("fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo")  # these start many programs
-_PACKAGES: Final = ("gdp", "proxy", "fog", "ring", "internet", "internet_demo", "fog_demo", "lab")
+_PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
 _SPACES: Final = ("cgroup", "ipc", "mnt", "pid", "user", "uts")

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
-from gdp.intervals import ADVERTISEMENT
-from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
+from gdp.intervals import ADVERTISEMENT, LEASE_MAX_S, LEASE_MIN_S
 from lab.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults

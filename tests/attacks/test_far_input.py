@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import cbor2
@@ -16,16 +15,15 @@ from gdp.errors import RemoteError
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.expander import MessageExpander
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.reduce.compression import BodyDecompressor
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.empty import NoAnswer
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Encoding, Serializer, canonical
 from proxy.wire.message import RosMessage, Step, TopicDescription
 from tests.attacks.test_recorder import Recorder, channel, described, ros_message
-from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -303,40 +301,3 @@ def test_y07_an_error_about_a_local_message_ends_that_message_only(
     _say(sites, robot, "/other", "heard too")
     assert (chatter.texts, other.texts) == (["heard"], ["heard too"])
     assert robot.faults == {"internal": 1}
-
-
-def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_gets_the_next_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pytest.importorskip("websockets")
-    from lab.process import until
-    from proxy.doors.foxglove_session import FoxgloveSession
-    from tests.proxy.doors.test_foxglove_door import (
-        advertised,
-        client,
-        door_of,
-        heard,
-        message,
-        readers,
-        subscribe,
-    )
-
-    encode = FoxgloveSession.encode
-    monkeypatch.setattr(
-        FoxgloveSession, "encode", lambda self, item: _fault() if item.raw == b"bad" else encode(self, item)
-    )
-    door = door_of()
-    try:
-        with client(door) as listener:
-            handle = door.advertise(replace(known.channel(STRING), topic="/chatter"))
-            subscribe(listener, 7, advertised(listener))
-            until(lambda: bool(readers(door)))
-            for raw in (b"bad", b"good"):
-                door.publish(handle, raw)
-            status = heard(listener)
-            assert (status["op"], status["level"]) == ("status", 2)
-            assert "ZeroDivisionError" in str(status["message"])
-            assert message(listener) == (7, b"good")
-            assert door.dropped == 1
-    finally:
-        door.shut_down()

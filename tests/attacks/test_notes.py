@@ -9,7 +9,7 @@ import pytest
 from gdp.client.path_mtu import PLATEAUS, PathMtu
 from gdp.client.reader_proxies import READERS_MAX
 from gdp.client.writer_proxy import WriterProxyState
-from gdp.crypto.control_seal import ControlSealer
+from gdp.crypto.control_seal import ControlContext, ControlSealer
 from gdp.crypto.envelope import seal_key
 from gdp.crypto.introduction import Introduction
 from gdp.errors import DropReason
@@ -51,12 +51,7 @@ def by_the_secret_alone(pipe: Pipe, end: End, number: int, acknack: AckNack) -> 
     made = ControlSealer(
         key=key,
         epoch=1,
-        kind=Kind.ACKNACK,
-        source=reader.name,
-        incarnation=reader.incarnation,
-        destination=source.name,
-        topic=TOPIC,
-        destination_incarnation=source.incarnation,
+        context=ControlContext(Kind.ACKNACK, reader.name, reader.incarnation, source.name, source.incarnation, TOPIC),
         numbers=iter([number]),
     )
     return made.seal(acknack.to_wire())

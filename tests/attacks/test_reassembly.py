@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import urandom
 
-from gdp.crypto.envelope import Opener, Sealer, Signer
+from gdp.crypto.envelope import KeyContext, Opener, Sealer, Signer
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, MESSAGE_MAX_BYTES
@@ -32,10 +32,7 @@ class Stream:
         sealer = Sealer(
             secret=SECRET,
             epoch=1,
-            kind=Kind.DATA,
-            source=self.source,
-            incarnation=INCARNATION,
-            destination=self.topic,
+            context=KeyContext(Kind.DATA, self.source, INCARNATION, self.topic),
             signer=signer,
             random_bytes=urandom,
         )
@@ -103,10 +100,7 @@ def test_a58_the_largest_message_of_a_lone_source_fits_and_so_do_three() -> None
     sealer = Sealer(
         secret=SECRET,
         epoch=1,
-        kind=Kind.DATA,
-        source=stream.source,
-        incarnation=INCARNATION,
-        destination=stream.topic,
+        context=KeyContext(Kind.DATA, stream.source, INCARNATION, stream.topic),
         signer=WRITER,
         random_bytes=urandom,
     )

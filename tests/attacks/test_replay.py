@@ -39,15 +39,17 @@ def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(rel
     assert world.network.run(10, lambda: reader.attachment.is_attached)
     reader.subscribe(world.topic(flow.name, reader, [Right.READ]))
     world.network.send_pending(SERVER)
-    assert world.network.run(10, lambda: bool(reader.writer_proxies_of(flow.topic.name)))
+    assert world.network.run(10, lambda: bool(reader.subscriptions.writer_proxies_of(flow.topic.name)))
     for frame in [each for each in tap.frames if each[1] in (Kind.HEARTBEAT, Kind.DATA)] * 2:
         world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
     world.network.run(1)
     assert reader.poll_messages() == []
-    assert [each.state for each in reader.writer_proxies_of(flow.topic.name)] == [WriterProxyState.NEW]
+    assert [each.state for each in reader.subscriptions.writer_proxies_of(flow.topic.name)] == [WriterProxyState.NEW]
     world.network.thaw(ROBOT)
     flow.got[SERVER] = []
-    assert world.network.run(20, lambda: reader.writer_proxies_of(flow.topic.name)[0].state is WriterProxyState.LIVE)
+    assert world.network.run(
+        20, lambda: reader.subscriptions.writer_proxies_of(flow.topic.name)[0].state is WriterProxyState.LIVE
+    )
     still_flows(flow)
     flow.outlive()
 
@@ -57,7 +59,7 @@ def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
     server, client = Party(world, SERVER, Right.SERVE), Party(world, ROBOT, Right.CALL)
-    assert world.network.run(10, lambda: client.member.peers(client.service) != [])
+    assert world.network.run(10, lambda: client.member.services.peers(client.service) != [])
     client.publish(b"open the gripper")
     assert world.network.run(10, lambda: server.bodies() == [b"open the gripper"])
     world.network.taps.clear()
@@ -66,7 +68,7 @@ def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server
     assert world.network.run(10, lambda: restarted.attachment.is_attached)
     server.got.clear()
     server.begin()
-    assert world.network.run(10, lambda: restarted.writer_proxies_of(server.service) != [])
+    assert world.network.run(10, lambda: restarted.subscriptions.writer_proxies_of(server.service) != [])
     for frame in [each for each in tap.frames if each[1] in (Kind.HEARTBEAT, Kind.DATA)] * 2:
         world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
     world.network.run(1)
@@ -98,7 +100,7 @@ def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> No
         world.network.run(0.05)
     assert world.network.run(5, lambda: flow.has(SERVER, before + 50))
     assert world.switches["nuc5"].drops()[DropReason.REPLAYED] >= 50
-    assert sum(world.members[SERVER].lost().values()) == 0
+    assert sum(world.members[SERVER].subscriptions.lost().values()) == 0
     flow.outlive()
 
 

@@ -94,7 +94,7 @@ def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: boo
     still_flows(flow)
     revoke(world, flow)
     world.network.run(1)
-    assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
+    assert not world.members[SERVER].subscriptions.writer_proxies_of(flow.topic.name)
     for switch in ("nuc1", "nuc5"):
         fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
         assert world.switches[switch].state.policy.revoked.has(fingerprint, world.owner.key.public.compressed)
@@ -205,7 +205,7 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
 
     monkeypatch.setattr(switch.state.verifier, "recheck", recheck)
     reader = world.members["nuc1/reader3"]
-    delegation = reader.subscribed()[0].delegation
+    delegation = next(each.topic for each in reader.subscriptions).delegation
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
     switch.revoke(wire, world.network.now)
     assert set(seen) == {reader.name}
@@ -325,7 +325,7 @@ def test_a_reader_of_a_topic_whose_switch_restarted_is_refused_by_what_its_rib_k
     world = ring()
     flow = flowing(world)
     reader = world.members[SERVER]
-    delegation = next(topic for topic in reader.subscribed() if topic.name == flow.topic.name).delegation
+    delegation = next(each.topic for each in reader.subscriptions if each.topic.name == flow.topic.name).delegation
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
     world.network.stop("nuc5")
     world.switches["nuc1"].revoke(wire, world.network.now)

@@ -8,8 +8,8 @@ from os import urandom
 
 import pytest
 
-from gdp.crypto.control_seal import ControlSealer
-from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, Sealer
+from gdp.crypto.control_seal import ControlContext, ControlSealer
+from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, KeyContext, Sealer
 from gdp.crypto.records import RecordKey
 from gdp.frame.codec import HEADER_BYTES
 from gdp.frame.kinds import Kind
@@ -29,10 +29,7 @@ def test_a32_copies_of_a_publisher_do_not_repeat_a_nonce() -> None:
         Sealer(
             secret=SECRET,
             epoch=1,
-            kind=Kind.DATA,
-            source=SOURCE,
-            incarnation=INCARNATION,
-            destination=TOPIC,
+            context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
             signer=WRITER,
             random_bytes=urandom,
         )
@@ -56,10 +53,7 @@ def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None
     sealer = Sealer(
         secret=SECRET,
         epoch=1,
-        kind=Kind.DATA,
-        source=SOURCE,
-        incarnation=INCARNATION,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
         signer=WRITER,
         random_bytes=draw,
     )
@@ -72,15 +66,7 @@ def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None
 def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> None:
     made = [
         ControlSealer(
-            key=b"k" * 32,
-            epoch=1,
-            kind=Kind.ACKNACK,
-            source=SOURCE,
-            incarnation=5,
-            destination=TOPIC,
-            topic=TOPIC,
-            destination_incarnation=9,
-            numbers=count(7),
+            key=b"k" * 32, epoch=1, context=ControlContext(Kind.ACKNACK, SOURCE, 5, TOPIC, 9, TOPIC), numbers=count(7)
         ).seal(body)
         for body in (ONE, OTHER)
     ]

@@ -18,7 +18,7 @@ _FORM = re.compile(
 )
 _WORDS_MAX = 100
 _REFERENCE = re.compile(r"\b(?:ADR|[Dd]ecision) (\d+)\b")
-_SOURCES = ("gdp", "proxy", "fog", "scripts", "tests", "netns_tests", "docs")
+_SOURCES = ("gdp", "proxy", "fog", "gdp_extensions", "scripts", "tests", "netns_tests", "docs")
 
 
 def _form(record: Path) -> re.Match[str]:

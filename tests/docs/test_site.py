@@ -49,7 +49,7 @@ def test_an_index_of_measurements_leads_to_every_page(index: str, folder: str) -
 
 def test_sections_of_the_design_that_the_code_cites_exist() -> None:
     stated = set(re.findall(r"^## (\d+)\.", (ROOT / "docs/explanation/design.md").read_text(), re.MULTILINE))
-    sources = [path for package in ("gdp", "proxy", "fog") for path in (ROOT / package).rglob("*.py")]
+    sources = [path for package in ("gdp", "proxy", "fog", "gdp_extensions") for path in (ROOT / package).rglob("*.py")]
     cited = {number for path in sources for pair in _CITATION.findall(path.read_text()) for number in pair if number}
     assert cited
     assert cited <= stated

@@ -30,12 +30,12 @@ from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
-from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
 from proxy.endpoints.core.endpoint import Origin, RosEndpoint
 from proxy.recordings.mcap_writer import McapWriter
 from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
+from proxy.serial.rosbridge_json import RosbridgeCodec, cbor_raw
 from proxy.serial.serializer import Encoding
 from proxy.tools.message_text import MessageText
 from proxy.wire.message import RosMessage, Step

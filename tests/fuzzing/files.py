@@ -19,7 +19,6 @@ from gdp.config.config import SwitchConfig
 from gdp.config.yaml_source import read_yaml
 from gdp.crypto.pbes2 import SECRET_LABEL, _parts, protect
 from gdp.errors import ConfigError, LocalError, RemoteError, StoreError
-from gdp.stores.token_uri import TokenUri
 from proxy.config.config import ProxyConfig
 from proxy.recordings.channels import offered_qos
 from proxy.recordings.decoder import BagDecoder
@@ -37,7 +36,6 @@ _BAG_TOKENS: Final = (b"op=\x05", b"op=\x02", b"conn=", b"compression=lz4", b"co
 _QOS: Final = b"- history: 3\n  depth: 1\n  reliability: 1\n  durability: 2\n  deadline: {sec: 1, nsec: 2}\n"
 _CONFIG: Final = b"identity: id\ndomain: {root: r.crt}\niface: a\nexpose:\n - {name: /a, type: a/msg/B, owner: o.pub}\n"
 _TOPICS: Final = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format"
-_TOKEN: Final = b"pkcs11:token=a%20b;object=n;id=%01;type=private?module-path=/l.so&pin-source=file:/p"
 _TEXT_MAX: Final = 8_192  # bytes: the readers of YAML are slow
 
 
@@ -179,7 +177,6 @@ DECODERS: Final = (
     ),
     Decoder("journal", _in_file("journal", _journal), (_journal_file(),), (StoreError, LocalError)),
     Decoder("machine-file", _in_file("machine.json", lambda path: MachineFile.read(path.parent)), (_MACHINE,), ()),
-    Decoder("token-uri", lambda data: TokenUri.from_text(data.decode("latin-1")), (_TOKEN,), (LocalError,)),
     Decoder("pbes2", _parts, (protect(bytes(96), b"p", bytes(32), SECRET_LABEL),), (LocalError,)),
     Decoder("boot", read_programs, (_PROGRAMS,), (LocalError,)),
     Decoder("plan", lambda data: ClusterPlan.from_json(data.decode("latin-1")), (_PLAN,), (LocalError,)),

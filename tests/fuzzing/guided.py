@@ -39,7 +39,7 @@ def instrumented_decoders() -> tuple[Decoder, ...]:
     """
     import atheris
 
-    with atheris.instrument_imports(include=["gdp", "proxy", "fog"]):
+    with atheris.instrument_imports(include=["gdp", "proxy", "fog", "gdp_extensions"]):
         from tests.fuzzing.registry import DECODERS
     return DECODERS
 

@@ -39,7 +39,7 @@ __all__ = [
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CORPUS: Final = ROOT / "tests" / "corpus"
-_PACKAGES: Final = tuple(str(ROOT / package) for package in ("gdp", "proxy", "fog"))
+_PACKAGES: Final = tuple(str(ROOT / package) for package in ("gdp", "proxy", "fog", "gdp_extensions"))
 _TRACE_EVERY: Final = 8
 _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length

@@ -15,7 +15,7 @@ from gdp.control.rib_replication import Entry
 from gdp.crypto import cbor
 from gdp.crypto.cbor import Value
 from gdp.crypto.certificates import Root, Unverified
-from gdp.crypto.control_seal import ControlOpener, ControlSealer
+from gdp.crypto.control_seal import ControlContext, ControlOpener, ControlSealer
 from gdp.crypto.envelope import Opener
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.kem import KemPublicKey
@@ -116,15 +116,7 @@ def _note(data: bytes) -> object:
 
 def _note_seed() -> bytes:
     return ControlSealer(
-        key=_KEY,
-        epoch=1,
-        kind=Kind.ACKNACK,
-        source=SOURCE,
-        incarnation=5,
-        destination=TOPIC,
-        topic=TOPIC,
-        destination_incarnation=9,
-        numbers=count(1),
+        key=_KEY, epoch=1, context=ControlContext(Kind.ACKNACK, SOURCE, 5, TOPIC, 9, TOPIC), numbers=count(1)
     ).seal(b"body")
 
 

@@ -23,7 +23,7 @@ from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto import cbor
-from gdp.crypto.envelope import Sealer
+from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import NAMED_SUBJECT, SUBJECT
@@ -711,7 +711,9 @@ class Forge:
         """Return a hostile control datagram of a reader's own writer proxy, by the key agreed with its publisher."""
         member = self._stage.world.members.get(persona.node)
         writer_proxies = (
-            [] if member is None else [each for each in member.writer_proxies() if each.state is WriterProxyState.LIVE]
+            []
+            if member is None
+            else [each for each in member.subscriptions.writer_proxies() if each.state is WriterProxyState.LIVE]
         )
         if not writer_proxies:
             return []
@@ -774,10 +776,7 @@ class Forge:
         sealer = Sealer(
             secret=secret,
             epoch=epoch,
-            kind=kind,
-            source=identity.name,
-            incarnation=incarnation,
-            destination=topic,
+            context=KeyContext(kind, identity.name, incarnation, topic),
             signer=identity.key,
             random_bytes=rng.randbytes,
         )

@@ -189,11 +189,11 @@ class Stage:
     def publish(self, message: bytes) -> None:
         """Let the insiders' publisher publish, and their server answer its clients."""
         member = self.world.members["nuc1/insider"]
-        for publisher in member.publishers():
+        for publisher in list(member.publications):
             publisher.publish(message)
         service = self.topics["nuc1/insider serve"].name
-        for client in member.connected_peers(service):
-            member.respond(service, client, message)
+        for client in member.services.connected_peers(service):
+            member.services.respond(service, client, message)
         member.flush(self.world.network.now.mono_s)
         self.world.network.send_pending("nuc1/insider")
 

@@ -55,7 +55,7 @@ class Party:
 
     def answer(self, client: Name, message: bytes) -> None:
         """Answer one client."""
-        self.member.respond(self.service, client, message)
+        self.member.services.respond(self.service, client, message)
         self._flush()
 
     def collect(self) -> list[Message]:
@@ -65,7 +65,7 @@ class Party:
         if self.right is Right.SERVE and self.answers:
             for each in messages:
                 if Name(each.delivered.publisher) in {
-                    writer_proxy.publisher for writer_proxy in self.member.writer_proxies_of(self.service)
+                    writer_proxy.publisher for writer_proxy in self.member.subscriptions.writer_proxies_of(self.service)
                 }:
                     self.answer(Name(each.delivered.publisher), each.delivered.message + b" by " + self.label.encode())
         return self.got
@@ -104,7 +104,7 @@ def meet(world: Simulation, *parties: Party, within_s: float = 5.0) -> bool:
 
     def have_met() -> bool:
         return all(
-            len(party.member.peers(party.service)) == (clients if party.right is Right.SERVE else servers)
+            len(party.member.services.peers(party.service)) == (clients if party.right is Right.SERVE else servers)
             for party in parties
         )
 

@@ -156,7 +156,7 @@ class Books:
         self.network.run(3)
         self.flow.collect()
         world = self.world
-        pending = sum(switch.resolver.pending_frames for switch in world.switches.values())
+        pending = sum(len(switch.resolver.pending) for switch in world.switches.values())
         ends = {"delivered": len(self.flow.got[B]), "parked": pending, **self.ledger.taken}
         assert self.ledger.taken["flying"] == pending == 0
         assert self._attempts == sum(ends.values()) + sum(self.reasons().values()), (ends, self.reasons())
@@ -308,5 +308,5 @@ def test_reliable_messages_that_were_published_all_come_whatever_the_books_say_o
         sim_link.loss = 0.05
     flow.stream(200, 0.002, 5_000)
     assert books.network.run(20, lambda: flow.has(B, 200))
-    (writer_proxy,) = books.world.members[B].writer_proxies_of(flow.topic.name)
+    (writer_proxy,) = books.world.members[B].subscriptions.writer_proxies_of(flow.topic.name)
     assert (flow.numbers(B), writer_proxy.losses.total) == (list(range(200)), 0)

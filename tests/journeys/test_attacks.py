@@ -158,7 +158,7 @@ def test_for_strangers_nothing_is_looked_for() -> None:
     ]
     found = attack(flow, frames, ("nuc1",))
     assert found == {DropReason.UNKNOWN_SENDER: 1_000}
-    assert flow.world.switches["nuc1"].resolver.pending_frames == 0
+    assert len(flow.world.switches["nuc1"].resolver.pending) == 0
     flow.outlive()
 
 
@@ -171,11 +171,11 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
     for number in range(2 * QUERIES_MAX):
         header = Header(Kind.DATA, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, number.to_bytes(32, "big"), b"e" * 32)
         world.network._nodes["nuc1"].machine.receive([ReceivedFrame(port, mac, encode(header))], world.network.now)
-    assert len(nuc1.resolver._queries) <= QUERIES_MAX + 8
+    assert len(nuc1.resolver.queries) <= QUERIES_MAX + 8
     assert nuc1.drops()[DropReason.PENDING_FULL] > 0
     world.network.send_pending("nuc1")
     world.network.run(6)
-    assert nuc1.resolver.pending_frames == 0
+    assert len(nuc1.resolver.pending) == 0
     still_flows(flow)
     flow.outlive()
 

@@ -81,7 +81,7 @@ def test_a_writer_proxy_that_was_closed_says_nothing_after_its_goodbye() -> None
     flow = flowing(ring())
     network, reader = flow.world.network, flow.world.members[SERVER]
     tap = Tap(SERVER, "nuc5")
-    writer_proxies: list[WriterProxy] = list(reader.writer_proxies())
+    writer_proxies: list[WriterProxy] = list(reader.subscriptions.writer_proxies())
     reader.leave()
     network.send_pending(SERVER)
     network.run(0.01)

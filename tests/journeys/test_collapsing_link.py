@@ -113,7 +113,7 @@ def test_a_link_that_collapses_stays_up_carries_what_is_urgent_and_recovers(kbit
     for name in TOPICS:
         assert collapse.share(name, thin_until_s + CATCHES_UP_S, thin_until_s + AFTER_S) == 1, name
         reader = collapse.world.members[READER]
-        lost = reader.losses_of(collapse.flows[name].topic.name).total
+        lost = reader.subscriptions.losses_of(collapse.flows[name].topic.name).total
         assert len(collapse.came_s[name]) + lost == collapse.count(name), f"{name}: what did not come is counted"
     collapse.flows["/odom"].outlive()
 

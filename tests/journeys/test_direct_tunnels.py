@@ -9,8 +9,7 @@ import pytest
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.intervals import ENDPOINT
-from gdp.limits import KEEPALIVE_MS
+from gdp.intervals import ENDPOINT, KEEPALIVE_MS
 from gdp.names import Name
 from gdp.switch.direct_tunnels import Action, Close, Open, Retry
 from gdp.trust.revocation import Revocation

@@ -93,7 +93,7 @@ class Replicas:
             self.serve(label)
         self.call(1, 1)
         member = self.net.cores[ROBOT].member
-        assert self.run(10.0, lambda: len(member.peers(self.topic.name)) == len(self.servers))
+        assert self.run(10.0, lambda: len(member.services.peers(self.topic.name)) == len(self.servers))
         self.call(1, 2)
         if case == "stalled":
             self.net.world.network.replace(f"s/{OTHER}", Stalled(self.net.cores[OTHER].member))
@@ -211,7 +211,7 @@ def test_a_server_that_joins_while_requests_follow_each_other_delays_at_most_the
         replicas.net.world.network.call(0.1 * number, ask)
     replicas.net.world.network.call(0.1 * JOINED_AFTER + 0.02, partial(replicas.serve, OTHER))
     assert replicas.run(20.0, look)
-    assert len(core.member.peers(replicas.topic.name)) == 2
+    assert len(core.member.services.peers(replicas.topic.name)) == 2
     before_s = median(took_s[number] for number in range(20, JOINED_AFTER))
     after_s = sorted(took_s[number] for number in range(JOINED_AFTER, REQUESTS))
     assert after_s[-1] <= 2 * before_s, [round(1e3 * each, 1) for each in after_s[-5:]]
@@ -269,7 +269,7 @@ def test_an_ended_call_sends_nothing_more_to_the_other_server_which_learns_that_
     replicas.call(307_200, 4)
     assert branch[0] <= 4 * 0.1 * 307_200
     replicas.run(2.0)
-    losses = [each.losses.counts for each in replicas.net.cores[OTHER].member.writer_proxies()]
+    losses = [each.losses.counts for each in replicas.net.cores[OTHER].member.subscriptions.writer_proxies()]
     assert sum(each[LossReason.CALL_ENDED] for each in losses) > 0
     assert all(each.keys() <= {LossReason.CALL_ENDED} for each in losses)
     replicas.links[OTHER].bytes_s = SERVER_BYTES_S

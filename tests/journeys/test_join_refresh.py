@@ -14,7 +14,7 @@ from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.intervals import JOIN, JOIN_PROOF, SoftState
 from gdp.limits import JOINS_AGAIN_MAX
-from gdp.switch import multicast
+from gdp.switch import multicast, upstream_joins
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology, chain
 from tests.journeys.flows import Flow, advertise, flowing
@@ -129,16 +129,17 @@ def test_joins_pass_a_queue_that_is_shorter_than_one_of_them(topics: int) -> Non
 
 
 def test_numbers_alone_keep_no_branch_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    # the lower switch never shows its proofs of its own accord
-    monkeypatch.setattr(multicast, "JOIN_PROOF", SoftState(1e9, periods=3e-9 * JOIN.refresh_s))
+    unasked = SoftState(1e9, periods=3e-9 * JOIN.refresh_s)  # the lower switch never shows its proofs of its own accord
+    monkeypatch.setattr(upstream_joins, "JOIN_PROOF", unasked)
+    monkeypatch.setattr(multicast, "JOIN_PROOF", unasked)
     world, (flow,) = two_switches()
     upper, joins = world.switches["s1"].multicast, Joins(world)
     world.network.run(12 * JOIN.refresh_s)
     assert 3 <= len(joins.whole) <= 4  # it had to
-    monkeypatch.setattr(multicast, "JOINS_AGAIN_MAX", 0)  # and now it never does
+    monkeypatch.setattr(upstream_joins, "JOINS_AGAIN_MAX", 0)  # and now it never does
     world.network.run(3 * JOIN.refresh_s + JOIN.lease_s)
     assert not upper.trees.of_topic(flow.topic.name)
-    monkeypatch.setattr(multicast, "JOINS_AGAIN_MAX", JOINS_AGAIN_MAX)
+    monkeypatch.setattr(upstream_joins, "JOINS_AGAIN_MAX", JOINS_AGAIN_MAX)
     world.network.run(JOIN.refresh_s + 0.1)
     flow.outlive()
 

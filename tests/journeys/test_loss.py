@@ -34,7 +34,7 @@ def away(flow: Flow, label: str, away_s: float) -> None:
 
 
 def assert_complete(flow: Flow) -> None:
-    losses = flow.world.members[READER].losses_of(flow.topic.name)
+    losses = flow.world.members[READER].subscriptions.losses_of(flow.topic.name)
     numbers = flow.numbers(READER)
     lost = [each for span in losses.ranges for each in range(span.first - 1, span.last)]
     assert numbers == sorted(set(numbers))
@@ -62,7 +62,7 @@ def test_a_reader_that_was_away_for_longer_costs_what_both_ends_count() -> None:
     flow = flow_of()
     away(flow, READER, REPORTS.lease_s + FORGET_S + 5.0)
     assert_complete(flow)
-    lost = flow.world.members[READER].losses_of(flow.topic.name)
+    lost = flow.world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert lost.total == flow.publisher.messages - flow.publisher.acknowledgements.acknowledged > 0
     assert lost.counts.keys() <= {LossReason.GIVEN_UP, LossReason.NO_READER}
 
@@ -71,7 +71,7 @@ def test_a_best_effort_topic_loses_what_was_sent_meanwhile_and_no_more() -> None
     flow = flow_of(reliable=False)
     away(flow, READER, 10.0)
     assert_complete(flow)
-    lost = flow.world.members[READER].losses_of(flow.topic.name).total
+    lost = flow.world.members[READER].subscriptions.losses_of(flow.topic.name).total
     assert 10.0 / EVERY_S <= lost <= 13.0 / EVERY_S
 
 
@@ -87,7 +87,7 @@ def test_what_a_publisher_says_in_a_new_life_before_its_reader_is_back_is_lost()
     again.stream(round(3 * ADVERTISEMENT.lease_s), 1.0, 100)
     again.publish(b"\xff" * 4)
     world.network.run(3 * ADVERTISEMENT.lease_s + 5)
-    losses = world.members[READER].losses_of(flow.topic.name)
+    losses = world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.PUBLISHER_RESTARTED}
     assert losses.ranges[0].first == 1
     again.collect()
@@ -105,7 +105,7 @@ def test_a_reader_that_starts_again_counts_what_came_between() -> None:
     world.restart_member(READER)
     flow.read_by(READER)
     world.network.run(3 * ADVERTISEMENT.lease_s)
-    losses = world.members[READER].losses_of(flow.topic.name)
+    losses = world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.READER_RESTARTED}
     assert first + losses.total + len(flow.numbers(READER)) == flow.publisher.messages
 
@@ -120,7 +120,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     world.network.run(3)
     flow.read_by(READER)
     world.network.run(3 * ADVERTISEMENT.lease_s)
-    assert world.members[READER].losses_of(flow.topic.name).total == 0
+    assert world.members[READER].subscriptions.losses_of(flow.topic.name).total == 0
     assert 10 < len(flow.numbers(READER)) < 40
 
 
@@ -133,4 +133,4 @@ def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_
     flow.read_by(READER)
     world.network.run(3 * ADVERTISEMENT.lease_s + 1)
     assert flow.numbers(READER) == [3, 4]
-    assert world.members[READER].losses_of(flow.topic.name).total == 0
+    assert world.members[READER].subscriptions.losses_of(flow.topic.name).total == 0

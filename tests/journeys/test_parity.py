@@ -75,7 +75,7 @@ class Camera:
 
     def recovered(self, reader: int = 0) -> int:
         """Return how many frames parity has restored at a reader."""
-        return sum(each.recovery.recovered for each in self.readers[reader].writer_proxies())
+        return sum(each.recovery.recovered for each in self.readers[reader].subscriptions.writer_proxies())
 
 
 def camera(*, fec: bool = True, reliable: bool = False, seed: int = 1, readers: int = 1) -> Camera:
@@ -210,7 +210,7 @@ def test_memory_of_recovery_is_released() -> None:
     made.stream(40, 0.1, JPEG_BYTES)
     made.cable.loss = 0.0
     made.flow.world.network.run(8.0)
-    assert made.readers[0].held_bytes == 0
+    assert made.readers[0].subscriptions.held_bytes == 0
     drops = Counter(made.readers[0].drops())
     assert drops[DropReason.UNUSED_PARITY]
     assert not drops[DropReason.BAD_TAG] + drops[DropReason.MALFORMED]

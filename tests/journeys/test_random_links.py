@@ -182,7 +182,7 @@ class Trial:
 
     def _counted(self, name: str) -> int:
         reader = self.world.members[self._member("reader")]
-        return len(self.came_s[name]) + reader.losses_of(self.flows[name].topic.name).total
+        return len(self.came_s[name]) + reader.subscriptions.losses_of(self.flows[name].topic.name).total
 
     def _is_counted(self, name: str) -> bool:
         return self._counted(name) == self.sent[name]

@@ -36,7 +36,7 @@ def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, 
 
 
 def ask(client: Party, server: Party, message: bytes) -> None:
-    client.member.send_request(client.service, server.member.name, message)
+    client.member.services.send_request(client.service, server.member.name, message)
     client.world.network.send_pending(client.label)
 
 
@@ -105,7 +105,7 @@ def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Ri
     rights = sorted(labels, key=lambda right: right is not first)
     parties = {right: Party(world, labels[right], right) for right in rights}
     client, server = parties[Right.CALL], parties[Right.SERVE]
-    assert world.network.run(30, lambda: bool(client.member.peers(client.service)))
+    assert world.network.run(30, lambda: bool(client.member.services.peers(client.service)))
     ask(client, server, b"first")
     assert work(world, server, client, until_s=5 if lossy else 0.05, have=1)
     assert client.bodies() == [b"first by s3/right"]
@@ -128,17 +128,17 @@ def test_requests_to_one_server_are_complete_and_in_order_over_links_that_lose()
 def test_who_is_not_heard_cannot_be_asked() -> None:
     world, client, (one, _) = cluster(*SERVERS[:2])
     with pytest.raises(LocalError, match="is not heard"):
-        client.member.send_request(client.service, world.members["s3/right"].name, b"?")
+        client.member.services.send_request(client.service, world.members["s3/right"].name, b"?")
     with pytest.raises(LocalError, match="no call of"):
-        one.member.send_request(client.service, client.member.name, b"?")
+        one.member.services.send_request(client.service, client.member.name, b"?")
     with pytest.raises(LocalError, match="no serve of"):
-        client.member.respond(client.service, one.member.name, b"?")
+        client.member.services.respond(client.service, one.member.name, b"?")
     gone = one.member.name
     one.member.withdraw(one.service)
     world.network.send_pending(one.label)
-    assert world.network.run(1, lambda: len(client.member.writer_proxies_of(client.service)) == 1)
+    assert world.network.run(1, lambda: len(client.member.subscriptions.writer_proxies_of(client.service)) == 1)
     with pytest.raises(LocalError, match="is not heard"):
-        client.member.send_request(client.service, gone, b"?")
+        client.member.services.send_request(client.service, gone, b"?")
 
 
 def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> None:
@@ -151,8 +151,8 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
     world.restart_member(one.label)
     one.got.clear()
     one.begin()
-    assert world.network.run(1, lambda: one.member.peers(one.service) == [client.member.name])
-    assert world.network.run(1, lambda: client.member.peers(client.service) == [one.member.name])
+    assert world.network.run(1, lambda: one.member.services.peers(one.service) == [client.member.name])
+    assert world.network.run(1, lambda: client.member.services.peers(client.service) == [one.member.name])
     ask(client, one, b"to the second life")
     assert work(world, one, until_s=1, have=1)
     world.network.run(2)
@@ -162,14 +162,16 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
 
 def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bounded() -> None:
     world, client, (one,) = cluster(SERVERS[0])
-    (public,) = one.member.writer_proxies_of(one.service)
+    (public,) = one.member.subscriptions.writer_proxies_of(one.service)
     public.state = WriterProxyState.NEW  # as if its first Heartbeat had been lost
     public.schedule.due_s = float("inf")
     messages = 40
     for number in range(messages):
         ask(client, one, bytes([number]) * 20_000)
     world.network.run(2)
-    (private,) = [writer_proxy for writer_proxy in one.member.writer_proxies() if writer_proxy is not public]
+    (private,) = [
+        writer_proxy for writer_proxy in one.member.subscriptions.writer_proxies() if writer_proxy is not public
+    ]
     assert private.delivery.delivered * 20_000 <= PRIVATE_WAIT_BYTES + 20_000
     assert private.drops[DropReason.MEMORY_FULL] > 0
     public.schedule.due_s = world.network.now.mono_s
@@ -183,8 +185,8 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
 @pytest.mark.momentary("two names are compared, nothing is sent")
 def test_the_two_directions_of_two_nodes_are_two_streams() -> None:
     _, client, (one,) = cluster(SERVERS[0])
-    (writer_proxy,) = client.member.writer_proxies_of(client.service)
-    (back,) = one.member.writer_proxies_of(one.service)
+    (writer_proxy,) = client.member.subscriptions.writer_proxies_of(client.service)
+    (back,) = one.member.subscriptions.writer_proxies_of(one.service)
     server, caller = ((each.publisher, each.incarnation) for each in (writer_proxy, back))
     assert len({private_name(client.service, *ends) for ends in ((server, caller), (caller, server))}) == 2  # type: ignore[arg-type]
 
@@ -197,7 +199,7 @@ def test_a_frozen_or_dead_server_holds_up_no_other_and_is_no_peer_after_a_second
     world.network.call(1.0, partial(world.network.stop if kill else world.network.freeze, victim.label))
     listed: list[int] = []
     for late_s in (-0.1, READER.refresh_s + 0.1):
-        world.network.call(1.0 + late_s, lambda: listed.append(len(client.member.peers(client.service))))
+        world.network.call(1.0 + late_s, lambda: listed.append(len(client.member.services.peers(client.service))))
     load.run(5, per_s=2_000)
     assert listed == [3, 2]
     for server in healthy:
@@ -225,7 +227,7 @@ def test_two_of_three_servers_may_freeze_at_once() -> None:
     load.run(3, per_s=1_000)
     assert len(load.waits_s[SERVERS[0]]) == 3_000
     assert load.worst_s(SERVERS[0]) <= READER.refresh_s
-    assert client.member.peers(client.service) == [servers[0].member.name]
+    assert client.member.services.peers(client.service) == [servers[0].member.name]
     outlive(world, client, servers[0])
 
 
@@ -236,7 +238,7 @@ def test_a_server_that_thaws_continues_with_new_requests_and_delays_no_other() -
     world.network.call(0.5, partial(world.network.freeze, frozen.label))
     world.network.call(2.5, partial(world.network.thaw, frozen.label))
     load.run(5, per_s=500, every_s=0.02)
-    assert len(client.member.peers(client.service)) == 3
+    assert len(client.member.services.peers(client.service)) == 3
     for label in SERVERS[:2]:
         assert len(load.waits_s[label]) == 2_500
         assert load.worst_s(label) <= READER.refresh_s
@@ -248,9 +250,9 @@ def test_a_server_that_thaws_continues_with_new_requests_and_delays_no_other() -
 def test_a_silent_server_is_no_peer_even_without_requests() -> None:
     world, client, (heard, silent) = cluster(*SERVERS[:2])
     world.network.run(3)
-    assert len(client.member.peers(client.service)) == 2
+    assert len(client.member.services.peers(client.service)) == 2
     world.network.stop(silent.label)
-    assert world.network.run(SERVER.lease_s + 0.3, lambda: len(client.member.peers(client.service)) == 1)
+    assert world.network.run(SERVER.lease_s + 0.3, lambda: len(client.member.services.peers(client.service)) == 1)
     outlive(world, client, heard)
 
 
@@ -260,7 +262,7 @@ def test_a_client_that_had_no_time_does_not_take_its_servers_for_silent() -> Non
     world.network.freeze(client.label)
     world.network.run(SERVER.lease_s + 1)
     client.member.handle_timer(world.network.now)  # before it has read the messages of that time
-    assert len(client.member.peers(client.service)) == 2
+    assert len(client.member.services.peers(client.service)) == 2
 
 
 def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
@@ -281,7 +283,7 @@ def test_a_restarted_server_is_a_peer_again_as_soon_as_it_is_there() -> None:
     load.run(2, per_s=100)
     world.restart_member(again.label)
     again.begin()
-    assert world.network.run(0.1, lambda: len(client.member.peers(client.service)) == 3)
+    assert world.network.run(0.1, lambda: len(client.member.services.peers(client.service)) == 3)
     client.publish(b"once more")
     assert work(world, again, until_s=0.1, have=1)
     assert again.bodies() == [b"once more"]
@@ -338,11 +340,11 @@ def test_a_new_server_is_a_peer_at_once_though_its_advertisements_and_questions_
     assert world.run_until_attached()
     clients = [Party(world, label, Right.CALL) for label in ("r/proxy", "r/watch")]
     old = Party(world, "m1/old", Right.SERVE).member.name
-    assert world.network.run(10.0, lambda: all(old in each.member.peers(each.service) for each in clients))
+    assert world.network.run(10.0, lambda: all(old in each.member.services.peers(each.service) for each in clients))
     world.network.set_link(spare, up=True)
     world.network.run(0.6)
     world.add_member("m2/new", "m2")
     name = Party(world, "m2/new", Right.SERVE).member.name
-    assert world.network.run(1.0, lambda: all(name in each.member.peers(each.service) for each in clients))
+    assert world.network.run(1.0, lambda: all(name in each.member.services.peers(each.service) for each in clients))
     world.network.run(3.25 * world.lease_s)
-    assert all({name, old} <= set(each.member.peers(each.service)) for each in clients)
+    assert all({name, old} <= set(each.member.services.peers(each.service)) for each in clients)

@@ -89,5 +89,5 @@ def test_links_that_fall_silent_while_a_border_starts_end_nothing(drawn: tuple[D
     assert numbers == sorted(set(numbers))
     assert numbers[-1] == count - 1, "traffic did not return"
     # With links of 0.3 s the reader may be silent for longer than its lease, so messages may be given up.
-    lost = sum(world.members["inner/reader"].lost().values())
+    lost = sum(world.members["inner/reader"].subscriptions.lost().values())
     assert lost == count - len(numbers), "lost without a report"

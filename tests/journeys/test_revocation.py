@@ -57,7 +57,9 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
     else:
         delegation = flow.topic.delegation
         if end == "reader":
-            delegation = next(s for s in reader.subscribed() if s.name == flow.topic.name).delegation
+            delegation = next(
+                each.topic for each in reader.subscriptions if each.topic.name == flow.topic.name
+            ).delegation
         fingerprint = parse(delegation.chain[-1]).fingerprint
         wire = world.owner.revoke(delegation.subject, fingerprint, until)
     world.switches[at].revoke(wire, world.network.now)
@@ -68,7 +70,7 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
         expected = {*world.switches, *(label.upper() for label in world.ribs), *world.members}
     assert keeps(world, fingerprint, key) >= expected
     if end != "reader":
-        assert not reader.writer_proxies_of(flow.topic.name)
+        assert not reader.subscriptions.writer_proxies_of(flow.topic.name)
         stored = [host.rib.state.store.routes(flow.topic.name) for host in world.ribs.values()]
         assert not any(stored)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
@@ -90,7 +92,7 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     revoke(world, flow.topic.delegation)
     world.network.run(WITHIN_S)
     assert {label: host.rib.names for label, host in world.ribs.items()} == {k: n - 1 for k, n in before.items()}
-    assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
+    assert not world.members[SERVER].subscriptions.writer_proxies_of(flow.topic.name)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(negative=True)
 
@@ -118,7 +120,7 @@ def test_a_revoked_publisher_that_advertises_again_is_refused() -> None:
 def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
     flow = flowing(ring())
     world = flow.world
-    reader = next(s for s in world.members[SERVER].subscribed() if s.name == flow.topic.name)
+    reader = next(e.topic for e in world.members[SERVER].subscriptions if e.topic.name == flow.topic.name)
     revoke(world, reader.delegation)
     world.network.run(WITHIN_S)
     tap = Tap("nuc1", "nuc2")
@@ -136,7 +138,7 @@ def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
     assert world.run_until_attached()
     flow = flowing(world, readers=(SERVER, "nuc4/other"))
     flow.stream(100, 0.05)
-    reader = next(s for s in world.members[SERVER].subscribed() if s.name == flow.topic.name)
+    reader = next(e.topic for e in world.members[SERVER].subscriptions if e.topic.name == flow.topic.name)
     world.network.call(1.0, lambda: revoke(world, reader.delegation))
     assert world.network.run(10, lambda: flow.has("nuc4/other", 100))
     assert flow.numbers("nuc4/other") == list(range(100))
@@ -180,7 +182,9 @@ def test_the_whole_way_to_another_reader_stands_while_one_is_taken_back(revoked:
     assert world.run_until_attached()
     readers = (SERVER, "nuc5/other")
     flow = flowing(world, readers=readers)
-    reader = next(s for s in world.members[readers[revoked]].subscribed() if s.name == flow.topic.name)
+    reader = next(
+        each.topic for each in world.members[readers[revoked]].subscriptions if each.topic.name == flow.topic.name
+    )
     until = int(world.network.now.unix_s) + 100_000
     fingerprint = parse(reader.delegation.chain[-1]).fingerprint
     world.switches["nuc5"].revoke(world.owner.revoke(reader.delegation.subject, fingerprint, until), world.network.now)

@@ -66,7 +66,7 @@ class Pair:
         """Check that every message came once, in order, in time, and that nothing looks like an attack."""
         assert self.late == []
         assert self.flow.numbers(READER) == list(range(self.sent))
-        assert self.reader.losses_of(self.flow.topic.name).total == 0
+        assert self.reader.subscriptions.losses_of(self.flow.topic.name).total == 0
         drops = Counter(self.reader.drops()) + Counter(self.flow.member.drops())
         assert {reason: count for reason, count in drops.items() if reason in ALARMS and count} == {}
 
@@ -128,7 +128,7 @@ def test_what_neither_path_brings_is_requested() -> None:
     made.publish(200, 10_000)
     made.at.world.network.run(2.0 + 200 * PERIOD_S)
     assert made.flow.numbers(READER) == list(range(made.sent))
-    assert made.reader.losses_of(made.flow.topic.name).total == 0
+    assert made.reader.subscriptions.losses_of(made.flow.topic.name).total == 0
     assert 0 < made.flow.publisher.protection.repairs < 100
 
 

@@ -52,7 +52,7 @@ def test_the_first_call_is_answered_as_soon_as_a_server_is_known(first: Right) -
     order = sorted((Right.SERVE, Right.CALL), key=lambda right: right is not first)
     parties = {right: Party(world, SERVER if right is Right.SERVE else ROBOT, right) for right in order}
     client, server = parties[Right.CALL], parties[Right.SERVE]
-    assert world.network.run(2, lambda: bool(client.member.peers(client.service)))
+    assert world.network.run(2, lambda: bool(client.member.services.peers(client.service)))
     client.publish(b"first")
     assert work(world, server, client, until_s=0.1, have=1)
     assert client.stream.drops[DropReason.NO_READER] == 0
@@ -100,10 +100,10 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     world = ring()
     _, client = pair(world)
     world.network.stop(SERVER)
-    assert world.network.run(READER.lease_s + 2, lambda: not client.member.peers(client.service))
-    assert world.network.run(40, lambda: not list(client.member.writer_proxies()))
+    assert world.network.run(READER.lease_s + 2, lambda: not client.member.services.peers(client.service))
+    assert world.network.run(40, lambda: not list(client.member.subscriptions.writer_proxies()))
     world.network.run(3.25 * world.lease_s)
-    assert list(client.member.writer_proxies()) == []
+    assert list(client.member.subscriptions.writer_proxies()) == []
 
 
 def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
@@ -111,12 +111,12 @@ def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     server, client = pair(world)
     server.member.withdraw(server.service)
     world.network.send_pending(SERVER)
-    assert world.network.run(1, lambda: not list(client.member.writer_proxies()))
-    assert client.member.peers(client.service) == []
+    assert world.network.run(1, lambda: not list(client.member.subscriptions.writer_proxies()))
+    assert client.member.services.peers(client.service) == []
     with pytest.raises(LocalError):
-        server.member.respond(server.service, client.member.name, b"too late")
+        server.member.services.respond(server.service, client.member.name, b"too late")
     world.network.run(3.25 * world.lease_s)
-    assert client.member.peers(client.service) == []
+    assert client.member.services.peers(client.service) == []
 
 
 def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
@@ -142,7 +142,9 @@ def test_a_restarted_server_answers_again() -> None:
     assert work(world, server, client, until_s=2, have=1)
     world.restart_member(SERVER)
     server.begin()
-    assert world.network.run(30, lambda: client.stream.readers == 1 and len(server.member.peers(server.service)) == 1)
+    assert world.network.run(
+        30, lambda: client.stream.readers == 1 and len(server.member.services.peers(server.service)) == 1
+    )
     world.network.run(1)
     client.publish(b"2")
     assert work(world, server, client, until_s=2, have=2)
@@ -205,7 +207,7 @@ def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
     with pytest.raises(LocalError, match="no delegation to serve"):
         member.serve(caller, b"")
     with pytest.raises(LocalError, match="no serve of"):
-        member.respond(caller.name, world.members[SERVER].name, b"")
+        member.services.respond(caller.name, world.members[SERVER].name, b"")
     with pytest.raises(LocalError, match="no delegation to call"):
         member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
 
@@ -221,7 +223,7 @@ def test_a_node_that_may_only_call_reaches_no_client_however_it_advertises() -> 
     world.network.send_pending(OTHER)
     world.network.run(2)
     assert liar.attachment.refusals[DropReason.NOT_DELEGATED] >= 1
-    assert client.member.peers(client.service) == [server.member.name]
+    assert client.member.services.peers(client.service) == [server.member.name]
     outlive(world, client, server)
 
 
@@ -264,7 +266,7 @@ def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_n
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=3)
     assert client.bodies() == [b"before", b"meanwhile", b"after"]
-    assert sum(writer_proxy.losses.total for writer_proxy in client.member.writer_proxies()) == 0
+    assert sum(writer_proxy.losses.total for writer_proxy in client.member.subscriptions.writer_proxies()) == 0
 
 
 def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it_lost() -> None:
@@ -280,7 +282,7 @@ def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it
     server.answer(client.member.name, b"after")
     assert work(world, client, until_s=3, have=2)
     assert client.bodies() == [b"before", b"after"]
-    assert sum(writer_proxy.losses.total for writer_proxy in client.member.writer_proxies()) == 1
+    assert sum(writer_proxy.losses.total for writer_proxy in client.member.subscriptions.writer_proxies()) == 1
     outlive(world, client, server)
 
 
@@ -299,13 +301,13 @@ def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -
     server, client = pair(world)
     server.answer(client.member.name, b"1")
     assert work(world, client, until_s=2, have=1)
-    streams = server.member._publications._private[server.service]
+    streams = server.member.publications._private[server.service]
     assert len(streams) == 1
     world.network.run(1)
     (writer_proxy,) = [
         writer_proxy
-        for writer_proxy in client.member.writer_proxies()
-        if writer_proxy not in client.member.writer_proxies_of(client.service)
+        for writer_proxy in client.member.subscriptions.writer_proxies()
+        if writer_proxy not in client.member.subscriptions.writer_proxies_of(client.service)
     ]
     writer_proxy.schedule.due_s = float("inf")  # it sends nothing any more
     world.network.run(READER.lease_s + 1.5 * FORGET_S)
@@ -385,11 +387,11 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
         world.owner.revoke(delegation.subject, link.fingerprint, link.validity.not_after_unix_s), world.network.now
     )
     world.network.send_pending("nuc5")
-    assert world.network.run(1, lambda: not server.member.peers(server.service))
+    assert world.network.run(1, lambda: not server.member.services.peers(server.service))
     with pytest.raises(LocalError, match="is not heard"):
         server.answer(client.member.name, b"?")
     world.network.run(3.25 * world.lease_s)
-    assert server.member.peers(server.service) == []
+    assert server.member.services.peers(server.service) == []
 
 
 def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:

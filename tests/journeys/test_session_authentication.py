@@ -9,7 +9,7 @@ import pytest
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.unicast_stream import PeerIncarnation, private_incarnation, private_name
-from gdp.crypto.envelope import SEAL_BYTES, SIGNATURE_BYTES, Sealer
+from gdp.crypto.envelope import SEAL_BYTES, SIGNATURE_BYTES, KeyContext, Sealer
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.session_seal import session_secret
@@ -56,18 +56,15 @@ class Pair:
 
     def forge(self, secret: bytes, *, is_session: bool, signer: SigningKey | None) -> list[bytes]:
         """Return the frames of a message to the client in the server's name, which any member could send."""
-        (at_client,) = self.client.member.writer_proxies_of(self.client.service)
-        (at_server,) = self.server.member.writer_proxies_of(self.server.service)
+        (at_client,) = self.client.member.subscriptions.writer_proxies_of(self.client.service)
+        (at_server,) = self.server.member.subscriptions.writer_proxies_of(self.server.service)
         server = PeerIncarnation(self.server.member.name, at_client.incarnation)
         client = PeerIncarnation(self.client.member.name, at_server.incarnation)
         stream = private_name(self.client.service, server, client, is_session=is_session)
         sealer = Sealer(
             secret=secret,
             epoch=1,
-            kind=Kind.DATA,
-            source=server.name,
-            incarnation=private_incarnation(stream),
-            destination=stream,
+            context=KeyContext(Kind.DATA, server.name, private_incarnation(stream), stream),
             address=client.name,
             signer=signer,
             random_bytes=urandom,
@@ -106,7 +103,9 @@ def topic_of(world: Simulation, member: Participant, right: Right, epochs: list[
 def incarnations(pair: Pair) -> set[int]:
     """Return the incarnations of each end that the other knows."""
     parties = (pair.server, pair.client)
-    return {each.incarnation for party in parties for each in party.member.writer_proxies_of(party.service)}
+    return {
+        each.incarnation for party in parties for each in party.member.subscriptions.writer_proxies_of(party.service)
+    }
 
 
 def drops(pair: Pair, reason: DropReason) -> int:
@@ -144,7 +143,7 @@ def test_a_member_with_the_topic_secret_cannot_make_a_message_of_a_session_strea
     pair = pair_of()
     pair.ask()
     before = drops(pair, DropReason.BAD_TAG)
-    (at_client,) = pair.client.member.writer_proxies_of(pair.client.service)
+    (at_client,) = pair.client.member.subscriptions.writer_proxies_of(pair.client.service)
     own_agreement = ExchangeKey.from_random(urandom(32)).agree(at_client.exchange, b"gdp-note-shared-1")[0]
     guesses = [topic_secret(pair), session_secret(own_agreement, topic_secret(pair), pair.client.service)]
     for secret in guesses:

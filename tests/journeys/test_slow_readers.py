@@ -117,7 +117,7 @@ def test_best_effort_a_slow_reader_makes_the_others_neither_lose_nor_wait() -> N
     got = flow.numbers(SLOW)
     assert got == sorted(set(got))
     assert len(got) + slow.dropped == 400
-    (writer_proxy,) = world.members[SLOW].writer_proxies()
+    (writer_proxy,) = world.members[SLOW].subscriptions.writer_proxies()
     assert writer_proxy.losses.total == 400 - len(got) > 0
     flow.outlive()
 
@@ -153,7 +153,7 @@ def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_learns_what_it_
     world.network.run(2)  # it takes the frames that still wait for it
     flow.publish((1_000).to_bytes(4, "big"))
     assert world.network.run(10, lambda: all(flow.numbers(label)[-1:] == [1_000] for label in (NEAR, FAR, SLOW)))
-    (writer_proxy,) = world.members[SLOW].writer_proxies()
+    (writer_proxy,) = world.members[SLOW].subscriptions.writer_proxies()
     assert len(flow.got[SLOW]) + writer_proxy.losses.total == 201
     assert flow.numbers(NEAR) == flow.numbers(FAR) == [*range(200), 1_000]
     flow.outlive()

@@ -99,7 +99,7 @@ def test_a_path_that_fails_takes_no_message_along_and_gets_its_share_back(which:
     striped.run(10)
     assert striped.second_share() == pytest.approx(0.5, abs=0.15)
     assert striped.flow.numbers(READER) == list(range(95))
-    assert striped.reader.losses_of(striped.flow.topic.name).total == 0
+    assert striped.reader.subscriptions.losses_of(striped.flow.topic.name).total == 0
 
 
 def test_short_messages_take_both_paths() -> None:

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gdp.limits import DETECT_MULTIPLIER, SCAPY_KEEPALIVE_MS
+from gdp.intervals import DETECT_MULTIPLIER, SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.trust.right import Right
 from tests.draws import draws
@@ -147,7 +147,7 @@ class Traffic:
             numbers = [number for number, _ in came]
             assert numbers == sorted(set(numbers)), f"{source} to {reader}"
             member = self.bed.world.members[f"{reader}/member"]
-            lost = member.losses_of(self.flows[source].topic.name).total
+            lost = member.subscriptions.losses_of(self.flows[source].topic.name).total
             assert lost == len(self.sent_s) - len(numbers), f"{source} to {reader}: lost without a report"
         for pair, came in (*self.read.items(), *self.answered.items()):
             if pair in direct:

@@ -168,7 +168,7 @@ class SimulatedChaos:
             self._record(member, kind, of[each.topic], incarnation, publisher, number)
         for channel, flow in enumerate(self._plan.flows):
             if member in flow.readers:
-                counts = Counter(node.losses_of(self._names[channel]).counts)
+                counts = Counter(node.subscriptions.losses_of(self._names[channel]).counts)
                 seen = self._seen.get((member, channel), Counter())
                 for reason, more in (counts - seen).items():
                     self._record(member, Kind.LOST, channel, 0, reason, more)

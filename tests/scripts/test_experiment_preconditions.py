@@ -179,7 +179,7 @@ def test_a_machine_names_the_commit_of_its_code_and_whether_code_was_changed() -
 
 def test_a_tree_without_git_writes_no_page_but_runs_quickly(tmp_path: Path) -> None:
     tree = tmp_path / "tree"
-    for part in ("scripts", "gdp", "fog", "proxy"):
+    for part in ("scripts", "gdp", "fog", "proxy", "gdp_extensions"):
         shutil.copytree(ROOT / part, tree / part, ignore=shutil.ignore_patterns("__pycache__", "data"))
     argv = [sys.executable, str(tree / "scripts/experiments/table1.py")]
     environment = {**os.environ, "PYTHONPATH": f"{tree}{os.pathsep}{tree / 'scripts'}"}

@@ -106,12 +106,13 @@ def test_limits_that_were_raised_in_a_commit_are_found(tmp_path: Path) -> None:
     assert [each["product lines"] for each in readability.limit_versions(tmp_path)] == [40, 45, 45]
 
 
-def test_lines_of_the_product_and_of_test_beds_are_counted_apart(tmp_path: Path) -> None:
-    names = ("gdp/a.py", "scripts/b.sh", "netns_tests/lab.py", "netns_tests/test_lab.py", "tests/c.py", "docs/d.md")
+def test_lines_of_the_product_its_core_and_of_test_beds_are_counted_apart(tmp_path: Path) -> None:
+    files = "gdp/a.py scripts/b.sh netns_tests/lab.py netns_tests/test_lab.py tests/c.py docs/d.md gdp_extensions/e.py"
+    names = files.split()
     for lines, name in enumerate(names, 1):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x\n" * lines)
-    assert readability.line_counts([tmp_path / name for name in names], tmp_path) == (1, 2 + 3)
+    assert readability.line_counts([tmp_path / name for name in names], tmp_path) == (1 + 7, 1, 2 + 3)
 
 
 def test_seconds_large_classes_and_long_constructors_are_counted() -> None:

@@ -73,16 +73,14 @@ class TxDrops:
     """Frames that devices and their queues refused to send; the kernel does not report them to a redirecting program.
 
     A device counts all senders: if others use it too, their frames are included.
+
+    Attributes:
+        total: frames refused since the first query of each device.
     """
 
     def __init__(self) -> None:
         self._last: dict[int, int] = {}  # by ifindex
-        self._total = 0
-
-    @property
-    def total(self) -> int:
-        """Frames refused since the first query of each device."""
-        return self._total
+        self.total = 0
 
     def poll(self, ask: NetlinkSocket, ifindexes: Iterable[int]) -> None:
         """Query these devices, and forget the others. Costs a dump of all queues: 4 ms with 32 ports.
@@ -95,7 +93,7 @@ class TxDrops:
         for ifindex, parent, facts in ask.queues() if now else ():
             if ifindex in now and parent == ROOT:
                 now[ifindex] += _queue_drops(facts)
-        self._total += sum(max(count - self._last.get(ifindex, count), 0) for ifindex, count in now.items())
+        self.total += sum(max(count - self._last.get(ifindex, count), 0) for ifindex, count in now.items())
         self._last = now
 
 

@@ -56,6 +56,9 @@ class KernelMap:
         value_bytes: size of one value; for a per-CPU map, on one CPU.
         name: shown by diagnostic tools.
 
+    Attributes:
+        value_bytes: bytes of one value as user space sees it: the values of all CPUs.
+
     Raises:
         BpfError: the kernel refuses it.
     """
@@ -64,20 +67,15 @@ class KernelMap:
         self.max_entries = max_entries
         self.name = name
         each = -(-value_bytes // 8) * 8
-        self._value_bytes = each * possible_cpus() if kind is MapKind.PERCPU_ARRAY else value_bytes
+        self.value_bytes = each * possible_cpus() if kind is MapKind.PERCPU_ARRAY else value_bytes
         flags = _NO_PREALLOC if kind is MapKind.HASH else 0
         shape = struct.pack("=5I", kind, key_bytes, value_bytes, max_entries, flags)
         attributes = bytearray(shape + struct.pack("=2I16s", 0, 0, name.encode()[:NAME_MAX]))
         self.fd = _create(attributes, f"make the map {name} of {max_entries} entries")
-        self._key, self._value = bytearray(key_bytes), bytearray(self._value_bytes)
+        self._key, self._value = bytearray(key_bytes), bytearray(self.value_bytes)
         self._one = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(self._key), address(self._value), 0))
         self._one_key = self._one[:16]  # an operation without a value must get none
         self._tried = f"map {name}"
-
-    @property
-    def value_bytes(self) -> int:
-        """Bytes of one value as user space sees it: the values of all CPUs."""
-        return self._value_bytes
 
     def close(self) -> None:
         """Close the descriptor; a program that uses the map keeps it."""
@@ -92,7 +90,7 @@ class KernelMap:
 
     def get(self, key: bytes) -> bytes | None:
         """Return one entry's value, None if there is none. Safe in any thread."""
-        given, value = bytearray(key), bytearray(self._value_bytes)
+        given, value = bytearray(key), bytearray(self.value_bytes)
         try:
             attributes = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(given), address(value), 0))
             bpf(Command.MAP_LOOKUP_ELEM, attributes, self._tried)
@@ -135,7 +133,7 @@ class KernelMap:
 
     def read_array(self, count: int) -> bytes:
         """Return the first ``count`` values of an array, concatenated. Safe in any thread."""
-        keys, values, following = bytearray(4 * count), bytearray(self._value_bytes * count), bytearray(8)
+        keys, values, following = bytearray(4 * count), bytearray(self.value_bytes * count), bytearray(8)
         places = (0, address(following), address(keys), address(values), count, self.fd, 0, 0)
         try:
             if count:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.names import Name
@@ -65,13 +66,7 @@ class ClientCore:
     """
 
     def __init__(
-        self,
-        member: Participant,
-        topic: Topic,
-        label: str,
-        *,
-        start: int,
-        **options: Unpack[ServiceOptions],
+        self, member: Participant, topic: Topic, label: str, *, start: int, **options: Unpack[ServiceOptions]
     ) -> None:
         self._member = member
         self._name = topic.name
@@ -149,7 +144,7 @@ class ClientCore:
         times += [call.deadline_s for call in self._unasked]
         if not self.is_idle or self._for_all:
             times.append(self._follow_at_s)
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*times)
 
     def close(self) -> None:
         """Stop calling the name; active calls fail."""
@@ -165,12 +160,14 @@ class ClientCore:
         """Update the set of servers."""
         self._follow_at_s = now_s + LOOK_S
         member = self._member
-        peers = set(member.peers(self._name) or member.connected_peers(self._name))  # a slow server is better than none
+        peers = set(
+            member.services.peers(self._name) or member.services.connected_peers(self._name)
+        )  # a slow server is better than none
         if not peers:  # and a silent one may return: its calls go on
-            peers = self._servers.keys() & set(member.silent_peers(self._name))
+            peers = self._servers.keys() & set(member.services.silent_peers(self._name))
         heard = {
             writer_proxy.publisher: writer_proxy
-            for writer_proxy in member.writer_proxies_of(self._name)
+            for writer_proxy in member.subscriptions.writer_proxies_of(self._name)
             if writer_proxy.publisher in peers
         }
         for name, incarnation in list(self._servers.items()):
@@ -240,7 +237,7 @@ class ClientCore:
             while effects := dispatch.poll_effects():
                 for effect in effects:
                     if isinstance(effect, End):
-                        self._member.end_call(self._name, effect.call)
+                        self._member.services.end_call(self._name, effect.call)
                         continue
                     servers = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if servers is None:
@@ -253,7 +250,7 @@ class ClientCore:
                 continue  # it ended in the meantime
             try:
                 if isinstance(effect, Ask):
-                    self._member.send_requests(self._name, effect.request, effect.call)
+                    self._member.services.send_requests(self._name, effect.request, effect.call)
                 else:
                     self._publisher.publish(_wire_of(effect))
             except LocalError as error:
@@ -262,7 +259,7 @@ class ClientCore:
     def _send_to(self, dispatch: Dispatch[Response], server: Name, effect: Ask | Stop, now_s: float) -> None:
         try:
             call = effect.call if isinstance(effect, Ask) else None
-            self._member.send_request(self._name, server, _wire_of(effect), call)
+            self._member.services.send_request(self._name, server, _wire_of(effect), call)
         except LocalError as error:
             self._not_sent(dispatch, effect, [server], str(error), now_s)
 

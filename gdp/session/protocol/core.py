@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.client.participant import Message as MemberMessage
 from gdp.client.participant import Participant, ServiceOptions, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import NAME_BYTES, Name
@@ -247,10 +248,7 @@ class SessionCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer beyond the participant's own, or None."""
-        if not self._services:
-            return None
-        times = [service.get_timer() for service in self._services]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(*[service.get_timer() for service in self._services]) if self._services else None
 
 
 def replication_of(value: str | int | Replication) -> Replication:

@@ -360,12 +360,12 @@ class BaseSubscription(Opened[_D]):
     @property
     def publishers(self) -> int:
         """Return the number of matched publishers."""
-        return len(self._session.core.member.writer_proxies_of(self.name))
+        return len(self._session.core.member.subscriptions.writer_proxies_of(self.name))
 
     @property
     def lost(self) -> int:
         """Return how many messages were lost on their way to this node."""
-        return self._session.core.member.losses_of(self.name).total
+        return self._session.core.member.subscriptions.losses_of(self.name).total
 
     @property
     def dropped(self) -> int:
@@ -395,12 +395,7 @@ class BaseServer(Opened[_D], Generic[_D, _H], ABC):
     """Server of one name with ``workers`` that call a handler."""
 
     def __init__(
-        self,
-        session: BaseSession[_D, Any, Any, Any, Any],
-        topic: Topic,
-        server: ServerCore,
-        handler: _H,
-        workers: int,
+        self, session: BaseSession[_D, Any, Any, Any, Any], topic: Topic, server: ServerCore, handler: _H, workers: int
     ) -> None:
         super().__init__(session, topic)
         self._core = server

@@ -10,19 +10,14 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
+from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.intervals import HOUR_S, TICK_S
 from gdp.limits import CALL_GRACE_S, CALLER_AWAY_S
 from gdp.names import Name
 from gdp.service.frames import Answer, Outcome, Request
 from gdp.service.serving import Asked, Serving, Turn
-from gdp.session.protocol.wire import (
-    LEAVING,
-    PAYLOAD_MAX_BYTES,
-    RESPONSE,
-    SERVING,
-    read_request,
-)
+from gdp.session.protocol.wire import LEAVING, PAYLOAD_MAX_BYTES, RESPONSE, SERVING, read_request
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -48,13 +43,7 @@ class ServerCore:
     """
 
     def __init__(
-        self,
-        member: Participant,
-        topic: Topic,
-        *,
-        start: int,
-        at_once: int | None,
-        **options: Unpack[ServiceOptions],
+        self, member: Participant, topic: Topic, *, start: int, at_once: int | None, **options: Unpack[ServiceOptions]
     ) -> None:
         self._member = member
         self._name = topic.name
@@ -69,12 +58,12 @@ class ServerCore:
     @property
     def clients(self) -> int:
         """Return the number of clients."""
-        return len(self._member.peers(self._name))
+        return len(self._member.services.peers(self._name))
 
     @property
     def is_idle(self) -> bool:
         """Return whether no request is active, and the clients have confirmed their responses."""
-        return not self._serving and self._member.is_acknowledged(self._name)
+        return not self._serving and self._member.publications.is_acknowledged(self._name)
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a client's request, or its notice that calls have ended.
@@ -135,8 +124,7 @@ class ServerCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._serving.get_timer(), self._check_at_s]
-        return min((time for time in times if time is not None), default=None)
+        return earliest(self._serving.get_timer(), self._check_at_s)
 
     def _begin(self, client: Name, frame: Request, now_s: float) -> None:
         asked = Asked(client, _PART, frame.call)
@@ -167,14 +155,14 @@ class ServerCore:
 
     def _send(self, client: Name, wire: bytes) -> None:
         try:
-            self._member.respond(self._name, client, wire)
+            self._member.services.respond(self._name, client, wire)
         except LocalError:
             self.unsent += 1  # the client has gone; if it repeats the request, it gets the stored response
 
     def _check_clients(self, now_s: float) -> None:
         """Drop the calls of clients that have gone."""
-        here = set(self._member.connected_peers(self._name))
-        known = {writer_proxy.publisher for writer_proxy in self._member.writer_proxies_of(self._name)}
+        here = set(self._member.services.connected_peers(self._name))
+        known = {writer_proxy.publisher for writer_proxy in self._member.subscriptions.writer_proxies_of(self._name)}
         clients = self._serving.clients
         self._seen_s = {each: now_s if each in here else self._seen_s.get(each, now_s) for each in clients}
         for client, seen_s in self._seen_s.items():

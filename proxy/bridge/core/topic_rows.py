@@ -59,7 +59,7 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             bytes=flow.stats.received_bytes,
             lost=flow.stats.lost - late,
             late=late,
-            publishers=len(member.writer_proxies_of(spec.name)),
+            publishers=len(member.subscriptions.writer_proxies_of(spec.name)),
             readers=flow.local_readers,
         )
     if isinstance(flow, ExposedService):
@@ -68,7 +68,7 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             messages=flow.requests,
             bytes=flow.request_bytes,
             publishers=1,
-            readers=len(member.connected_peers(spec.name)),
+            readers=len(member.services.connected_peers(spec.name)),
         )
     assert isinstance(flow, ImportedService)
     return row(

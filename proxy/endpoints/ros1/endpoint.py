@@ -1,7 +1,7 @@
 """ROS 1 endpoint in the proxy: forwards every operation to a rospy process, and returns its events.
 
-I/O; a process and a socket pair. When the process ends, or its master restarts, another process is started and all
-handles are established again; until then the handles are faulted.
+I/O, by ``rospy_process.py``. When the process ends, or its master restarts, another process is started and all handles
+are established again; until then the handles are faulted.
 """
 
 from __future__ import annotations
@@ -9,21 +9,16 @@ from __future__ import annotations
 import itertools
 import os
 import select
-import socket
-import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
 import cbor2
 
 from gdp.errors import LocalError, RemoteError
-from gdp.intervals import ANSWER_S, STEADY_S
-from gdp.requests import Backoff
 from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
@@ -39,14 +34,11 @@ from proxy.endpoints.core.endpoint import (
 )
 from proxy.endpoints.ros1.install import rospy_folder
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
+from proxy.endpoints.ros1.rospy_process import RospyProcess
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
 __all__ = ["Ros1Endpoint"]
-
-_START_S: Final = 4.0  # a process that has just been started answers later
-_RESTARTS: Final = Backoff(0.25, 5.0)
-_ROOT: Final = Path(__file__).resolve().parents[3]
 
 
 @dataclass(slots=True)
@@ -79,8 +71,6 @@ class Ros1Endpoint:
         """
         rospy_folder()
         self.label = f"ros1 {master_uri}"
-        self._master_uri = master_uri
-        self._node = node
         self._numbers = itertools.count(1)
         self._held: dict[int, _Held] = {}
         self._events: list[Event] = []
@@ -89,30 +79,27 @@ class Ros1Endpoint:
         self._trouble = ""  # the present fault; also reported to handles created while it lasts
         self._answers: dict[int, bytes | None] = {}
         self._known: dict[tuple[Kind, str, str], bytes] = {}
-        self._incarnation_id = 0
-        self._failures = 0
-        self._lost = 0
+        self._lost = 0  # by the present process
         self._lost_before = 0
         self._woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._epoll = select.epoll()
-        self._epoll.register(self._woken, select.EPOLLIN)
-        self._ended: list[subprocess.Popen[bytes]] = []
-        self._start(0.0)
+        self._rospy = RospyProcess(master_uri, node)
+        self._rospy.epoll.register(self._woken, select.EPOLLIN)
 
     @property
     def dropped(self) -> int:
         """Return the number of messages dropped between the two processes, oldest of a topic first."""
-        return self._lost_before + self._link.dropped + self._lost
+        return self._rospy.dropped + self._lost_before + self._lost
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
-        return self._epoll.fileno()
+        return self._rospy.epoll.fileno()
 
     def poll_events(self) -> Sequence[Event]:
         """Remove and return the pending events, in order."""
         self._pump()
         if self._events:
-            self._drain_woken()
+            with suppress(BlockingIOError):  # no wake-up was needed
+                os.eventfd_read(self._woken)
         events, self._events = self._events, []
         return events
 
@@ -152,7 +139,7 @@ class Ros1Endpoint:
         held = self._held[handle]
         if held.kept is not None:
             held.kept.append(raw)
-        self._link.send(Kind.PUBLISH, handle, 0, raw)
+        self._rospy.link.send(Kind.PUBLISH, handle, 0, raw)
 
     def subscribers(self, handle: int) -> int:
         """Return the present number of local subscriptions of a publisher."""
@@ -166,11 +153,11 @@ class Ros1Endpoint:
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request."""
-        self._link.send(Kind.ANSWER, handle, ticket, raw)
+        self._rospy.link.send(Kind.ANSWER, handle, ticket, raw)
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
         """Fail a request: its client gets a ``ServiceException`` with the reason."""
-        self._link.send(Kind.REFUSE, handle, ticket, reason.encode())
+        self._rospy.link.send(Kind.REFUSE, handle, ticket, reason.encode())
 
     def create_client(self, name: str, type_name: str) -> int:
         """Create a client of a local service; only its type's name need be known."""
@@ -179,7 +166,7 @@ class Ros1Endpoint:
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request."""
         self._held[handle].calls.add(call)
-        if not self._link.send(Kind.CALL, handle, call, raw):
+        if not self._rospy.link.send(Kind.CALL, handle, call, raw):
             self._fail(handle, call, "too much waits for the rospy process")
 
     def drop(self, handle: int, call: int) -> None:
@@ -187,67 +174,30 @@ class Ros1Endpoint:
         held = self._held.get(handle)
         if held is not None and call in held.calls:
             held.calls.discard(call)
-            self._link.send(Kind.DROP, handle, call)
+            self._rospy.link.send(Kind.DROP, handle, call)
 
     def close(self, handle: int) -> None:
         """Close a subscription, publisher, server or client."""
         if self._held.pop(handle, None) is not None:
-            self._link.send(Kind.CLOSE, handle)
+            self._rospy.link.send(Kind.CLOSE, handle)
             self._events = [event for event in self._events if getattr(event, "handle", None) != handle]
 
     def shut_down(self) -> None:
         """Leave the graph; may block two seconds while the process unregisters from the master."""
-        self._link.close()
-        self._ended.append(self._process)
-        until_s = time.monotonic() + ANSWER_S
-        for process in self._ended:
-            try:
-                process.wait(max(0.0, until_s - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        self._epoll.close()
+        self._rospy.close()
         os.close(self._woken)
 
     # the process
 
-    def _start(self, delay_s: float) -> None:
-        ours, its = socket.socketpair()
-        self._incarnation_id += 1
-        self._started_s = time.monotonic()
-        self._is_answering = False
-        left_out = ("ROS_NAMESPACE", "GDP_PASSPHRASE")
-        environment = {key: value for key, value in os.environ.items() if key not in left_out}
-        environment["ROS_MASTER_URI"] = self._master_uri
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(_ROOT))))
-        arguments = (its.fileno(), self._master_uri, self._node, self._incarnation_id, delay_s)
-        with its:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "proxy.endpoints.ros1.child", *map(str, arguments)],
-                pass_fds=[its.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # rospy prints there
-                env=environment,
-                start_new_session=True,  # Ctrl-C goes to the proxy, which then closes the link
-            )
-        self._link = IpcLink(ours, self._watch_space)
-        self._epoll.register(ours, select.EPOLLIN)
-        for handle, held in self._held.items():
-            self._establish(handle, held)
-
     def _establish(self, handle: int, held: _Held) -> None:
-        self._link.send(held.kind, handle, 0, held.payload)
+        self._rospy.link.send(held.kind, handle, 0, held.payload)
         for raw in held.kept or ():
-            self._link.send(Kind.PUBLISH, handle, 0, raw)
+            self._rospy.link.send(Kind.PUBLISH, handle, 0, raw)
 
     def _restart(self) -> None:
         """Fail the calls under way after the process has ended, and start another, with a growing delay."""
-        self._process.kill()
-        self._ended = [process for process in (*self._ended, self._process) if process.poll() is None]
-        self._lost_before += self._link.dropped + self._lost
+        self._lost_before += self._lost
         self._lost = 0
-        self._epoll.unregister(self._link)
-        self._link.close()
         if not self._trouble:
             self._suffer("the rospy process has ended")
         for handle, held in self._held.items():
@@ -255,20 +205,14 @@ class Ros1Endpoint:
             for call in sorted(held.calls):
                 self._fail(handle, call, self._trouble)
         self._is_graph_old = True
-        self._failures = 0 if time.monotonic() - self._started_s > STEADY_S else self._failures + 1
-        self._start(_RESTARTS.pause_s(self._failures) if self._failures else 0.0)
-
-    def _watch_space(self) -> None:
-        self._epoll.modify(self._link, select.EPOLLIN | select.EPOLLOUT)
+        self._rospy.restart()
+        for handle, held in self._held.items():
+            self._establish(handle, held)
 
     def _pump(self) -> None:
         """Transfer frames on the link without blocking."""
-        if self._link.is_behind:
-            self._link.flush()
-            if not self._link.is_behind:
-                self._epoll.modify(self._link, select.EPOLLIN)
         try:
-            frames = self._link.poll_frames()
+            frames = self._rospy.poll_frames()
         except LinkEndedError:
             self._restart()
             return
@@ -277,11 +221,13 @@ class Ros1Endpoint:
 
     def _arrive(self, frame: Frame) -> None:
         kind, handle, number, payload = frame
-        self._is_answering = True
         if kind in (Kind.KNOWN, Kind.UNKNOWN):
             self._answers[number] = payload if kind is Kind.KNOWN else None
         elif kind is Kind.GRAPH:
-            self._receive_graph(payload)
+            graph = _graph_of(payload)
+            if graph != self._graph or self._is_graph_old:
+                self._events.append(GraphChanged())
+            self._graph, self._is_graph_old, self._trouble = graph, False, ""
         elif kind is Kind.LOST:
             self._lost = number
         elif kind is Kind.ENDING or (kind is Kind.FAULTED and not handle):
@@ -310,17 +256,6 @@ class Ros1Endpoint:
             except RemoteError as error:
                 self._events.append(EndpointError(handle, f"its publisher describes it badly: {error}"))
 
-    def _receive_graph(self, payload: bytes) -> None:
-        ends = frozenset(
-            GraphEntity(Role(role), name, type_name, node, node, hash=md5)
-            for role, name, type_name, node, md5 in cbor2.loads(payload)
-        )
-        if ends != self._graph or self._is_graph_old:
-            self._events.append(GraphChanged())
-        self._graph = ends
-        self._is_graph_old = False
-        self._trouble = ""
-
     # handles
 
     def _hold(self, held: _Held) -> int:
@@ -345,25 +280,19 @@ class Ros1Endpoint:
         self._events.append(event)
         os.eventfd_write(self._woken, 1)
 
-    def _drain_woken(self) -> None:
-        try:
-            os.eventfd_read(self._woken)
-        except BlockingIOError:
-            return  # no wake-up was needed
-
     def _ask(self, kind: Kind, name: str, type_name: str) -> bytes | None:
         """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``."""
         known = self._known.get((kind, name, type_name))
         if known is not None:
             return known
         question = next(self._numbers)
-        self._link.send(kind, 0, question, cbor2.dumps([name, type_name]))
-        until_s = max(time.monotonic() + ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
+        self._rospy.link.send(kind, 0, question, cbor2.dumps([name, type_name]))
+        until_s = self._rospy.answers_by_s
         while question not in self._answers:
             left_s = until_s - time.monotonic()
             if left_s <= 0:
                 raise LocalError(f"{type_name}: the rospy process does not answer")
-            _wait(self._link, left_s)
+            _wait(self._rospy.link, left_s)
             self._pump()
         if self._events:
             os.eventfd_write(self._woken, 1)
@@ -371,6 +300,13 @@ class Ros1Endpoint:
         if answer is not None:
             self._known[kind, name, type_name] = answer
         return answer
+
+
+def _graph_of(payload: bytes) -> Graph:
+    return frozenset(
+        GraphEntity(Role(role), name, type_name, node, node, hash=md5)
+        for role, name, type_name, node, md5 in cbor2.loads(payload)
+    )
 
 
 def _wait(link: IpcLink, patience_s: float) -> None:

@@ -74,11 +74,11 @@ class Caller:
     def __init__(
         self, station: End, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter
     ) -> None:
-        self._station, self._token, self._out, self._incarnation_id = station, token, out, incarnation_id
+        self._token, self._out, self._incarnation_id = token, out, incarnation_id
         self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
         self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
-        self._every_s = 1.0 / float(settings["hz"])
+        self._services, self._every_s = station.member.services, 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._count = 0
 
@@ -89,7 +89,7 @@ class Caller:
 
     def go_on(self, now_s: float) -> None:
         """Discover servers, make the calls that are due, end those that time out."""
-        peers = set(self._station.member.peers(self._name)) or set(self._station.member.connected_peers(self._name))
+        peers = set(self._services.peers(self._name) or self._services.connected_peers(self._name))
         for server in set(self._dispatch.servers) - peers:
             self._dispatch.replica_lost(server, now_s, "gone")
         for server in peers:
@@ -138,7 +138,7 @@ class Caller:
                 self._stream.publish(effect.request)
             for server in effect.servers or ():
                 try:
-                    self._station.member.send_request(self._name, server, effect.request)
+                    self._services.send_request(self._name, server, effect.request)
                 except LocalError as error:
                     self._dispatch.refused(effect.call, server, str(error), now_s)
 
@@ -159,7 +159,7 @@ class Reading:
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + _LOOK_S
-        settings = Counter(station.member.losses_of(name).counts)
+        settings = Counter(station.member.subscriptions.losses_of(name).counts)
         for reason, number in (settings - self._reported_counts).items():
             self._out.add(Kind.LOST, self._channel, 0, reason, number, time.monotonic_ns())
         self._reported_counts = settings
@@ -187,7 +187,7 @@ class Serving:
         body = message.delivered.message
         if body[: len(self._token)] == self._token:
             try:
-                self._station.member.respond(self._name, Name(message.delivered.publisher), body)
+                self._station.member.services.respond(self._name, Name(message.delivered.publisher), body)
             except LocalError as error:
                 print(f"not answered: {error}", file=sys.stderr, flush=True)
 

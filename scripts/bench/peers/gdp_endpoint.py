@@ -59,22 +59,22 @@ class SessionEndpoint:
             self._end.call(PING, is_session=True)
         else:
             self._end.serve(PING, is_session=True)
-        self._name = self._end.name_of(PING)
+        self._services, self._name = self._end.member.services, self._end.name_of(PING)
         self._arrived = deque[bytes]()
         self._client: Name | None = None  # of the newest request
 
     def connect(self) -> None:
         """Wait until the name has a server; raises ``TimeoutError``."""
-        if not self._end.runtime.run(lambda: bool(self._end.member.peers(self._name)), time.monotonic() + PATIENCE_S):
+        if not self._end.runtime.run(lambda: bool(self._services.peers(self._name)), time.monotonic() + PATIENCE_S):
             raise TimeoutError("no server: the overlay did not come up")
 
     def send(self, message: bytes) -> None:
         """Send a request to the only server, or respond to the newest one."""
         if self._is_client:
-            (server,) = self._end.member.peers(self._name)
-            self._end.member.send_request(self._name, server, message)
+            (server,) = self._services.peers(self._name)
+            self._services.send_request(self._name, server, message)
         elif self._client is not None:
-            self._end.member.respond(self._name, self._client, message)
+            self._services.respond(self._name, self._client, message)
         self._end.member.flush(time.monotonic())
         self._end.runtime.send()
 

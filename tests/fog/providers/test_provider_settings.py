@@ -10,7 +10,7 @@ import yaml
 
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
-from fog.providers.skypilot.config import SkyPilotConfig
+from fog.providers.skypilot_config import SkyPilotConfig
 from gdp.config.schema import Section
 from tests.pages import ROOT, blocks
 

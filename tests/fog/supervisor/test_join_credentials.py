@@ -71,7 +71,6 @@ def ours(lab: Lab, site: Site, journal: Journal) -> Iterator[tuple[Supervisor, C
             members=members,
             provider=provider,
             command=lambda _: ("run",),
-            heard=lambda: None,
         )
         journal.put_cluster(ONE, time.time())
         work(made, lambda: "m1" in provider.boots and journal.machines("c")[0].id)

@@ -64,7 +64,6 @@ def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
         members=DomainMembers(site.domain_files),
         provider=provider,
         command=lambda _: ("run",),
-        heard=lambda: None,
         patience=Timeouts(spot_retry_s=0.2),
     )
 

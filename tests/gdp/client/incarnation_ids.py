@@ -9,7 +9,7 @@ from os import urandom
 from gdp.client.control_keys import ControlKeys
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.crypto.control_seal import ControlSealer, control_key
+from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import Signer, seal_key
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.introduction import Introduction
@@ -90,11 +90,8 @@ class Notes:
         return ControlSealer(
             key=key,
             epoch=epoch,
-            kind=kind,
-            source=self._name,
-            incarnation=incarnation_id,
-            destination=publisher.name,
-            topic=self._topic,
-            destination_incarnation=publisher.incarnation,
+            context=ControlContext(
+                kind, self._name, incarnation_id, publisher.name, publisher.incarnation, self._topic
+            ),
             numbers=self._reader.note_numbers,
         )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count
 from random import Random
 
 from gdp.client.delivery import Delivered
-from gdp.client.identities import ReaderIdentity, WriterIdentity
+from gdp.client.identities import PublisherIdentity, ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
@@ -103,19 +103,17 @@ class Pipe:
         return self.attach(reader_of(name, incarnation), loss=loss, secrets=secrets)
 
     def attach(self, reader: ReaderIdentity, *, loss: float = 0.0, secrets: Secrets = SECRETS) -> End:
-        budget = ReassemblyQuota()
+        reader = replace(reader, budget=ReassemblyQuota())
         writer_proxy = WriterProxy(
             topic=TOPIC,
             reader=reader,
-            publisher=Name(b"p" * 32),
-            incarnation=self.incarnation,
-            writer=WRITER.public,
-            exchange=self.source.control_keys.public,
+            publisher=PublisherIdentity(
+                Name(b"p" * 32), self.incarnation, WRITER.public, self.source.control_keys.public
+            ),
             secrets=secrets,
-            budget=budget,
             now_s=self.now_s,
         )
-        end = self.ends[reader.name] = End(reader, writer_proxy, budget, loss)
+        end = self.ends[reader.name] = End(reader, writer_proxy, reader.budget, loss)
         return end
 
     def publish(self, messages: Sequence[bytes]) -> None:
@@ -141,7 +139,7 @@ class Pipe:
             self.publisher.handle_timer(self.now_s)
             for each in self.ends.values():
                 each.writer_proxy.handle_timer(self.now_s)
-                each.delivered += each.writer_proxy.poll_delivered()
+                each.delivered += each.writer_proxy.delivery.poll()
         return True
 
     def _next_s(self) -> float:
@@ -181,7 +179,7 @@ class Pipe:
             header = decode(frame)
             assert header.kind in (Kind.DATA, Kind.HEARTBEAT, Kind.PARITY)
             end.writer_proxy.receive(header, frame, self.now_s)
-            end.delivered += end.writer_proxy.poll_delivered()
+            end.delivered += end.writer_proxy.delivery.poll()
 
         return arrive
 

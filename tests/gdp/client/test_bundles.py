@@ -8,7 +8,7 @@ import pytest
 
 from gdp.client.publisher import Publisher
 from gdp.client.sequence_numbers import SequenceState
-from gdp.crypto.envelope import SIGNATURE_BYTES, Sealer, fragment_capacity
+from gdp.crypto.envelope import SIGNATURE_BYTES, KeyContext, Sealer, fragment_capacity
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Flag, Kind
@@ -182,17 +182,14 @@ def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body:
     sealer = Sealer(
         secret=SECRETS[1],
         epoch=1,
-        kind=Kind.DATA,
-        source=Name(b"p" * 32),
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, Name(b"p" * 32), 1, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
         for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
             end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
-    assert [each.message for each in end.writer_proxy.poll_delivered()] == [b"next"]
+    assert [each.message for each in end.writer_proxy.delivery.poll()] == [b"next"]
     drops = end.writer_proxy.drops
     assert drops[DropReason.MALFORMED] + drops[DropReason.TRUNCATED] == 1
 

@@ -86,4 +86,4 @@ def test_what_is_kept_is_bounded_in_memory() -> None:
     for begin in range(0, 2_000, 100):
         publish(publisher, pipe, range(begin, begin + 100))
         pipe.run(1.0)
-    assert publisher._window._cache.held_bytes <= 100 * SIZE
+    assert publisher._window.cache.held_bytes <= 100 * SIZE

@@ -7,7 +7,7 @@ from os import urandom
 import pytest
 
 from gdp.client.writer_proxy import WriterProxyState
-from gdp.crypto.envelope import Sealer, Signer
+from gdp.crypto.envelope import KeyContext, Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
@@ -29,14 +29,7 @@ def forge(
 ) -> list[bytes]:
     """Return messages that a reader can make: fragments that open, under a signature that is not the writer's."""
     sealer = Sealer(
-        secret=SECRETS[1],
-        epoch=1,
-        kind=kind,
-        source=PUBLISHER,
-        incarnation=1,
-        destination=TOPIC,
-        signer=signer,
-        random_bytes=urandom,
+        secret=SECRETS[1], epoch=1, context=KeyContext(kind, PUBLISHER, 1, TOPIC), signer=signer, random_bytes=urandom
     )
     return list(sealer.seal(number, Flag.RELIABLE, message, mtu))
 
@@ -116,10 +109,7 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
     sealer = Sealer(
         secret=SECRETS[1],
         epoch=1,
-        kind=Kind.DATA,
-        source=PUBLISHER,
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, PUBLISHER, 1, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
@@ -136,17 +126,14 @@ def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> 
     sealer = Sealer(
         secret=SECRETS[1],
         epoch=1,
-        kind=Kind.DATA,
-        source=PUBLISHER,
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, PUBLISHER, 1, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
     for number in range(2, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
-    assert [each.number for each in end.writer_proxy.poll_delivered()][:3] == [2, 3, 4]
+    assert [each.number for each in end.writer_proxy.delivery.poll()][:3] == [2, 3, 4]
     assert end.writer_proxy.losses.total == 1
 
 
@@ -179,10 +166,7 @@ def test_a_message_whose_number_has_no_next_is_refused_and_ends_no_reader(reliab
         sealer = Sealer(
             secret=SECRETS[1],
             epoch=1,
-            kind=Kind.DATA,
-            source=PUBLISHER,
-            incarnation=1,
-            destination=TOPIC,
+            context=KeyContext(Kind.DATA, PUBLISHER, 1, TOPIC),
             signer=WRITER,
             random_bytes=urandom,
         )
@@ -251,10 +235,7 @@ def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     sealer = Sealer(
         secret=unexpected[1],
         epoch=1,
-        kind=Kind.DATA,
-        source=PUBLISHER,
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, PUBLISHER, 1, TOPIC),
         signer=MALLORY,
         random_bytes=urandom,
     )

@@ -7,7 +7,7 @@ import pytest
 from gdp.client.best_effort_queue import FRESH_S, BestEffortQueue, Carried
 from gdp.client.send_options import SendOptions
 from gdp.client.writer_proxy import WriterProxyState
-from gdp.crypto.envelope import Sealed, Sealer
+from gdp.crypto.envelope import KeyContext, Sealed, Sealer
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.message.loss import LossReason
@@ -21,10 +21,7 @@ def sealed(number: int, size: int = len(LARGE)) -> Sealed:
     sealer = Sealer(
         secret=bytes(32),
         epoch=1,
-        kind=Kind.DATA,
-        source=bytes(32),
-        incarnation=1,
-        destination=bytes(32),
+        context=KeyContext(Kind.DATA, bytes(32), 1, bytes(32)),
         signer=WRITER,
         random_bytes=bytes,
     )

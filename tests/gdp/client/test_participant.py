@@ -43,13 +43,15 @@ def test_a_topic_may_come_back_as_something_else() -> None:
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     flow.member.withdraw(flow.topic.name)
     flow.world.network.send_pending(ROBOT)
-    assert flow.world.network.run(1, lambda: not flow.world.members[SERVER].writer_proxies_of(flow.topic.name))
+    assert flow.world.network.run(
+        1, lambda: not flow.world.members[SERVER].subscriptions.writer_proxies_of(flow.topic.name)
+    )
     again(flow, reliable=False, depth=2)
     for number in range(4):
         flow.publish(b"%d" % number)
     assert flow.world.network.run(5, lambda: flow.has(SERVER, 3))
     assert [each.message for each in flow.got[SERVER]] == [b"reliable", b"2", b"3"]
-    (writer_proxy,) = flow.world.members[SERVER].writer_proxies_of(flow.topic.name)
+    (writer_proxy,) = flow.world.members[SERVER].subscriptions.writer_proxies_of(flow.topic.name)
     assert writer_proxy.description == b"described again"
 
 
@@ -60,7 +62,7 @@ def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:
     assert flow.publisher.publish(b"too late") is None
     assert flow.member.drops()[DropReason.NO_READER] == 0
     assert flow.publisher.drops[DropReason.NO_READER] == 1
-    assert flow.member.publishers() == []
+    assert list(flow.member.publications) == []
 
 
 def test_withdrawing_does_not_end_reading_the_same_name() -> None:
@@ -96,7 +98,7 @@ def test_a_topic_is_read_again_from_what_is_new_then_and_replays_are_refused() -
     flow.publish(b"unheard")
     reader.subscribe(flow.world.topic(flow.name, reader, [Right.READ]))
     network.send_pending(SERVER)
-    assert network.run(1, lambda: bool(reader.writer_proxies_of(flow.topic.name)))
+    assert network.run(1, lambda: bool(reader.subscriptions.writer_proxies_of(flow.topic.name)))
     switch = reader.attachment.switch
     assert switch is not None
     reader.receive([ReceivedFrame(switch.port, switch.mac, frame) for frame in tap.frames], network.now)
@@ -131,7 +133,7 @@ def test_a_topic_is_read_once_at_a_time() -> None:
 def test_a_new_description_reaches_who_reads_already_though_frames_are_lost() -> None:
     flow = flowing(ring())
     network, reader = flow.world.network, flow.world.members[SERVER]
-    (writer_proxy,) = reader.writer_proxies_of(flow.topic.name)
+    (writer_proxy,) = reader.subscriptions.writer_proxies_of(flow.topic.name)
     assert network.run(1, lambda: writer_proxy.description == b"described")
     flow.world.leads[SERVER].loss = 1.0
     flow.publisher.describe(b"another")

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.client.publisher import Publisher
 from gdp.client.writer_proxy import WriterProxyState
-from gdp.crypto.envelope import Sealer
+from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
@@ -232,23 +232,17 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     sealer = Sealer(
         secret=b"2" * 32,
         epoch=2,
-        kind=Kind.DATA,
-        source=Name(b"p" * 32),
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, Name(b"p" * 32), 1, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
     (frame,) = list(sealer.seal(2, Flag.RELIABLE, sequenced(2, b"new key"), 1500))
     end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
-    assert [each.message for each in end.writer_proxy.poll_delivered()] == [b"new key"]
+    assert [each.message for each in end.writer_proxy.delivery.poll()] == [b"new key"]
     sealer = Sealer(
         secret=b"3" * 32,
         epoch=3,
-        kind=Kind.DATA,
-        source=Name(b"p" * 32),
-        incarnation=1,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, Name(b"p" * 32), 1, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )

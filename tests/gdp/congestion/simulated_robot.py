@@ -15,7 +15,7 @@ from random import Random
 
 from thin_link.channel import Channel, Loss, Rate
 
-from gdp.client.identities import WriterIdentity
+from gdp.client.identities import PublisherIdentity, WriterIdentity
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.send_options import PublisherSettings
@@ -25,7 +25,6 @@ from gdp.congestion.delivery_rate import Flight
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Kind
-from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from tests.gdp.client.incarnation_ids import reader_of, source_of
@@ -162,8 +161,8 @@ class SimulatedRobot:
         publisher.tree_stands(MTU)
         publisher.published = self._turns.add
         proxy = WriterProxy(
-            topic=name, reader=self.reader, publisher=source.name, incarnation=1, writer=key.public,
-            exchange=source.control_keys.public, secrets=_SECRETS, budget=ReassemblyQuota(), now_s=0.0,
+            topic=name, reader=self.reader, secrets=_SECRETS, now_s=0.0,
+            publisher=PublisherIdentity(source.name, 1, key.public, source.control_keys.public),
         )  # fmt: skip
         return Topic(stream, publisher, proxy)
 
@@ -292,7 +291,7 @@ class SimulatedRobot:
         for topic in self.topics:
             proxy = topic.proxy
             proxy.handle_timer(now_s)
-            for each in proxy.poll_delivered():
+            for each in proxy.delivery.poll():
                 topic.arrived.append((done_s, done_s - int.from_bytes(each.message[:8], "big") / 1e9))
             for note in proxy.control_to_send(done_s):
                 self.at(done_s, lambda topic=topic, note=note: self._report(topic, note))  # type: ignore[misc]

@@ -21,8 +21,8 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.intervals import NEIGHBOUR
-from gdp.limits import CLOCK_SKEW_S, COST_AUTO, HELLO_IDLE
+from gdp.intervals import HELLO_IDLE, NEIGHBOUR
+from gdp.limits import CLOCK_SKEW_S, COST_AUTO
 from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 

@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.crypto.control_seal import JUMP_MAX, ControlOpener, ControlReplayWindow, ControlSealer, control_key, topic_of
+from gdp.crypto.control_seal import (
+    JUMP_MAX,
+    ControlContext,
+    ControlOpener,
+    ControlReplayWindow,
+    ControlSealer,
+    control_key,
+    topic_of,
+)
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, decode, encode
@@ -22,15 +30,7 @@ KEY = control_key(SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
 
 def sealer(topic: bytes = TOPIC, first: int = 1) -> ControlSealer:
     return ControlSealer(
-        key=KEY,
-        epoch=1,
-        kind=Kind.ACKNACK,
-        source=READER,
-        incarnation=5,
-        destination=PUBLISHER,
-        topic=topic,
-        destination_incarnation=9,
-        numbers=count(first),
+        key=KEY, epoch=1, context=ControlContext(Kind.ACKNACK, READER, 5, PUBLISHER, 9, topic), numbers=count(first)
     )
 
 
@@ -66,12 +66,7 @@ def test_a_published_note_is_sealed_again_to_the_byte() -> None:
         made = ControlSealer(
             key=key,
             epoch=note["epoch"],
-            kind=note["kind"],
-            source=source,
-            incarnation=incarnation,
-            destination=destination,
-            topic=topic,
-            destination_incarnation=to_incarnation,
+            context=ControlContext(note["kind"], source, incarnation, destination, to_incarnation, topic),
             numbers=numbers,
         )
         assert made.seal(bytes.fromhex(note["body"])).hex() == note["frame"]
@@ -128,15 +123,7 @@ def test_two_sealers_that_share_numbers_make_no_nonce_twice() -> None:
     numbers = count(1)
     two = [
         ControlSealer(
-            key=KEY,
-            epoch=1,
-            kind=Kind.ACKNACK,
-            source=READER,
-            incarnation=5,
-            destination=PUBLISHER,
-            topic=topic,
-            destination_incarnation=9,
-            numbers=numbers,
+            key=KEY, epoch=1, context=ControlContext(Kind.ACKNACK, READER, 5, PUBLISHER, 9, topic), numbers=numbers
         )
         for topic in (TOPIC, b"u" * 32)
     ]

@@ -16,6 +16,7 @@ from gdp.crypto.envelope import (
     SALT_BYTES,
     SEAL_BYTES,
     SIGNATURE_BYTES,
+    KeyContext,
     MessageKeys,
     Opener,
     Sealer,
@@ -67,10 +68,7 @@ def test_a_published_message_is_sealed_again_to_the_byte_up_to_its_signature(vec
     sealer = Sealer(
         secret=of(vector, "secret"),
         epoch=epoch,
-        kind=kind,
-        source=source,
-        incarnation=incarnation,
-        destination=destination,
+        context=KeyContext(kind, source, incarnation, destination),
         signer=signer,
         random_bytes=lambda _: salt,
     )
@@ -179,10 +177,7 @@ def test_a_number_is_sealed_once() -> None:
     sealer = Sealer(
         secret=SECRET,
         epoch=1,
-        kind=Kind.DATA,
-        source=SOURCE,
-        incarnation=INCARNATION,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
@@ -196,10 +191,7 @@ def test_what_is_above_the_limits_is_refused_before_a_number_is_spent() -> None:
     sealer = Sealer(
         secret=SECRET,
         epoch=1,
-        kind=Kind.DATA,
-        source=SOURCE,
-        incarnation=INCARNATION,
-        destination=TOPIC,
+        context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
         signer=WRITER,
         random_bytes=urandom,
     )
@@ -220,10 +212,7 @@ def test_two_copies_of_one_sealer_share_no_key_under_one_number() -> None:
         Sealer(
             secret=SECRET,
             epoch=1,
-            kind=Kind.DATA,
-            source=SOURCE,
-            incarnation=INCARNATION,
-            destination=TOPIC,
+            context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
             signer=WRITER,
             random_bytes=urandom,
         )

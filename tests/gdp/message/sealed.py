@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import urandom
 
-from gdp.crypto.envelope import Opener, Sealer, Signer
+from gdp.crypto.envelope import KeyContext, Opener, Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import decode
@@ -29,10 +29,7 @@ def seal(
         Sealer(
             secret=secret,
             epoch=1,
-            kind=Kind.DATA,
-            source=SOURCE,
-            incarnation=INCARNATION,
-            destination=TOPIC,
+            context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
             signer=signer,
             random_bytes=urandom,
         ).seal(number, 0, message, mtu)

@@ -58,8 +58,8 @@ def test_what_goes_out_is_every_frame_once_and_in_order() -> None:
         at, part = divmod(len(sent), 40)
         window.handle_acknack(A, has(at + 1, part), now_s)
     assert sent == [frame for number in range(1, 31) for frame in message(number, 40)]
-    assert window.oldest is None
-    assert window._cache.held_bytes == 0
+    assert window.cache.oldest is None
+    assert window.cache.held_bytes == 0
 
 
 def test_a_missing_part_is_sent_again_before_anything_new() -> None:
@@ -151,7 +151,7 @@ def test_a_reader_that_reports_unsent_messages_takes_nothing_from_another() -> N
     window = window_of(20, 100, (A, B))
     window.frames_to_send(0.0)
     window.handle_acknack(A, has((1 << 64) - 1, 0xFFFF_FFFF), 0.1)
-    assert window.oldest == 1
+    assert window.cache.oldest == 1
     assert not window.is_acknowledged()
     assert window.acknowledged == 0
 
@@ -183,9 +183,9 @@ def test_the_slowest_reader_holds_the_window() -> None:
     window = window_of(2, 10, (A, B))
     window.frames_to_send(0.0)
     window.handle_acknack(A, has(3), 0.1)
-    assert window.oldest == 1
+    assert window.cache.oldest == 1
     window.handle_acknack(B, has(2), 0.1)
-    assert window.oldest == 2
+    assert window.cache.oldest == 2
     assert window.acknowledged == 1
 
 
@@ -195,16 +195,16 @@ def test_a_reader_that_leaves_holds_nothing_any_more() -> None:
     window.handle_acknack(A, has(3), 0.1)
     window.drop_reader(B)
     assert window.is_acknowledged()
-    assert window.oldest is None
+    assert window.cache.oldest is None
 
 
 def test_the_last_messages_are_kept_for_late_joiners() -> None:
     window = window_of(10, 3, keep_last=4)
     window.frames_to_send(0.0)
     window.handle_acknack(A, has(11), 0.1)
-    assert window.oldest == 7
+    assert window.cache.oldest == 7
     window.drop_reader(A)
-    assert window.oldest == 7
+    assert window.cache.oldest == 7
 
 
 def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> None:
@@ -217,8 +217,8 @@ def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> N
     for number in range(11, 26):
         put(window, number, message(number, 1))
     assert window.evicted == 5
-    assert window._cache.held_bytes <= 20 * PART
-    assert window.oldest == 6
+    assert window.cache.held_bytes <= 20 * PART
+    assert window.cache.oldest == 6
 
 
 def test_numbers_under_way_stay_within_the_readers_replay_window() -> None:
@@ -336,7 +336,7 @@ def test_a_cancelled_message_sends_nothing_more_and_the_next_one_goes_on() -> No
     assert window.frames_to_send(0.1) == message(2, 10)
     window.handle_acknack(A, has(4), 0.2)
     assert window.is_acknowledged()
-    assert window._cache.held_bytes == 0
+    assert window.cache.held_bytes == 0
 
 
 def test_a_cancelled_message_that_was_sent_is_given_up_when_a_reader_lacks_something_of_it() -> None:
@@ -349,7 +349,7 @@ def test_a_cancelled_message_that_was_sent_is_given_up_when_a_reader_lacks_somet
     assert window.poll_cancelled(lacks) == [1]
     window.handle_acknack(B, lacks, 0.2)
     assert window.frames_to_send(0.2) == []
-    assert window.oldest == 2
+    assert window.cache.oldest == 2
     window.handle_acknack(B, has(3), 0.3)
     assert window.is_acknowledged()
 

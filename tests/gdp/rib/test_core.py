@@ -14,8 +14,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StoreError
-from gdp.intervals import ADVERTISEMENT
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore

@@ -83,7 +83,7 @@ def test_a_call_goes_to_a_server_that_returns_in_the_moment_in_which_the_last_on
     call = begin(replicas, timeout_s=60.0)
     assert replicas.run(5.0, lambda: bool(edge.turns) and bool(cloud.turns))
     connected = list[Name]()
-    monkeypatch.setattr(replicas.cores["robot"].member, "peers", lambda _: connected)
+    monkeypatch.setattr(replicas.cores["robot"].member.services, "peers", lambda _: connected)
     for label in ("edge", "cloud"):
         connected[:] = [replicas.sessions[label].name]
         replicas.run(2.0)
@@ -225,7 +225,7 @@ def test_a_call_to_the_only_server_has_no_signature_where_both_ends_say_session(
         replicas.send("robot")
         respond(replicas, server, "edge", b"y")
     assert replicas.run(2.0, lambda: all(each.is_done for each in calls))
-    requests = [each for each in edge.member.writer_proxies() if each.topic != topic.name]
+    requests = [each for each in edge.member.subscriptions.writer_proxies() if each.topic != topic.name]
     assert [each.delivery.delivered for each in requests] == [2]
 
 

@@ -148,7 +148,7 @@ def test_a_message_without_a_reader_is_counted_as_lost(pair: Simulated) -> None:
     publisher = pair.sessions["robot"].publisher("camera")
     publisher.put(b"x")
     assert publisher.lost == 1
-    assert pair.cores["robot"].member.unconfirmed()[LossReason.NO_READER] == 1
+    assert pair.cores["robot"].member.publications.unconfirmed()[LossReason.NO_READER] == 1
 
 
 def test_a_late_reader_gets_the_last_message_of_a_latched_publisher(pair: Simulated) -> None:

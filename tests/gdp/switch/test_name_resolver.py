@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import DropReason
-from gdp.intervals import ADVERTISEMENT
-from gdp.limits import NEGATIVE_LEASE_S, PENDING_S, QUESTIONS_RATE
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
+from gdp.limits import PENDING_S, QUESTIONS_RATE
 from gdp.names import Name
 from gdp.switch.name_cache import Location
 from gdp.switch.name_queries import QUERIES_MAX, RETRY_S, TRIES_MAX
@@ -44,8 +44,8 @@ def test_a_location_answers_the_query_and_releases_the_frame() -> None:
     resolver = missed()
     resolver.receive_location(location(), 0.1)
     assert resolver.resolve(SERVER, 0.1, NEIGHBOUR) == ([location()], None)
-    assert resolver.release_frames(SERVER) == [(b"frame", PENDING_S, NEIGHBOUR)]
-    assert (resolver.pending_frames, resolver.drops.total()) == (0, 0)
+    assert resolver.pending.release(SERVER) == [(b"frame", PENDING_S, NEIGHBOUR)]
+    assert (len(resolver.pending), resolver.drops.total()) == (0, 0)
 
 
 def test_a_negative_answer_drops_the_frame_and_stands_for_a_moment() -> None:
@@ -74,22 +74,22 @@ def test_a_location_that_a_rib_does_not_know_gets_another_lease_up_to_the_end_of
 
 def test_a_name_that_one_rib_does_not_know_is_queried_at_each_other_one_once_and_then_later() -> None:
     resolver = NameResolver(ME)
-    resolver.watch(SERVER, 0.0)
+    resolver.queries.watch(SERVER, 0.0)
     others = {name(f"rib{number}") for number in range(3)}
     asked: list[Name] = []
     for rib in sorted(others):
         assert [query for query, _ in resolver.queries_to_send(0.1 * len(asked))] == [SERVER]
-        assert rib not in resolver.passed_over(SERVER)
+        assert rib not in resolver.queries.passed_over(SERVER)
         resolver.receive_unknown(SERVER, rib, 0.1 * len(asked), others)
         asked.append(rib)
-    assert (resolver.queries_to_send(1.0), resolver.passed_over(SERVER)) == ([], frozenset())
+    assert (resolver.queries_to_send(1.0), resolver.queries.passed_over(SERVER)) == ([], frozenset())
     assert resolver.queries_to_send(ADVERTISEMENT.lease_s / 4 + 0.3) != []
 
 
 def test_a_frame_waits_while_ribs_do_not_know_its_name_and_then_is_dropped() -> None:
     resolver = missed()
     resolver.receive_unknown(SERVER, RIB, 0.1, {RIB})
-    assert resolver.pending_frames == 1
+    assert len(resolver.pending) == 1
     resolver.expire(PENDING_S)
     assert resolver.drops == {DropReason.PENDING_EXPIRED: 1}
 
@@ -104,7 +104,7 @@ def test_a_query_without_an_answer_drops_the_frame_when_it_fails() -> None:
     resolver = missed()
     for tries in range(1, TRIES_MAX + 4):
         resolver.queries_to_send(tries * RETRY_S)
-    assert (len(resolver._queries), resolver.pending_frames) == (0, 0)
+    assert (len(resolver.queries), len(resolver.pending)) == (0, 0)
     assert resolver.drops == {DropReason.NO_ROUTE: 1}
 
 
@@ -113,7 +113,7 @@ def test_a_frame_expires_while_its_query_is_open() -> None:
     assert resolver.next_expiry() == PENDING_S
     resolver.expire(PENDING_S)
     assert resolver.drops == {DropReason.PENDING_EXPIRED: 1}
-    assert len(resolver._queries) == 1
+    assert len(resolver.queries) == 1
 
 
 def test_a_frame_that_has_no_query_is_counted() -> None:
@@ -122,16 +122,16 @@ def test_a_frame_that_has_no_query_is_counted() -> None:
         resolver.resolve(name(str(number)), 0.0)
     resolver.resolve(SERVER, 0.0)
     resolver.buffer_frame(SERVER, b"frame", 0.0, NEIGHBOUR)
-    assert (resolver.pending_frames, resolver.drops) == (0, {DropReason.PENDING_FULL: 1})
+    assert (len(resolver.pending), resolver.drops) == (0, {DropReason.PENDING_FULL: 1})
 
 
 def test_a_neighbour_above_its_rate_opens_no_query() -> None:
     resolver = NameResolver(ME)
     for number in range(int(QUESTIONS_RATE.burst) + 10):
         resolver.resolve(name(str(number)), 0.0, NEIGHBOUR)
-    assert len(resolver._queries) == QUESTIONS_RATE.burst
+    assert len(resolver.queries) == QUESTIONS_RATE.burst
     resolver.resolve(SERVER, 0.0, b"n" + name("other"))
-    assert len(resolver._queries) == QUESTIONS_RATE.burst + 1
+    assert len(resolver.queries) == QUESTIONS_RATE.burst + 1
 
 
 def test_a_name_that_only_publishes_has_no_reader() -> None:
@@ -170,7 +170,7 @@ def test_a_location_that_is_used_is_watched() -> None:
 def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
     resolver = NameResolver(ME)
     resolver.receive_location(replace(location(expires_s=1.0), stale_until_s=9.0), 0.0)
-    resolver.serve_stale(0.5, stale=True)
+    resolver.cache.serve_stale(True, 0.5)
     assert resolver.expire(2.0) == []
     resolver.receive_removal(SERVER, name("robot"), 2.0)
     assert resolver.resolve(SERVER, 2.0) is None
@@ -178,7 +178,7 @@ def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
 
 def test_a_new_rib_gets_every_watch_at_once() -> None:
     resolver = NameResolver(ME)
-    resolver.watch(TOPIC, 0.0)
+    resolver.queries.watch(TOPIC, 0.0)
     assert resolver.queries_to_send(0.0) == [(TOPIC, ADVERTISEMENT.lease_s)]
     resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
     assert resolver.queries_to_send(1.0) == []
@@ -189,7 +189,7 @@ def test_a_new_rib_gets_every_watch_at_once() -> None:
 def test_the_echo_of_a_relayed_advertisement_answers_no_query_until_it_is_repeated() -> None:
     resolver = NameResolver(ME)
     watch = [(TOPIC, ADVERTISEMENT.lease_s)]
-    resolver.watch(TOPIC, 0.0)
+    resolver.queries.watch(TOPIC, 0.0)
     assert resolver.queries_to_send(0.0) == watch
     resolver.receive_location(location(TOPIC), 0.01, is_ours=True)
     assert resolver.queries_to_send(RETRY_S) == watch

@@ -5,7 +5,8 @@ from __future__ import annotations
 from gdp.errors import DropReason
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import HOPS_MAX, NEGATIVE_LEASE_S
+from gdp.intervals import NEGATIVE_LEASE_S
+from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.switch.table import NOWHERE
 from gdp.switch.unicast import _Installed
@@ -27,7 +28,7 @@ def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -
     world = ring()
     robot, nuc1 = world.members[ROBOT].name, world.switches["nuc1"]
     send(world, ABSENT)
-    assert nuc1.resolver.pending_frames == 0
+    assert len(nuc1.resolver.pending) == 0
     world.network.run(0.1)
     send(world, ABSENT)
     world.network.run(0.01)
@@ -40,7 +41,7 @@ def test_a_frame_waits_while_its_destination_is_asked_for() -> None:
     world = ring()
     send(world, ABSENT)
     world.network.run(0.0005)
-    assert world.switches["nuc1"].resolver.pending_frames == 1
+    assert len(world.switches["nuc1"].resolver.pending) == 1
 
 
 def test_who_attaches_where_it_was_missed_is_reached_at_once() -> None:

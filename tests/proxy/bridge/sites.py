@@ -73,7 +73,7 @@ class Machine:
     def is_due(self, now_s: float) -> bool:
         """Return whether the proxy's loop would wake up now."""
         due_s = self.bridge.get_timer()
-        has_news = bool(self.member._messages) or any(endpoint._events for endpoint in self.endpoints)
+        has_news = bool(self.member._reception.messages) or any(endpoint._events for endpoint in self.endpoints)
         return has_news or now_s >= self.tick_at_s or (due_s is not None and due_s <= now_s)
 
     @property
@@ -94,12 +94,12 @@ class Machine:
     @property
     def stream(self) -> Publisher:
         """Return the one publisher on the overlay."""
-        (publisher,) = self.member.publishers()
+        (publisher,) = list(self.member.publications)
         return publisher
 
     def is_read(self, readers: int = 1) -> bool:
         """Return whether everything that it publishes has this many readers."""
-        streams = self.member.publishers()
+        streams = list(self.member.publications)
         return bool(streams) and all(stream.readers == readers for stream in streams)
 
 
@@ -183,7 +183,7 @@ class Sites:
         self.kill(machine)
         self.world.restart_member(machine.label)
         assert self.world.run_until_attached()
-        again = self._start(machine.label, [machine.graph], cast(ProxyConfig, machine.bridge._config), None)
+        again = self._start(machine.label, [machine.graph], cast(ProxyConfig, machine.bridge.rules), None)
         self.machines.append(again)
         return again
 

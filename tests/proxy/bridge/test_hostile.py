@@ -131,7 +131,7 @@ def test_answers_and_news_that_are_none_do_not_stop_a_client(sites: Sites, wire:
     caller = Client(client.graph)
     assert sites.run(3, caller.sees_server)
     server.stream.publish(wire)
-    server.member.respond(server.stream.topic, client.member.name, wire)
+    server.member.services.respond(server.stream.topic, client.member.name, wire)
     sites.run(1)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: caller.outcomes == [switched("yes")])

@@ -28,7 +28,7 @@ def graph() -> FakeGraph:
 
 def streams(*machines: Machine) -> list[Machine]:
     """Return the proxies that publish on the overlay."""
-    return [machine for machine in machines if machine.member.publishers()]
+    return [machine for machine in machines if list(machine.member.publications)]
 
 
 def carried(*machines: Machine) -> int:
@@ -206,4 +206,4 @@ def test_the_virtual_server_of_one_proxy_is_not_exposed_by_another(sites: Sites)
     assert len(importing.bridge.flows) == 1
     assert shared.servers
     assert exposing.bridge.flows == []
-    assert not exposing.member.publishers()
+    assert not list(exposing.member.publications)

@@ -38,7 +38,7 @@ def test_a_rule_that_is_added_carries_and_the_untouched_one_loses_nothing(sites:
     sites.run(1)
     sites.reload(robot, expose=[OTHER, CHATTER])
     sites.reload(server, imports=[OTHER, CHATTER])
-    assert sites.run(1, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(1, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     more.publish(string("hello"))
     sites.run(3)
     assert other.texts == ["hello"]
@@ -72,7 +72,7 @@ def test_a_rule_that_is_removed_carries_no_more_and_the_untouched_one_loses_noth
     sites.reload(robot, expose=[CHATTER, OTHER])
     sites.reload(server, imports=[CHATTER, OTHER])
     other, more = Ear(server.graph, "/other"), robot.graph.publish("/talker", "/other", STRING)
-    assert sites.run(2, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(2, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     sites.every(0.005, 400, lambda number: talker.publish(string(str(number))))
     sites.run(0.5)
     sites.reload(robot, expose=[CHATTER])
@@ -122,7 +122,7 @@ def test_a_new_epoch_takes_effect_without_a_message_lost(sites: Sites) -> None:
 
 def renew(sites: Sites, machine: Machine, fills: dict[int, int]) -> None:
     """Give a machine the secrets of more epochs."""
-    config = machine.bridge._config
+    config = machine.bridge.rules
     held = sites.held(machine.member, config)
     more = {epoch: bytes([fill]) * 32 for epoch, fill in fills.items() if epoch > 1}
     topics = [Topic(each.delegation, {**each.secrets, **more}) for each in held]
@@ -216,7 +216,7 @@ def test_a_pattern_that_is_added_and_removed_costs_the_untouched_topic_nothing(s
     assert sites.run(1, lambda: bool(robot.bridge.undelegated))
     sites.reload(robot, expose=["name: /camera/**", CHATTER], holds=[named("/chatter"), named("/camera/left/image")])
     sites.reload(server, imports=[f"name: /camera/left/image, type: {STRING}", CHATTER])
-    assert sites.run(2, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(2, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     image.publish(string("an image"))
     assert sites.run(1, lambda: view.texts == ["an image"])
     sites.reload(robot, expose=[CHATTER])

@@ -124,7 +124,7 @@ def test_requests_of_a_client_without_a_description_do_not_keep_a_server_from_le
     machine, _, client, _ = called(sites)
     flow, publisher = serving_of(machine), bytes(client.member.name)
     with pytest.MonkeyPatch.context() as patch:
-        (writer_proxy,) = machine.member.writer_proxies_of(machine.stream.topic)
+        (writer_proxy,) = machine.member.subscriptions.writer_proxies_of(machine.stream.topic)
         patch.setattr(writer_proxy, "description", b"")
         for number in range(300):
             flow.receive(Message(machine.stream.topic, Delivered(publisher, 1, number, b"?", 1, 0), b""), sites.now_s)

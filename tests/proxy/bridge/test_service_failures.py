@@ -252,7 +252,7 @@ def test_a_call_goes_to_a_server_that_returns_in_the_moment_in_which_the_last_on
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == second.asked == 1)
     connected = list[Name]()
-    monkeypatch.setattr(client.member, "peers", lambda _: connected)
+    monkeypatch.setattr(client.member.services, "peers", lambda _: connected)
     for label in (SERVER, OTHER):
         connected[:] = [sites.name(label)]
         sites.run(1)

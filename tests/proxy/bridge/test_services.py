@@ -51,7 +51,7 @@ def test_both_sides_of_a_service_send_as_their_rules_say(sites: Sites) -> None:
     server, client = pair(sites, f"{SWITCH}, weight: 5, max_bits_s: 2000000", f"{SWITCH}, weight: 9")
     LocalServer(server.graph)
     assert sites.run(3, Client(client.graph).sees_server)
-    options = [publisher.options for machine in (server, client) for publisher in machine.member.publishers()]
+    options = [publisher.options for machine in (server, client) for publisher in list(machine.member.publications)]
     assert options == [SendOptions(weight=5, max_bits_s=2e6), SendOptions(weight=9)]
 
 

@@ -140,7 +140,7 @@ def test_what_is_lost_is_repaired_for_a_reliable_publisher_only(sites: Sites) ->
         robot.graph.publish("/talker", "/chatter", STRING),
         robot.graph.publish("/talker", "/other", STRING, BEST_EFFORT),
     ]
-    assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(3, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     sites.world.leads[SERVER].loss = 0.2
     for talker in talkers:
         sites.every(0.01, 100, partial(count_aloud, talker))
@@ -178,7 +178,7 @@ def test_a_rule_may_say_otherwise_than_the_publisher(sites: Sites) -> None:
 
 
 def options_of(machine: Machine) -> SendOptions:
-    (publisher,) = machine.member.publishers()
+    (publisher,) = list(machine.member.publications)
     return publisher.options
 
 

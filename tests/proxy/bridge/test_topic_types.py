@@ -39,7 +39,7 @@ def test_images_and_texts_arrive_in_the_dialect_of_the_listener(
     texts, images = Ear(server.graph, "/chatter"), Ear(server.graph, "/image", IMAGE)
     talker = robot.graph.publish("/talker", "/chatter", STRING)
     camera = robot.graph.publish("/camera", "/image", IMAGE)
-    assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(3, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     pixels = bytes(range(256)) * 50
     talker.publish(string("grüße", there))
     camera.publish(image(pixels, there))
@@ -101,7 +101,7 @@ def test_definitions_that_differ_are_reported_once_with_the_first_difference_and
     server = sites.add(SERVER, imports=[POSE, CHATTER], graph=graph(2, "int32 x\nfloat64 y\n"))
     poses, texts = Ear(server.graph, "/pose", CUSTOM), Ear(server.graph, "/chatter")
     talker, other = robot.graph.publish("/t", "/pose", CUSTOM), robot.graph.publish("/t", "/chatter", STRING)
-    assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(3, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     for _ in range(3):
         talker.publish(b"\0\1\0\0" + bytes(8))
     other.publish(string("hello"))

@@ -69,7 +69,8 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     assert sites.run(1, lambda: len(ear.heard) == 1)
     talker.close()
     assert sites.run(
-        READER.lease_s + 1, lambda: not robot.member.publishers() and not list(server.member.writer_proxies())
+        READER.lease_s + 1,
+        lambda: not list(robot.member.publications) and not list(server.member.subscriptions.writer_proxies()),
     )
     talker = talk(robot)
     assert sites.run(1, robot.is_read)
@@ -84,7 +85,7 @@ def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Site
     talker.publish(string("goodbye"))
     talker.close()
     assert sites.run(1, lambda: ear.texts == ["goodbye"])
-    assert sites.run(READER.lease_s + 1, lambda: not robot.member.publishers())
+    assert sites.run(READER.lease_s + 1, lambda: not list(robot.member.publications))
 
 
 @pytest.mark.parametrize("size", [20, 60_000])
@@ -99,7 +100,7 @@ def test_the_last_message_of_a_publisher_that_leaves_at_once_arrives_by_a_thin_l
     talker.publish(string("x" * size))
     talker.close()
     assert sites.run(5, lambda: len(ear.heard) == 1)
-    assert sites.run(READER.lease_s + 1, lambda: not robot.member.publishers())
+    assert sites.run(READER.lease_s + 1, lambda: not list(robot.member.publications))
     assert robot.faults == {}
 
 
@@ -110,8 +111,8 @@ def test_messages_that_stay_unconfirmed_after_their_publisher_has_gone_are_repor
         talker.publish(string(str(number)))
     talker.close()
     sites.run(9)
-    assert (len(robot.member.publishers()), robot.faults) == (1, {})
-    assert sites.run(2, lambda: not robot.member.publishers())
+    assert (len(list(robot.member.publications)), robot.faults) == (1, {})
+    assert sites.run(2, lambda: not list(robot.member.publications))
     assert robot.faults == {"unconfirmed": 1}
 
 
@@ -138,7 +139,7 @@ def test_a_rule_that_ends_ends_its_flow_at_once(sites: Sites) -> None:
     sites.run(0.1)
     sites.reload(robot)
     sites.run(0.2)
-    assert not robot.member.publishers()
+    assert not list(robot.member.publications)
 
 
 def test_two_talkers_of_one_topic_are_both_heard_and_one_may_leave(sites: Sites) -> None:
@@ -158,11 +159,11 @@ def test_the_tree_stands_only_while_somebody_local_reads(sites: Sites) -> None:
     robot, server = pair(sites)
     talk(robot)
     sites.run(3)
-    assert server.member.subscribed() == []
+    assert [each.topic for each in server.member.subscriptions] == []
     ear = Ear(server.graph, "/chatter")
     assert sites.run(1, robot.is_read)
     ear.leave()
-    assert sites.run(1, lambda: not server.member.subscribed() and robot.is_read(0))
+    assert sites.run(1, lambda: not [each.topic for each in server.member.subscriptions] and robot.is_read(0))
     again = Ear(server.graph, "/chatter")
     assert sites.run(1, robot.is_read)
     robot.graph.publications[-1].publish(string("again"))
@@ -216,7 +217,7 @@ def test_a_pattern_carries_what_is_delegated_and_tells_what_is_not(
     server = sites.add(SERVER, imports=["name: /camera/*"], holds=granted)
     talkers = [talk(robot, f"/camera/{side}") for side in ("left", "right", "third")]
     ears = [Ear(server.graph, f"/camera/{side}") for side in ("left", "right", "third")]
-    assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    assert sites.run(3, lambda: robot.is_read() and len(list(robot.member.publications)) == 2)
     for talker in talkers:
         talker.publish(string("?"))
     sites.run(1)

@@ -135,8 +135,8 @@ def wrong_right(folder: Path) -> Stage:
     stage.sites.add(ROBOT, expose=[CHATTER])
     machine = stage.sites.add(SERVER, imports=[CHATTER], holds=[])
     topic = stage.sites._topic(machine.member, named("/chatter"), {Right.PUBLISH})
-    machine.bridge._held._topics[topic.name] = topic
-    machine.bridge.reload(machine.bridge.rules, machine.bridge._held)
+    machine.bridge.held._topics[topic.name] = topic
+    machine.bridge.reload(machine.bridge.rules, machine.bridge.held)
     stage.listen()
     stage.talk()
     stage.run(10)
@@ -160,7 +160,7 @@ def delegation_expired(folder: Path) -> Stage:
 
 def delegation_revoked(folder: Path) -> Stage:
     stage = _flowing(folder)
-    topic = stage.server.bridge.held.get(stage.server.member.subscribed()[0].name)
+    topic = stage.server.bridge.held.get(next(each.topic for each in stage.server.member.subscriptions).name)
     assert topic is not None
     world = stage.sites.world
     fingerprint = parse(topic.delegation.chain[-1]).fingerprint

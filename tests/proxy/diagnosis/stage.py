@@ -193,7 +193,7 @@ class Stage:
         def holders(name: Name, _now_s: float) -> set[Name]:
             return {
                 reader
-                for each in member.publishers()
+                for each in list(member.publications)
                 if each.topic == name
                 for reader in map(Name, each.matched.names())
             }

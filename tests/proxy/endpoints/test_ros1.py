@@ -119,7 +119,7 @@ def test_what_is_published_is_heard_byte_for_byte_from_our_node(net: Net, ear: E
     big = bytes(range(256)) * 16_384
     ear.endpoint.publish(handle, string("one"))
     ear.endpoint.publish(handle, big)
-    ear.until(lambda: not ear.endpoint._link.is_behind)
+    ear.until(lambda: not ear.endpoint._rospy.link.is_behind)
     assert listener.line() == f"{string('one').hex()} /{NODE} 0 {STRING_MD5}"
     assert listener.line() == f"{big.hex()} /{NODE} 0 {STRING_MD5}"
     listener.end()
@@ -254,7 +254,7 @@ def test_a_type_that_is_not_installed_is_advertised_by_its_definition(net: Net, 
 
 
 def test_an_unknown_type_is_refused_with_what_to_install(monkeypatch: pytest.MonkeyPatch, ear: Ear) -> None:
-    monkeypatch.setattr("proxy.endpoints.ros1.endpoint.ANSWER_S", 30.0)  # the process imports the package to answer
+    monkeypatch.setattr("proxy.endpoints.ros1.rospy_process.ANSWER_S", 30.0)  # it imports the package to answer
     assert ear.endpoint.channel("/x", "sensor_msgs/msg/Image").hash == "060021388200f6f0f447d0fcd9c64743"
     with pytest.raises(LocalError, match="no_msgs/msg/Such is not known here"):
         ear.endpoint.channel("/x", "no_msgs/msg/Such")
@@ -277,7 +277,7 @@ def test_a_listener_that_stands_still_does_not_hold_up_the_others(net: Net, ear:
     os.kill(still.process.pid, signal.SIGSTOP)
     for number in range(150):
         ear.endpoint.publish(handle, string(f"{number:0100000}"))
-        ear.until(lambda: not ear.endpoint._link.is_behind)
+        ear.until(lambda: not ear.endpoint._rospy.link.is_behind)
         assert bytes.fromhex(awake.line().split()[0]).endswith(f"{number:04}".encode())
     os.kill(still.process.pid, signal.SIGCONT)
 
@@ -296,7 +296,7 @@ rospy.spin()
 
 def test_rounds_of_subscribing_and_advertising_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
     net.peer(ROUNDABOUT)
-    pid = ear.endpoint._process.pid
+    pid = ear.endpoint._rospy._process.pid
 
     def rounds(count: int) -> None:
         for _ in range(count):

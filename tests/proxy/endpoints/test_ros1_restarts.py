@@ -121,7 +121,7 @@ def test_a_killed_rospy_process_comes_back_with_everything(net: Net) -> None:
     dial = ear.endpoint.create_client("/slow", SET_BOOL)
     ear.endpoint.call(dial, 7, b"\1")
     server.until("asked")
-    os.kill(ear.endpoint._process.pid, signal.SIGKILL)
+    os.kill(ear.endpoint._rospy._process.pid, signal.SIGKILL)
     assert ear.wait(CallFailed, 1, dial)[0].call == 7
     for handle in (*handles, dial):
         assert "has ended" in ear.wait(EndpointError, 1, handle)[0].reason
@@ -152,7 +152,7 @@ def test_an_endpoint_shuts_without_a_master_too(net: Net) -> None:
     net.stop_master()
     ear = net.endpoint()
     ear.wait(EndpointError, 1, ear.endpoint.subscribe("/in", STRING, None))
-    process = ear.endpoint._process
+    process = ear.endpoint._rospy._process
     net.leave()
     assert process.returncode == 0
 
@@ -163,7 +163,7 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
     other = net.endpoint("another_node")
     other.wait_end("/out")
     net.endpoints.remove(ear.endpoint)
-    process = ear.endpoint._process
+    process = ear.endpoint._rospy._process
     ear.endpoint.shut_down()
     assert process.returncode == 0
     other.wait_end("/out", gone=True)

@@ -158,7 +158,7 @@ def test_fifty_local_clients_at_once_are_answered_or_refused_with_the_reason(net
             ear.endpoint.answer(handle, event.ticket, fine("yes"))
         else:
             ear.endpoint.refuse(handle, event.ticket, "no server")
-    ear.until(lambda: not ear.endpoint._link.is_behind)
+    ear.until(lambda: not ear.endpoint._rospy.link.is_behind)
     lines = set()
     while (line := clients.line()) != "done":
         lines.add(line)
@@ -206,7 +206,7 @@ def test_a_service_type_that_is_not_installed_is_served_by_its_definitions(net: 
 
 def test_rounds_of_serving_and_calling_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
     net.peer(SERVER)
-    pid = ear.endpoint._process.pid
+    pid = ear.endpoint._rospy._process.pid
 
     def rounds(count: int) -> None:
         for _ in range(count):

@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Final, cast
 from unittest import mock
 
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gdp.crypto.keys import SoftwareKey
-from gdp.dashboard.core.readings import Reading
-from gdp.dashboard.core.scene import Scene
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
 from gdp.nodes.data_plane import Chosen
@@ -81,15 +79,18 @@ class MemoryRuntime:
             call(now)
 
 
-def outputs(folder: Path) -> dict[str, object]:
-    """Return by node and command what clients read, with names replaced by labels."""
+Projections = Mapping[str, Callable[[Iterable[ControlHandlers]], object]]
+
+
+def outputs(folder: Path, projections: Projections = MappingProxyType({})) -> dict[str, object]:
+    """Return by node and command what clients read, and further projections of all nodes; labels replace names."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(signing_oracle())
         owner = SoftwareKey.of(ec.derive_private_key(4_711, ec.SECP256R1()))
         for module in (rule_files, sites_module):
             stack.enter_context(mock.patch.object(module, "OWNER", owner))
         network = _Network(folder, stack)
-        return network.labelled(network.read())
+        return network.labelled(network.read(projections))
 
 
 class _Network:
@@ -124,11 +125,11 @@ class _Network:
         assert sites.run(10, lambda: len(ear.heard) > 40 and len(camera_ear.heard) > 40 and server.asked == 1)
         sites.run(1)
 
-    def read(self) -> dict[str, object]:
+    def read(self, projections: Projections) -> dict[str, object]:
         """Return what each command reads of each node."""
         world = self.sites.world
         found: dict[str, object] = {}
-        topic = self.robot.stream.topic if len(self.robot.member.publishers()) == 1 else self._topic()
+        topic = self.robot.stream.topic if len(list(self.robot.member.publications)) == 1 else self._topic()
         for label, handlers in self.handlers.items():
             self.runtimes[label].tick(world.network.now)
             shown: dict[str, object] = {"status": handlers.status(), "snapshot": handlers.snapshot()}
@@ -144,7 +145,7 @@ class _Network:
             lines = Metrics(self.sources[label]).text().splitlines()
             shown["metrics"] = [line for line in lines if "gdp_latency" not in line]  # by the clock of the host
             found[label] = shown
-        found["dashboard"] = self._scene()
+        found |= {name: project(self.handlers.values()) for name, project in projections.items()}
         for label, identity in world.identities.items():
             if label not in world.switches or label in self.handlers:
                 found[f"state {label}"] = self._ask(identity.name, topic)
@@ -167,16 +168,6 @@ class _Network:
 
     def _topic(self) -> Name:
         return next(spec.name for spec, _ in self.robot.bridge.flows if spec.local == "/chatter")
-
-    def _scene(self) -> dict[str, object]:
-        scene = Scene()
-        for second in range(2):
-            rows = [
-                Reading(json.loads(json.dumps(each.snapshot())), json.loads(json.dumps(each.topology())))
-                for each in self.handlers.values()
-            ]
-            scene.update(rows, float(second), float(second))
-        return {"structure": scene.structure(), "figures": scene.figures(0), "name": scene.name_detail("x")}
 
     def _ask(self, target: Name, topic: Name) -> Mapping[str, object]:
         """Return the reply of a node to ``state``, asked over the network in memory."""

@@ -244,7 +244,7 @@ def test_a_replayed_topic_is_reliable_unless_its_rule_says_otherwise(sites: Site
         other = f"name: /other, type: {STRING}, reliable: false"
         robot = join(sites, ROBOT, endpoint, expose=[CHATTER, other])
         sites.run(1)
-        assert sorted(each.confirms for each in robot.member.publishers()) == [False, True]
+        assert sorted(each.confirms for each in list(robot.member.publications)) == [False, True]
 
 
 def test_a_replayed_message_is_of_use_for_the_lifespan_that_was_recorded(sites: Sites, tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_a_replayed_message_is_of_use_for_the_lifespan_that_was_recorded(sites: 
     for endpoint in opened(path):
         robot = join(sites, ROBOT, endpoint, expose=[f"{CHATTER}, reliable: false"])
         sites.run(1)
-        assert [each.options.deadline_s for each in robot.member.publishers()] == [0.5]
+        assert [each.options.deadline_s for each in list(robot.member.publications)] == [0.5]
 
 
 def test_a_late_recorder_gets_the_last_message_of_a_latched_recording(sites: Sites, tmp_path: Path) -> None:

@@ -6,11 +6,11 @@ from typing import Final
 
 import pytest
 
-from proxy.doors.rosbridge_json import RosbridgeCodec
-from proxy.endpoints.dds.types import known_channel
 from proxy.recordings.channels import from_ros2
 from proxy.serial.channel import EMPTY_MD5, Channel, ros1_format
 from proxy.serial.converter import MessageConverter, translated_channel
+from proxy.serial.known_types import known_channel
+from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
 from proxy.serial.service_converter import translated_service
 from proxy.tools.message_text import MessageText, request_of
@@ -30,9 +30,7 @@ _TRIGGER1: Final = Service(
 
 
 def ros2() -> Channel:
-    channel = known_channel("/e", _EMPTY)
-    assert channel is not None
-    return channel
+    return known_channel("/e", _EMPTY)
 
 
 @pytest.mark.parametrize(

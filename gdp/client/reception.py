@@ -1,0 +1,90 @@
+"""Reception of a participant: frames go to their writer proxies; messages and reports come out.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from gdp.client.subscription import Message, Subscription, Subscriptions
+from gdp.client.timer_queue import TimerQueue
+from gdp.client.writer_proxy import WriterProxy
+from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import Header
+from gdp.sansio import ReceivedFrame
+
+__all__ = ["Reception"]
+
+
+class Reception:
+    """The writer proxies of one participant, with those that have news.
+
+    Attributes:
+        under_way: the writer proxy whose next fragment is expected.
+        fed: writer proxies that received frames since the last ``hand_out``.
+        messages: that arrived, in order within each writer proxy; the participant hands them out.
+        reporting: writer proxies whose report may be due.
+        timers: of the writer proxies.
+    """
+
+    def __init__(self, subscriptions: Subscriptions, send: Callable[[list[bytes]], None]) -> None:
+        self._subscriptions = subscriptions
+        self._send = send
+        self.fed: dict[WriterProxy, Subscription] = {}
+        self.under_way: tuple[WriterProxy, Subscription] | None = None
+        self.messages: list[Message] = []
+        self.reporting: dict[WriterProxy, None] = {}
+        self.timers = TimerQueue[WriterProxy]()
+
+    def receive(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
+        """Pass a frame to its writer proxy.
+
+        Raises:
+            StatementError: NOT_FOR_US.
+        """
+        found = self._subscriptions.find(header, now_s)
+        if found is None:
+            raise StatementError(DropReason.NOT_FOR_US)
+        subscription, writer_proxy = found
+        writer_proxy.receive(header, arrival.frame, now_s, arrival.waited_s)
+        self.fed[writer_proxy] = subscription
+        if header.parts > 1:
+            self.under_way = writer_proxy, subscription
+
+    def hand_out(self, now_s: float) -> None:
+        """Take the messages of the writer proxies that received frames."""
+        for writer_proxy, subscription in self.fed.items():
+            self.messages += subscription.poll_messages(writer_proxy.publisher)
+            if writer_proxy.is_report_due(now_s):
+                self.reporting[writer_proxy] = None  # it states for how long it held back what it reports
+            self.timers.reschedule(writer_proxy)
+        self.fed.clear()
+
+    def handle_timer(self, now_s: float) -> None:
+        """Process the timers that are due."""
+        for writer_proxy in self.timers.poll_due(now_s):
+            writer_proxy.handle_timer(now_s)
+            self.reporting[writer_proxy] = None
+            subscription = self._subscriptions.get(writer_proxy.topic)
+            if subscription is not None:  # it may have gone on without what is lost
+                self.messages += subscription.poll_messages(writer_proxy.publisher)
+
+    def report(self, now_s: float) -> None:
+        """Send the reports that are due."""
+        for writer_proxy in self.reporting:
+            notes = writer_proxy.control_to_send(now_s)
+            if notes:
+                self._send(notes)
+            self.timers.reschedule(writer_proxy)
+        self.reporting.clear()
+
+    def close(self, writer_proxies: Iterable[WriterProxy], *, goodbye: bool) -> None:
+        """Close writer proxies; ``goodbye``: also send each publisher a goodbye."""
+        self.under_way = None
+        for writer_proxy in writer_proxies:
+            notes = writer_proxy.close()
+            if goodbye:
+                self._send(notes)
+            self.reporting.pop(writer_proxy, None)
+            self.timers.reschedule(writer_proxy)

@@ -1,0 +1,71 @@
+"""Options that the doors share, and the course of a door's command.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from gdp.cli.completion import complete_node
+from gdp.cli.node import AwaitIface, Json
+from gdp.links.uplink import wait_for_device
+from gdp_extensions.doors.token import NoToken, TokenFile, door_token
+from proxy.cli.node_options import Delegations, Iface
+
+if TYPE_CHECKING:
+    from gdp_extensions.doors.endpoint import NewSession
+
+__all__ = ["DoorNode", "DoorOptions", "Listen", "Origins", "serve_door"]
+
+DoorNode = Annotated[
+    Path,
+    typer.Argument(
+        metavar="NODE", autocompletion=complete_node, help="The door's own node: its directory, or its proxy.yaml."
+    ),
+]
+Origins = Annotated[
+    list[str], typer.Option("--origin", metavar="URL", help="Let pages of this origin connect, as in the example.")
+]
+Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where clients connect.")]
+
+
+class DoorOptions(NamedTuple):
+    """Options of every door: who may connect, and which member it is."""
+
+    token_file: TokenFile = None
+    no_token: NoToken = False
+    iface: Iface = None
+    delegations: Delegations = None
+    await_iface: AwaitIface = 0.0
+    json: Json = False
+
+
+def serve_door(
+    label: str,
+    new_session: NewSession,
+    node: Path,
+    listen: str,
+    origins: Sequence[str],
+    options: DoorOptions,
+    *,
+    subprotocols: tuple[str, ...] = (),
+) -> None:
+    """Serve clients of a door until Ctrl-C.
+
+    Raises:
+        LocalError: keys, delegations, the token, the device or the address are not as stated.
+    """
+    from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+    from gdp_extensions.doors.node import run_door
+    from proxy.node.member_config import member_config
+
+    config, _ = member_config(node, options.iface, options.delegations)
+    token = door_token(options.token_file, no_token=options.no_token)
+    settings = DoorSettings(label=label, listen=listen, origins=tuple(origins), subprotocols=subprotocols, token=token)
+    wait_for_device(config.iface, options.await_iface)
+    run_door(config, lambda rights: DoorEndpoint(settings, new_session, rights), json=options.json)

@@ -1,0 +1,1 @@
+"""Protocols of doors and what a door remembers of its clients. Sans-I/O."""

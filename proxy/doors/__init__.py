@@ -1,4 +1,0 @@
-"""Doors: WebSocket servers through which programs of other systems read and write names of the overlay.
-
-A door is an endpoint of the bridge, next to ``proxy/endpoints/ros2``: its graph consists of WebSocket clients.
-"""

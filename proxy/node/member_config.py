@@ -1,0 +1,55 @@
+"""Configuration of a member that has no rules: a door, or a tool.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import orjson
+from pydantic import ValidationError
+
+from gdp.config.schema import first_fault
+from gdp.errors import LocalError
+from gdp.session.settings import SessionConfig, settings_of
+from proxy.config.config import ProxyConfig
+
+__all__ = ["member_config"]
+
+
+def member_config(node: Path, iface: str | None, delegations: Path | None) -> tuple[ProxyConfig, Path]:
+    """Return the configuration of such a member, and the directory of its delegations.
+
+    Args:
+        node: its directory, or its configuration file; rules and graphs in that are not used.
+
+    Raises:
+        LocalError: the node does not exist, or its files are wrong.
+    """
+    settings = settings_of(node, iface=iface, delegations=delegations)
+    directory = settings.delegation_directory
+    if not directory.is_dir():
+        raise LocalError(f"{directory}: no delegations; install one with 'gdp delegate install FILE --node {node}'")
+    try:
+        return ProxyConfig.model_validate_json(orjson.dumps(_values(settings, directory), default=os.fspath)), directory
+    except ValidationError as error:
+        raise LocalError(f"{node}: {first_fault(error)}") from error
+
+
+def _values(settings: SessionConfig, directory: Path) -> dict[str, object]:
+    domain = settings.domain
+    return {
+        "identity": settings.identity,
+        "domain": {
+            "root": domain.root,
+            "trusts": list(domain.trusts),
+            "transit": None if domain.transit is None else list(domain.transit),
+        },
+        "iface": settings.iface,
+        "delegations": directory,
+        "state": settings.state,
+        "lease_s": settings.lease_s,
+        "busy_poll_us": settings.busy_poll_us,
+    }
