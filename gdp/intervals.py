@@ -1,12 +1,6 @@
 """Named intervals, and the formulas by which other times derive from them.
 
 Sans-I/O; imports nothing of this project. A time of one mechanism alone is in its module; one idea has one value here.
-
-::
-
-    SoftState      sent again each ``refresh_s``, forgotten after ``lease_s`` = ``periods`` * ``refresh_s``
-    a wait         LOOK_S < WATCH_S < TICK_S < UPKEEP_S: what has no event is looked at so often, by who waits for it
-    a request      PROMPT_S < ANSWER_S < RELOAD_S < SERVER_S: by what the other program does before it answers
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ class SoftState:
 
     Attributes:
         refresh_s: between two sends.
-        periods: for which it is kept: one less, rounded down, may be lost in a row.
+        periods: for which it is kept; a whole one less may be lost in a row.
     """
 
     refresh_s: float
@@ -83,6 +77,7 @@ PROMPT_S: Final = 0.5  # silence is an answer, too, and others wait meanwhile
 ANSWER_S: Final = 2.0  # on this machine, from its state
 RELOAD_S: Final = 10.0  # ... from its files, which it reads again
 CONNECT_S: Final = 5.0  # handshake with another machine
+TRY_S: Final = 2.0  # ... at one of several addresses
 SERVER_S: Final = 30.0  # work of a server, or of a program of the system
 RETRY_S: Final = 5.0  # after a failure that time alone may end
 REFUSED_S: Final = 10.0  # for which a refusal, or silence, of one server is remembered
@@ -90,6 +85,8 @@ IDLE_S: Final = 10.0  # a connection without a request may be closed for another
 CACHE_S: Final = 30.0  # for which an answer of another service is used again
 
 # Life of programs
+TURN_S: Final = 0.0002  # longest wait of a thread for the interpreter; Python's default is 5 ms
+SCHEDULED_S: Final = 0.02  # within which a process runs that has work; later, the machine is busy
 ATTACH_S: Final = 10.0  # until a device is there, or a switch has accepted a node
 STOP_S: Final = 5.0  # from SIGTERM to SIGKILL
 STEADY_S: Final = 30.0  # a program that ran this long is started again at once

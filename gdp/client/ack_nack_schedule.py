@@ -18,9 +18,8 @@ from gdp.requests import Backoff
 __all__ = ["AckNackSchedule"]
 
 _FIRST_BYTES: Final = 3_000
-_MISSING: Final = Backoff(
-    REPORT_DELAY_S, 16 * REPORT_DELAY_S
-)  # between two requests of what is missing, while nothing comes
+# between two requests of what is missing, while nothing comes
+_MISSING: Final = Backoff(REPORT_DELAY_S, 16 * REPORT_DELAY_S)
 
 
 class AckNackSchedule:

@@ -21,12 +21,7 @@ from gdp.crypto.statements import Statement, StatementType, check_sequence, pars
 from gdp.errors import DropReason, FrameError, LocalError, StatementError
 from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
 from gdp.frame.kinds import Kind
-from gdp.limits import (
-    DIAGNOSTIC_FRAMES_RATE,
-    DIAGNOSTIC_WAIT_S,
-    DIAGNOSTICS_RATE,
-    HOPS_MAX,
-)
+from gdp.limits import DIAGNOSTIC_FRAMES_RATE, DIAGNOSTIC_WAIT_S, DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame, Timestamps

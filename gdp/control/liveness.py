@@ -17,13 +17,12 @@ from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.control.settings import NodeSettings
-from gdp.intervals import HELLO_IDLE, NEVER_S
+from gdp.intervals import HELLO_IDLE, NEVER_S, SCHEDULED_S
 from gdp.names import Name
 
 __all__ = ["LivenessMonitor"]
 
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
-_LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
 _OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
 _UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
 
@@ -95,7 +94,7 @@ class LivenessMonitor:
 
     def note_call(self, due_s: float, now_s: float) -> None:
         """Note when this node is called, and when it had requested that."""
-        if float("-inf") < due_s < now_s - _LATE_S:  # a neighbour to remove is due at once: that is no lateness
+        if float("-inf") < due_s < now_s - SCHEDULED_S:  # a neighbour to remove is due at once: that is no lateness
             self._lateness_s += now_s - due_s
             self._slowness.late(now_s - due_s, now_s)
 

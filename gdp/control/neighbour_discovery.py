@@ -23,20 +23,10 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from gdp.control.admission import (
-    Admission,
-    read_cookie,
-    seal_cookie,
-)
+from gdp.control.admission import Admission, read_cookie, seal_cookie
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import (
-    DIGEST_BYTES,
-    NONCE_BYTES,
-    RTCERTS_MAX,
-    Hello,
-    Timing,
-)
+from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
 from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts

@@ -22,7 +22,7 @@ from gdp.config.relay_config import RelayBorder
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
 from gdp.host_port import split_host_port
-from gdp.intervals import REFUSED_S
+from gdp.intervals import REFUSED_S, TRY_S
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_server import port_status
@@ -39,7 +39,6 @@ __all__ = ["BorderDialer"]
 
 log = logging.getLogger(__name__)
 
-_CONNECT_S: Final = 2.0  # for one address; then the next one has its turn
 _REDIALS: Final = Backoff(0.1, 5.0)
 _CANDIDATES_MAX: Final = 16
 _STANDBY: Final = "on standby: the tunnel over UDP is up, or has a moment to come up"
@@ -232,7 +231,7 @@ class BorderDialer:
             self._connecting = None
             self._failed(os.strerror(number))
             return
-        self._due_s = time.monotonic() + _CONNECT_S
+        self._due_s = time.monotonic() + TRY_S
         self._loop.wake_at(self._due_s)
         self._loop.register(opened.fileno(), select.EPOLLOUT, self._connected)
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
-from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
-from gdp.intervals import TICK_S
+from gdp.intervals import TICK_S, TURN_S
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from gdp_extensions.doors.core.hub import Rights
@@ -27,8 +26,6 @@ log = logging.getLogger(__name__)
 
 OpenDoor = Callable[[Callable[[], Rights]], DoorEndpoint]
 
-_TURN_S: Final = 0.0002  # longest wait of the server's thread for the interpreter; Python's default is 5 ms
-
 
 def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
     """Serve clients until stopped; SIGHUP or ``gdp reload`` reads the delegations again.
@@ -36,7 +33,7 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
     Raises:
         LocalError: keys, delegations, the device or the address are not as stated.
     """
-    sys.setswitchinterval(_TURN_S)
+    sys.setswitchinterval(TURN_S)
     with run_node(config, emit_wait if json else None) as node:
         held = DelegationStore(config.delegations, node.identity)
         state = [rules_of(list(held))]

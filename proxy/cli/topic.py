@@ -18,15 +18,7 @@ from gdp.cli.program import Program
 from gdp.errors import RemoteError
 from gdp.intervals import REPORT_S
 from gdp.trust.right import Right
-from proxy.cli.tool_options import (
-    Node,
-    ToolOptions,
-    TypeName,
-    complete_readable,
-    print_json,
-    print_text,
-    running_tool,
-)
+from proxy.cli.tool_options import Node, ToolOptions, TypeName, complete_readable, print_json, print_text, running_tool
 
 if TYPE_CHECKING:
     from proxy.bridge.bridge import Bridge

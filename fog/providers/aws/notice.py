@@ -28,13 +28,12 @@ import typer
 from fog.host.preemption_notice import write_notice
 from fog.providers.aws.core.instances import DRAIN
 from gdp.cli.version import HELP
-from gdp.intervals import ANSWER_S, DRAIN_S, HOUR_S
+from gdp.intervals import ANSWER_S, DRAIN_S, HOUR_S, POLL_S
 from gdp.terminal import echo
 
 __all__ = ["Metadata", "Watch", "main"]
 
 METADATA_URL: Final = "http://169.254.169.254"
-POLL_S: Final = 5.0
 _TOKEN_HEADER: Final = "X-aws-ec2-metadata-token"
 _NONE: Final = 404
 _TOKEN_EXPIRED: Final = 401

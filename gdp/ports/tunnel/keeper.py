@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.intervals import LOOK_S, STEADY_S, UPKEEP_S
+from gdp.intervals import ATTACH_S, LOOK_S, STEADY_S, UPKEEP_S
 from gdp.ports.confine.system import prctl
 from gdp.ports.netlink import LINK_GROUP, Notifications, RefusedError
 from gdp.ports.readiness import readable
@@ -63,7 +63,6 @@ _IFF_TUN, _IFF_NO_PI, _IFF_VNET_HDR = 0x1, 0x1000, 0x4000
 _TUN_PI, _TUN_VNET_HDR = 4, 5  # IFLA_TUN_PI, IFLA_TUN_VNET_HDR
 _DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG
 _NO_NEW_PRIVS: Final = 38
-_START_S: Final = 5.0
 _END_S: Final = 0.3
 _QUEUE_PACKETS: Final = 1_000  # as Ethernet devices; the 500 of TUN devices overflow in a burst of one window
 _RESTART_MIN_S, _RESTART_MAX_S = 0.1, 5.0
@@ -294,7 +293,7 @@ class _Keeper:
         with contextlib.closing(Notifications(LINK_GROUP)) as news:
             child = self._spawn(program, {})
             try:
-                end_s = time.monotonic() + _START_S
+                end_s = time.monotonic() + ATTACH_S
                 while (device := find_device(self._ifname)) is None or device.kind != "tun":
                     if child.process.poll() is not None or time.monotonic() > end_s:
                         child.read()
@@ -338,7 +337,7 @@ class _Keeper:
         mtu = self._found().mtu
         socket_path(self._ifname).unlink(missing_ok=True)
         child = self._spawn(program, {"WG_TUN_FD": str(self._tun)})
-        end_s = time.monotonic() + _START_S
+        end_s = time.monotonic() + ATTACH_S
         while not self._serves():
             if child.process.poll() is not None or time.monotonic() > end_s:
                 child.end()

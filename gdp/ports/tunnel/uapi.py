@@ -21,13 +21,12 @@ from typing import Final
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.intervals import LOOK_S, RETRY_S
+from gdp.intervals import ANSWER_S, LOOK_S, RETRY_S
 from gdp.ports.tunnel.control import Change, ControlLostError, DeviceState, PeerChange, PeerState
 
 __all__ = ["SOCKET_FOLDER", "UserspaceControl", "parse_state", "request_text", "socket_path"]
 
 SOCKET_FOLDER: Final = Path("/var/run/wireguard")  # wireguard-go allows no other
-_TIMEOUT_S: Final = 1.0  # it replies within milliseconds; the limit keeps a stopped process from blocking a node
 _BIND_TRIES: Final = 10  # a keeper that enlarges the buffers of a socket holds its port open for a moment
 _REPLY_MAX_BYTES: Final = 4 << 20
 _NANO: Final = 1e-9
@@ -79,7 +78,7 @@ class UserspaceControl:
             raise ControlLostError(f"tunnel {self._ifname}: wireguard-go did not respond")
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-                connection.settimeout(_TIMEOUT_S)
+                connection.settimeout(ANSWER_S)
                 connection.connect(str(socket_path(self._ifname)))
                 connection.sendall(request.encode())
                 reply = _read(connection)
