@@ -31,7 +31,7 @@ from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
-from fog.providers.aws.config import AwsConfig
+from fog.providers.aws_config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.providers.skypilot_config import SkyPilotConfig
 from fog.software.config import SOFTWARE_PORT, SoftwareConfig, listening_host_port

@@ -6,12 +6,15 @@ Source: FogROS2-FT, Listing 1.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from fog.launch.cluster_spec import ClusterKeywords, ClusterSpec
 from fog.launch.unreturned import record
 
 __all__ = ["FogCluster"]
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class FogCluster(ClusterKeywords):
     """Nodes on machines; each machine is a replica of all nodes. ``ClusterKeywords`` has its arguments.
 

@@ -7,26 +7,12 @@ Source: ros2cli 0.32 (jazzy), ``ros2cli.plugin_system``.
 from __future__ import annotations
 
 import argparse
+from functools import cache
+from typing import Final
 
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 
-__all__ = [
-    "CostVerb",
-    "DownVerb",
-    "LaunchVerb",
-    "LocalVerb",
-    "LogsVerb",
-    "LsVerb",
-    "PlanVerb",
-    "PricesVerb",
-    "PushVerb",
-    "ScaleVerb",
-    "SshVerb",
-    "StatusVerb",
-    "SuperviseVerb",
-    "VerbExtension",
-    "WheelsVerb",
-]
+__all__ = ["VerbExtension"]
 
 
 class VerbExtension:
@@ -51,57 +37,27 @@ class VerbExtension:
         return 0
 
 
-class LaunchVerb(VerbExtension):
-    """Start what a launch file describes, the cluster first."""
+_VERBS: Final = {
+    "LaunchVerb": "Start what a launch file describes, the cluster first.",
+    "LsVerb": "List clusters.",
+    "StatusVerb": "Show a cluster's machines and what they serve.",
+    "ScaleVerb": "Add or take away replicas while all runs.",
+    "LogsVerb": "Show what a machine's programs wrote.",
+    "PushVerb": "Bring the present software to a cluster's machines.",
+    "SshVerb": "Open a shell on a machine.",
+    "CostVerb": "Show what clusters cost.",
+    "PlanVerb": "Compute how many replicas are needed, and their price.",
+    "PricesVerb": "Show what machines cost, and how far away they are.",
+    "SuperviseVerb": "Keep clusters as they are wanted.",
+    "WheelsVerb": "Build the wheels that rented machines install.",
+    "LocalVerb": "Let something happen to a local machine.",
+    "DownVerb": "Give all machines of a cluster back.",
+}  # class, as an entry point names it, and what ros2cli shows
 
 
-class LsVerb(VerbExtension):
-    """List clusters."""
-
-
-class StatusVerb(VerbExtension):
-    """Show a cluster's machines and what they serve."""
-
-
-class ScaleVerb(VerbExtension):
-    """Add or take away replicas while all runs."""
-
-
-class LogsVerb(VerbExtension):
-    """Show what a machine's programs wrote."""
-
-
-class PushVerb(VerbExtension):
-    """Bring the present software to a cluster's machines."""
-
-
-class SshVerb(VerbExtension):
-    """Open a shell on a machine."""
-
-
-class CostVerb(VerbExtension):
-    """Show what clusters cost."""
-
-
-class PlanVerb(VerbExtension):
-    """Compute how many replicas are needed, and their price."""
-
-
-class PricesVerb(VerbExtension):
-    """Show what machines cost, and how far away they are."""
-
-
-class SuperviseVerb(VerbExtension):
-    """Keep clusters as they are wanted."""
-
-
-class WheelsVerb(VerbExtension):
-    """Build the wheels that rented machines install."""
-
-
-class LocalVerb(VerbExtension):
-    """Let something happen to a local machine."""
-
-
-class DownVerb(VerbExtension):
-    """Give all machines of a cluster back."""
+@cache
+def __getattr__(name: str) -> type[VerbExtension]:
+    """Return the class of a verb."""
+    if name not in _VERBS:
+        raise AttributeError(name)
+    return type(name, (VerbExtension,), {"__doc__": _VERBS[name]})

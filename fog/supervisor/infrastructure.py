@@ -23,7 +23,6 @@ from fog.machine import MachineState
 from fog.providers.local.netlinks import delete
 from fog.providers.local.spawn import spawn_detached
 from fog.providers.provider import AccountProvider, Provider
-from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
 from gdp.extras import Seam
@@ -39,7 +38,7 @@ log = logging.getLogger(__name__)
 
 _OWN_SPACE: Final = Path("/proc/self/ns/net")
 _GATEWAY_DAYS: Final = 3_650.0
-_PROVIDERS: Final[Seam[Callable[[SkyPilotConfig], Provider]]] = Seam("fog.provider")
+_PROVIDERS: Final[Seam[Callable[[Site], Provider]]] = Seam("fog.provider")
 
 
 def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
@@ -51,16 +50,9 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
     Raises:
         LocalError: a requirement is not installed, or its settings are wrong.
     """
-    match site.provider:
-        case "local":
-            return local_provider(site, regions)
-        case "aws":
-            from fog.catalog.prices import price_list
-            from fog.providers.aws.provider import AwsProvider
-
-            return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
-        case "skypilot":
-            return _PROVIDERS.get("skypilot", "provider skypilot")(site.skypilot)
+    if site.provider == "local":
+        return local_provider(site, regions)
+    return _PROVIDERS.get(site.provider, f"provider {site.provider}")(site)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:

@@ -99,9 +99,7 @@ class Watch:
                     attached_s = None
                 elif attached_s is None:
                     attached_s = time.monotonic()
-                peers = {
-                    name.to_text(): frozenset(each.to_text() for each in member.services.peers(name)) for name in called
-                }
+                peers = {name.to_text(): frozenset(map(Name.to_text, member.services.peers(name))) for name in called}
                 is_reported = attached_s is not None and (
                     all(peers.values()) or time.monotonic() - attached_s >= _SETTLED_S
                 )

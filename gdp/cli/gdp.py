@@ -58,6 +58,7 @@ _KNOWN: Final = {
     "cert": LazyCommand("gdp.cli.cert:app"),
     "delegate": LazyCommand("gdp.cli.delegate:app"),
     "audit": LazyCommand("gdp.cli.audit:app"),
+    "incident": LazyCommand("gdp.cli.incident:app"),
     "topic": LazyCommand("gdp.cli.topic:app"),
     "unit": LazyCommand("gdp.cli.unit:app"),
     "rib": LazyCommand("gdp.cli.rib_lookup:app"),

@@ -186,11 +186,6 @@ class AckNackHandler:
                 reader.start = reader.start._replace(number=move.new_number(reader.start.number))
         self._heartbeats.wanted = True
 
-    def release_window(self) -> None:
-        """Drop every reader from the window: it is no longer used."""
-        for name in self._readers.names():
-            self._window.drop_reader(name)
-
     def forget(self, name: bytes) -> None:
         """Forget a reader."""
         if self._readers.forget(name):
@@ -240,8 +235,8 @@ class AckNackHandler:
                 number = self._first_of(acknack, since_s)
                 waiting = number - queue.next_number
                 begin = queue.ledger.begin_of(number, queue.first_waiting)
-                if 0 < waiting < len(queue.deferred):
-                    begin = queue.deferred.sequence_of(waiting)
+                if 0 < waiting < len(queue.deferred.waiting):
+                    begin = queue.deferred.waiting[waiting][0]
                 if queue.is_acknowledged and not (queue.depth or acknack.next_number):
                     begin = min(queue.ledger.first_since(since_s), begin)  # what was published in between is lost
                 if reader.start is not None:  # it is a reader since then: what it did not get since is lost
@@ -265,11 +260,12 @@ class AckNackHandler:
         if acknack.next_number and queue.is_acknowledged:
             return min(max(acknack.next_number, queue.oldest), queue.next_number)
         if queue.depth:
-            return max(queue.oldest, queue.next_number + len(queue.deferred) - queue.depth)
+            return max(queue.oldest, queue.next_number + len(queue.deferred.waiting) - queue.depth)
         if not queue.awaited:
             return queue.next_number
-        cached = self._window.cache.first_since(since_s)
-        return queue.next_number + queue.deferred.count_before(since_s) if cached is None else cached
+        if (cached := self._window.cache.first_since(since_s)) is not None:
+            return cached
+        return queue.next_number + sum(added_s is None or added_s < since_s for *_, added_s in queue.deferred.waiting)
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue

@@ -206,10 +206,8 @@ class Attachment:
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
         if self._advertisements.pop((name, right), None) is not None and self.switch is not None:
-            self.say(
-                Kind.WITHDRAW,
-                Withdrawal(name, right, self._next_sequence()).to_wire(self._identity.name, self._identity.key),
-            )
+            withdrawal = Withdrawal(name, right, self._next_sequence())
+            self.say(Kind.WITHDRAW, withdrawal.to_wire(self._identity.name, self._identity.key))
 
     def withdraw_all(self) -> None:
         """Leave: withdraw every advertisement."""

@@ -51,17 +51,13 @@ class BestEffortCache(HistoryCache):
         self._is_enabled = options.repairs
         self._deadline_s = options.deadline_s
         self._repairs = RetransmissionQueue()
+        self.retransmissions = 0
         self._allowances: OrderedDict[bytes, TokenBucket] = OrderedDict()  # by reader
         self._credit_bytes = float(FIRST_CREDIT_BYTES)
         self._rtt_s: float | None = None
 
     def __len__(self) -> int:
         return len(self.messages)
-
-    @property
-    def retransmissions(self) -> int:
-        """Return how many fragments were sent again."""
-        return self._repairs.retransmissions
 
     def set_options(self, options: SendOptions) -> None:
         """Change the options; without ``repairs`` what is cached is dropped."""
@@ -125,6 +121,7 @@ class BestEffortCache(HistoryCache):
             return []
         self.drop_expired(now_s)
         frames = self._repairs.frames_to_send(self, limit, now_s)
+        self.retransmissions += len(frames)
         self._credit_bytes -= sum(map(len, frames))
         return frames
 

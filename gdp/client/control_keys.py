@@ -19,17 +19,12 @@ _PURPOSE: Final = b"gdp-note-shared-1"
 
 
 class ControlKeys:
-    """X25519 key that is created for this incarnation, and the secrets derived from it."""
+    """X25519 key that is created for this incarnation, and the secrets derived from it; ``public``: 32 bytes."""
 
     def __init__(self, exchange: ExchangeKey) -> None:
-        self._exchange = exchange
+        self._exchange, self.public = exchange, exchange.public
         self._shared: Lru[bytes] = Lru(_REMEMBERED)  # by the other's public key
         self._introduced: Lru[Introduction] = Lru(_REMEMBERED)
-
-    @property
-    def public(self) -> bytes:
-        """Return the public key, 32 bytes."""
-        return self._exchange.public
 
     def shared(self, far_public: bytes) -> bytes:
         """Return the 32 bytes shared with the holder of another key; the first call for a key takes about 0.1 ms.

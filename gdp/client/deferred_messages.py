@@ -20,39 +20,31 @@ class DeferredMessages:
 
     Args:
         ledger: of the writer.
+
+    Attributes:
+        waiting: sequence number, message, and since when it waits, oldest first.
     """
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
-        self._messages = deque[tuple[int, bytes, float | None]]()  # (sequence number, message, since when)
+        self.waiting = deque[tuple[int, bytes, float | None]]()
         self._held_bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._messages)
-
-    def sequence_of(self, index: int) -> int:
-        """Return the sequence number of a message; 0 is the oldest. Raises ``IndexError``."""
-        return self._messages[index][0]
-
-    def count_before(self, since_s: float) -> int:
-        """Return how many messages were not published since a second."""
-        return sum(added_s is None or added_s < since_s for _, _, added_s in self._messages)
 
     def add(self, message: bytes, added_s: float | None) -> None:
         """Add a message; ``added_s``: when it is published; None: it does not age."""
-        self._messages.append((self._ledger.next(added_s), message, added_s))
+        self.waiting.append((self._ledger.next(added_s), message, added_s))
         self._held_bytes += len(message)
 
     def pop(self) -> tuple[int, bytes, float | None]:
         """Remove and return the oldest: sequence number, message, and when it was published."""
-        oldest = self._messages.popleft()
+        oldest = self.waiting.popleft()
         self._held_bytes -= len(oldest[1])
         return oldest
 
     def drop_beyond(self, keep: int, options: SendOptions, now_s: float | None, *, is_latched: bool) -> int:
         """Drop the oldest messages above ``keep``, and beyond the history; return how many."""
         dropped = 0
-        while self._messages and (len(self) > keep or self._is_beyond(options, now_s, is_latched=is_latched)):
+        while self.waiting and (len(self.waiting) > keep or self._is_beyond(options, now_s, is_latched=is_latched)):
             sequence, _, _ = self.pop()
             self._ledger.lose(sequence, sequence, LossReason.NO_READER)
             dropped += 1
@@ -60,8 +52,8 @@ class DeferredMessages:
 
     def _is_beyond(self, options: SendOptions, now_s: float | None, *, is_latched: bool) -> bool:
         """Return whether the oldest is one too many by bytes, or too old."""
-        added_s = self._messages[0][2]
-        if not is_latched and self._held_bytes > WINDOW_BYTES and len(self) > 1:
+        added_s = self.waiting[0][2]
+        if not is_latched and self._held_bytes > WINDOW_BYTES and len(self.waiting) > 1:
             return True
         if options.history_bytes is not None and self._held_bytes > options.history_bytes:
             return True

@@ -128,7 +128,7 @@ class GoverningPaths:
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that bytes take which no reader confirms."""
         for path in self._governing():
-            path.controller.charge(size, now_s)
+            path.controller.pace.charge(size, now_s)
 
     def awaited_readers(self) -> frozenset[bytes]:
         """Return the readers whose paths must all permit a frame at once; empty: there is one path."""
@@ -143,7 +143,7 @@ class GoverningPaths:
     @property
     def bytes_s(self) -> float | None:
         """Return the bytes a second that this topic may expect of its path; None: not measured, and no limit."""
-        rate = min((rate for path in self._measured() if (rate := path.controller.bytes_s)), default=0.0)
+        rate = min((rate for path in self._measured() if (rate := path.controller.model.bytes_s)), default=0.0)
         shares = [rate * self.share] if rate else []
         if self._limit_bytes_s is not None:
             shares.append(self._limit_bytes_s)
@@ -152,25 +152,25 @@ class GoverningPaths:
     @property
     def capacity_bytes_s(self) -> float | None:
         """Return how many bytes a second the narrowest path carries; None: not measured."""
-        rates = (path.controller.capacity_bytes_s for path in self._measured())
+        rates = (path.controller.model.capacity_bytes_s for path in self._measured())
         return min((rate for rate in rates if rate), default=None)
 
     @property
     def loss(self) -> float:
         """Return the share of frames that were lost lately on the worst path, 0 to 1; 0 also if nothing is measured."""
-        return max((path.controller.loss for path in self._measured()), default=0.0)
+        return max((path.controller.model.loss for path in self._measured()), default=0.0)
 
     @property
     def rtt_s(self) -> float | None:
         """Return the smoothed round trip of the longest path in seconds; None: not measured."""
-        trips = (path.controller.rtt_s for path in self._measured())
+        trips = (path.controller.model.rtt_s for path in self._measured())
         return max((trip for trip in trips if trip is not None), default=None)
 
     @property
     def base_rtt_s(self) -> float | None:
         """Return the round trip of the longest path while it is empty, in seconds; None: not measured."""
-        measured = (path.controller for path in self._measured() if path.controller.rtt_s is not None)
-        return max((controller.base_rtt_s for controller in measured), default=None)
+        measured = (path.controller for path in self._measured() if path.controller.model.rtt_s is not None)
+        return max((controller.model.base_rtt_s for controller in measured), default=None)
 
     def patience_s(self, now_s: float) -> float:
         """Return how long the answer of the slowest reader may take."""

@@ -141,11 +141,6 @@ class Protection:
             return [*frames, *map(second_path_copy, frames)]
         return self._striper.stripe(frames, len(heartbeats) + self.repairs - repaired, self._readers.names())
 
-    def clear(self) -> None:
-        """Drop copies and parity that wait: there is no reader any more."""
-        self.copies.clear()
-        self.parity.clear()
-
     def _poll_data(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames; those that were sent before come first."""
         if limit <= 0:

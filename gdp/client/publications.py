@@ -39,6 +39,9 @@ class Publications:
 
     Args:
         heard: returns another party of a service, if it is connected now.
+
+    Attributes:
+        requests: to the servers of each name that is called.
     """
 
     def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
@@ -46,7 +49,7 @@ class Publications:
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
         self._private: dict[Name, UnicastStreams] = {}  # by service
-        self._requests: dict[Name, RequestStreams] = {}  # by service that is called
+        self.requests: dict[Name, RequestStreams] = {}
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
@@ -107,7 +110,7 @@ class Publications:
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
-        self._requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to)
+        self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to)
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -122,7 +125,7 @@ class Publications:
         """Stop publishing a name; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
-        self._requests.pop(name, None)
+        self.requests.pop(name, None)
         if publisher is None:
             return False
         self._sequence_registry.put(name, publisher.past)
@@ -152,13 +155,9 @@ class Publications:
             raise LocalError(f"{party.short} is not heard on {service.short}")
         return streams.stream(heard, self._publishers[service].queue.mtu, now_s)
 
-    def requests(self, service: Name) -> RequestStreams | None:
-        """Return the requests to the servers of a name, or None."""
-        return self._requests.get(service)
-
     def release_requests(self, now_s: float) -> None:
         """Begin the copies of requests that have waited for a faster one to leave."""
-        for requests in self._requests.values():
+        for requests in self.requests.values():
             requests.release(now_s)
 
     def forget(self, service: Name, party: PeerIncarnation) -> None:
@@ -228,8 +227,8 @@ class Publications:
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         due_s = earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due())
-        if self._requests:
-            due_s = earliest(due_s, *(requests.get_timer() for requests in self._requests.values()))
+        if self.requests:
+            due_s = earliest(due_s, *(requests.get_timer() for requests in self.requests.values()))
         return due_s
 
     def _all_of(self, name: Name) -> list[Publisher]:

@@ -220,8 +220,9 @@ class Publisher:
         if depth == self.queue.depth:
             return
         self.queue.set_depth(depth)
-        if not self.confirms:
-            self.acknowledgements.release_window()
+        if not self.confirms:  # the window is no longer used
+            for name in self.matched.names():
+                self._window.drop_reader(name)
         self._heartbeats.wanted = True
         self.published(self)
 
@@ -354,7 +355,8 @@ class Publisher:
         self.sent_frames.count()
         self.has_more = False
         if mtu is None or not self.matched:
-            self.protection.clear()
+            self.protection.copies.clear()
+            self.protection.parity.clear()
             if not self.matched:
                 queue.drop_unread()
             return []

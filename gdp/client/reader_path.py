@@ -12,8 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.congestion.controller import FIRST_RTT_S, PathController
+from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import Flight
+from gdp.congestion.path_model import FIRST_RTT_S
 from gdp.congestion.states import State
 from gdp.intervals import FORGET_S, PACE_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
@@ -55,7 +56,7 @@ class ReaderPath:
 
     def restart(self, now_s: float) -> None:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
-        self.controller.forget_all()
+        self.controller.rate.forget_all()
         self.controller = PathController(self._mtu)
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
         self._late_reports = 0  # in a row
@@ -70,21 +71,21 @@ class ReaderPath:
         controller, mtu = self.controller, self._mtu
         if self.may_probe:
             return mtu
-        free = int(controller.limit) - controller.inflight
+        free = int(controller.limit) - controller.rate.inflight
         if urgent:
             extra = max((_URGENT_SHARE - 1) * controller.window, _URGENT_FRAMES * mtu)
             return max(free + int(extra), 0)
         if free <= 0 and controller.next_send_s(mtu) is None:
             return 0
-        next_s = controller.due_s
+        next_s = controller.pace.due_s
         if next_s > now_s + BURST_S:
-            controller.paced()
+            controller.pace.is_paced = True
             return 0
         free = max(free, mtu)  # an empty path carries a frame, whatever its window
-        pace = controller.pacing_bytes_s
+        pace = controller.pace.bytes_s
         if pace >= _UNLIMITED:
             return free
-        since_s = max(next_s, now_s - max(controller.credit_s, BURST_S))
+        since_s = max(next_s, now_s - max(controller.pace.credit_s, BURST_S))
         return min(free, int((now_s + BURST_S - since_s) * pace) + mtu)
 
     def next_send_s(self) -> float:
@@ -96,12 +97,12 @@ class ReaderPath:
 
     def note_idle(self) -> None:
         """Note that nothing waits, though more might leave."""
-        if self.controller.inflight < self.controller.limit:
+        if self.controller.rate.inflight < self.controller.limit:
             self.controller.app_limited()
 
     def sent(self, size: int, frames: int, now_s: float) -> Flight:
         """Count frames that leave at once; return the flight as which they are confirmed."""
-        if not self.controller.inflight:
+        if not self.controller.rate.inflight:
             self._confirmed_s = now_s
             self._answered_s = self._answered_s if self._timeouts else now_s
         self.sent_bytes += size
@@ -114,12 +115,12 @@ class ReaderPath:
         Args:
             held_s: how long the reader held the report back; None: it gives no round trip.
         """
-        before = self.controller.inflight
+        before = self.controller.rate.inflight
         self.controller.acknowledged(flights, now_s, held_s=held_s, lost=lost)
-        if self.controller.inflight < before:
+        if self.controller.rate.inflight < before:
             self._confirmed_s, self._has_probed = now_s, False
-            if self.controller.rtt_s is not None:  # not one of before a timeout
-                self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.rtt_s, 0
+            if self.controller.model.rtt_s is not None:  # not one of before a timeout
+                self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.model.rtt_s, 0
 
     def handle_part(self, flight: Flight, held_s: float | None, now_s: float) -> None:
         """Note that a part of a flight came, which delays the timeout; ``held_s`` as in ``acknowledged``."""
@@ -136,12 +137,12 @@ class ReaderPath:
         """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
         if self.is_silent:
             self.is_silent = False
-            self.controller.forget_all()
+            self.controller.rate.forget_all()
 
     @property
     def trip_s(self) -> float:
         """Return the smoothed round trip, that of before a timeout if none was measured since; 0: none yet."""
-        return self.controller.rtt_s or self._trip_s
+        return self.controller.model.rtt_s or self._trip_s
 
     @property
     def stall_s(self) -> float:
@@ -150,26 +151,26 @@ class ReaderPath:
 
     def has_stalled(self, now_s: float) -> bool:
         """Return whether nothing under way was confirmed for two round trips and a report's delay."""
-        return self.is_silent or (self.controller.inflight > 0 and now_s - self._confirmed_s > self.stall_s)
+        return self.is_silent or (self.controller.rate.inflight > 0 and now_s - self._confirmed_s > self.stall_s)
 
     def arrival_s(self, size: int) -> float:
         """Return how long so many bytes take to be confirmed, while no queue stands; a loss takes a round trip more.
 
         Window and smoothed round trip change with each queue that other paths share, so the order would follow them.
         """
-        controller = self.controller
-        trips = 1 + min(controller.loss * _MESSAGE_FRAMES, 1.0)
-        return size / max(controller.capacity_bytes_s or 0.0, self.allowed_bytes_s) + trips * controller.base_rtt_s
+        model = self.controller.model
+        trips = 1 + min(model.loss * _MESSAGE_FRAMES, 1.0)
+        return size / max(model.capacity_bytes_s or 0.0, self.allowed_bytes_s) + trips * model.base_rtt_s
 
     def excess_s(self, size: int) -> float:
         """Return for how long bytes leave that do not fit the window now."""
-        excess = size - max(self.controller.limit - self.controller.inflight, 0.0)
+        excess = size - max(self.controller.limit - self.controller.rate.inflight, 0.0)
         return max(excess, 0.0) / self.allowed_bytes_s
 
     @property
     def allowed_bytes_s(self) -> float:
         """Return the bytes a second that the window permits."""
-        return self.controller.window / (self.controller.rtt_s or FIRST_RTT_S)
+        return self.controller.window / (self.controller.model.rtt_s or FIRST_RTT_S)
 
     def carries(self, size: int, within_s: float) -> bool:
         """Return whether so many bytes may leave within a time, as far as the path was measured."""
@@ -178,7 +179,7 @@ class ReaderPath:
 
     def patience_s(self, now_s: float) -> float:
         """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""
-        is_waiting = self._timeouts > 0 or self.controller.inflight > 0
+        is_waiting = self._timeouts > 0 or self.controller.rate.inflight > 0
         return max(self._trip_s, now_s - self._answered_s if is_waiting else 0.0)
 
     def handle_hops(self, hops: int, now_s: float) -> None:
@@ -201,7 +202,7 @@ class ReaderPath:
         each other double (RFC 6298, section 5.5): shorter than the round trip, they would never let one be measured.
         Before a timeout one frame may leave (RFC 8985, section 7): the last ones of a full window may be lost.
         """
-        if not self.controller.inflight:
+        if not self.controller.rate.inflight:
             return
         timeout_s = _TIMEOUTS.bounded_s(_TIMEOUT_TRIPS * self._trip_s) * 2 ** min(self._timeouts, _DOUBLINGS_MAX)
         timeout_s = min(timeout_s, _TIMEOUTS.most_s)
@@ -213,14 +214,14 @@ class ReaderPath:
             if not self._has_probed and now_s - self._confirmed_s >= max(_PROBE_TRIPS * self._trip_s, _PROBE_LEAST_S):
                 self.may_probe = self._has_probed = True
             late_s = max(self._trip_s / _LATE_TRIPS, _LATE_LEAST_S)
-            self.controller.forget_before(self.controller.confirmed_sent_s - late_s)
-            inflight = self.controller.inflight
-            self.controller.forget_before(self._confirmed_s - timeout_s)
-            self._timeouts += self.controller.inflight < inflight
+            self.controller.rate.forget_before(self.controller.confirmed_sent_s - late_s)
+            inflight = self.controller.rate.inflight
+            self.controller.rate.forget_before(self._confirmed_s - timeout_s)
+            self._timeouts += self.controller.rate.inflight < inflight
 
     def is_unused(self, now_s: float) -> bool:
         """Return whether nothing was confirmed for so long that the path need not be remembered."""
-        return not self.controller.inflight and now_s - self._confirmed_s > FORGET_S
+        return not self.controller.rate.inflight and now_s - self._confirmed_s > FORGET_S
 
 
 class ReaderPaths:
@@ -304,7 +305,7 @@ class ReaderPaths:
     def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""
         for path in self._paths.values():
-            path.controller.frames_sent(now_s)
+            path.controller.rate.frames_sent(now_s)
 
     def handle_timer(self, now_s: float) -> bool:
         """Let silent paths start again, and forget unused ones; return whether any may carry more now."""
@@ -313,13 +314,13 @@ class ReaderPaths:
         before = sum(path.is_silent for path in self._paths.values())
         timed_out = False
         for reader, path in list(self._paths.items()):
-            inflight = path.controller.inflight
+            inflight = path.controller.rate.inflight
             path.handle_timer(now_s)
-            timed_out |= path.controller.inflight < inflight or path.may_probe
+            timed_out |= path.controller.rate.inflight < inflight or path.may_probe
             if path.is_unused(now_s):
                 del self._paths[reader]
                 self._started.pop(reader, None)
-        self._scan_s = now_s + PACE_S if any(path.controller.inflight for path in self._paths.values()) else None
+        self._scan_s = now_s + PACE_S if any(path.controller.rate.inflight for path in self._paths.values()) else None
         return timed_out or before != sum(path.is_silent for path in self._paths.values())
 
     def get_timer(self) -> float | None:

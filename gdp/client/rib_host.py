@@ -33,7 +33,7 @@ class RibHost:
     """Protocol core of a RIB node."""
 
     def __init__(self, identity: Identity, policy: Policy, rib: RibCore, settings: NodeSettings) -> None:
-        self._identity = identity
+        self.name = identity.name
         self._reassembler = ControlReassembler()
         self._drops: Counter[DropReason] = Counter()
         self._is_connected = False
@@ -49,11 +49,6 @@ class RibHost:
             settings.first_sequence,
             lambda frames, _to, _now: self.attachment.send(frames),
         )
-
-    @property
-    def name(self) -> Name:
-        """Return the RIB's name."""
-        return self._identity.name
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""

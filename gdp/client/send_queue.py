@@ -89,7 +89,7 @@ class SendQueue:
     @property
     def is_empty(self) -> bool:
         """Return whether nothing waits outside the window."""
-        return not (self.deferred or self._gathered or self._best_effort)
+        return not (self.deferred.waiting or self._gathered or self._best_effort)
 
     def has_space(self) -> bool:
         """Return whether a message may be added without evicting an unacknowledged one."""
@@ -104,8 +104,8 @@ class SendQueue:
     @property
     def first_waiting(self) -> int:
         """Return the first sequence number that has no message number yet, or the next one."""
-        if self.deferred:
-            return self.deferred.sequence_of(0)
+        if self.deferred.waiting:
+            return self.deferred.waiting[0][0]
         return self._gathered.first if self._gathered else self.ledger.last + 1
 
     @property
@@ -198,7 +198,7 @@ class SendQueue:
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
-        while self.deferred:
+        while self.deferred.waiting:
             sequence, message, added_s = self.deferred.pop()
             self._seal_message(message, sequence, added_s=added_s)
 

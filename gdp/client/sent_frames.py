@@ -104,7 +104,7 @@ class SentFrames:
             size = sum(map(len, frames[:again]))
             samples = self._samples(frames[:again])
             for name in names:
-                self._paths.path(name, now_s).controller.charge(size, now_s)
+                self._paths.path(name, now_s).controller.pace.charge(size, now_s)
                 if name in self._readers:
                     self._readers[name].repairs += again
                     self._readers[name].receipts.sent(samples, is_repair=True)
@@ -259,7 +259,7 @@ class SentFrames:
         for name in self._readers.keys() - set(readers):
             path, reader = self._paths.get(name), self._readers.pop(name)
             if path is not None:
-                path.controller.forget(reader.flights)
+                path.controller.rate.forget(reader.flights)
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""

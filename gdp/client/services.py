@@ -77,7 +77,7 @@ class Services:
 
     def end_call(self, service: Name, call: Hashable) -> None:
         """Cancel what has not left of a call's requests, and their repairs; those of a withdrawn name have ended."""
-        requests = self._publications.requests(service)
+        requests = self._publications.requests.get(service)
         if requests is not None:
             requests.cancel(call)
 
@@ -112,7 +112,7 @@ class Services:
         ]
 
     def _requests_of(self, service: Name) -> RequestStreams:
-        requests = self._publications.requests(service)
+        requests = self._publications.requests.get(service)
         if requests is None:
             raise LocalError(f"no call of {service.short} here")
         return requests

@@ -254,11 +254,7 @@ class Subscriptions:
         if not response.advertisement:
             if writer_proxy is not None and writer_proxy.advertisement_sequence > response.sequence:
                 raise StatementError(DropReason.STALE, "gone, of an earlier advertisement")
-            return (
-                change
-                if writer_proxy is None
-                else StreamChanges([], self._detach(subscription, response.advertiser), [])
-            )
+            return change._replace(ended=self._detach(subscription, response.advertiser)) if writer_proxy else change
         advertisement = self._verifier.verify(response.advertisement, now.unix_s)
         is_heard = HEARS[subscription.right] is advertisement.right
         if not is_heard or advertisement.name != response.name or advertisement.node != response.advertiser:
@@ -279,15 +275,8 @@ class Subscriptions:
 
     def has_issuer(self, key: bytes) -> bool:
         """Return whether an accepted advertisement depends on a certificate that this key, 33 bytes, issued."""
-        writer_proxies = (
-            writer_proxy
-            for subscription in self._by_name.values()
-            for writer_proxy in subscription.writer_proxies.values()
-        )
-        return any(
-            writer_proxy.advertisement is not None and key in writer_proxy.advertisement.issuers
-            for writer_proxy in writer_proxies
-        )
+        advertisements = (each.advertisement for subscription in self for each in subscription.writer_proxies.values())
+        return any(each is not None and key in each.issuers for each in advertisements)
 
     def recheck(self, fingerprint: bytes, unix_s: float) -> list[WriterProxy]:
         """Return the writer proxies to close, because their party's advertisement depended on what was revoked."""

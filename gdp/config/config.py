@@ -27,6 +27,7 @@ from gdp.config.schema import (
     ExistingFile,
     Identity,
     Ifname,
+    JournalMib,
     Metrics,
     NewFile,
     RequiredName,
@@ -42,7 +43,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError
-from gdp.host_port import checked_host_port, split_host_port
+from gdp.host_port import checked_host_port
 from gdp.intervals import (
     ADVERTISEMENT,
     DETECT_MULTIPLIER,
@@ -62,7 +63,6 @@ from gdp.limits import (
     TABLE_MAX,
 )
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT
-from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.files import read_private
 
 __all__ = [
@@ -211,6 +211,7 @@ class SwitchConfig(Section):
     detect_multiplier: DetectMultiplier = Field(
         default=DETECT_MULTIPLIER, description="Missed keepalives after which the other end gives up."
     )
+    journal: JournalMib = None
     control_socket: ControlSocket = None
     sandbox: Sandbox = True
 
@@ -294,18 +295,10 @@ class ClusterConfig(Section):
     cert: ExistingFile | None = Field(default=None, description="Client certificate, PEM.")
     key: ExistingFile | None = Field(default=None, description="Its key, PEM.")
 
-    def address(self) -> ClusterAddress:
-        """Return the address of the cluster; reads the file of the password.
-
-        Raises:
-            LocalError: the file of the password is not private.
-        """
+    def password(self) -> str:
+        """Return the password in its file; empty: none. Raises ``LocalError``: the file is not private."""
         file = self.password_file
-        password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
-        nodes = tuple(map(split_host_port, self.nodes))
-        return ClusterAddress(
-            nodes=nodes, username=self.username, password=password, ca=self.ca, cert=self.cert, key=self.key
-        )
+        return "" if file is None else read_private(file).decode("utf-8", "replace").strip()
 
 
 class SharedStore(Section):
@@ -347,6 +340,7 @@ class RibConfig(Section):
     metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
     audit: AuditFolder = None
     token_folders: TokenFolders = ()
+    journal: JournalMib = None
     control_socket: ControlSocket = None
     sandbox: Sandbox = True
 

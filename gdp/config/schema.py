@@ -152,6 +152,10 @@ ControlSocket = Annotated[
     NewFile | None,
     Field(description="Control socket. `null`: next to the locks of nodes."),
 ]
+JournalMib = Annotated[
+    int | None,
+    Field(ge=1, le=1_024, description="MiB of memory for a journal, which `gdp incident` saves. `null`: none."),
+]
 Sandbox = Annotated[bool, Field(description="Drop rights that are not needed once the node is up.")]
 
 

@@ -1,4 +1,4 @@
-"""Delivery rate of a path, from what each acknowledgement confirms.
+"""Flights of a path, and its delivery rate, from what each acknowledgement confirms.
 
 Sans-I/O. Source: draft-cheng-iccrg-delivery-rate-estimation-02. A sample is the bytes that arrived while a frame was
 under way, divided by the longer of the times in which they were sent and confirmed. So neither a burst of frames nor an
@@ -7,9 +7,11 @@ aggregated acknowledgement appears as a high rate.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import takewhile
 
-__all__ = ["DeliveryRate", "Flight", "RateSample"]
+__all__ = ["DeliveryRate", "Flight"]
 
 
 @dataclass(slots=True, eq=False)
@@ -32,43 +34,69 @@ class Flight:
     is_under_way: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class RateSample:
-    """Bytes a second over one flight; ``prior_delivered`` counts the rounds."""
-
-    bytes_s: float
-    prior_delivered: int
-    is_app_limited: bool
-
-
 class DeliveryRate:
-    """Bytes of one path, sent and delivered.
+    """Bytes of one path: sent, under way, and delivered.
 
     Attributes:
         delivered: bytes confirmed so far.
+        inflight: bytes under way.
     """
 
     def __init__(self) -> None:
         self.delivered = 0
+        self.inflight = 0
+        self._flights: dict[Flight, None] = {}  # in the order in which they left
+        self._leaving: list[Flight] = []  # counted, and perhaps not sealed yet
         self._delivered_s = 0.0
         self._first_sent_s = 0.0
         self._limited_until = 0
 
-    def sent(self, size: int, now_s: float, inflight: int, frames: int = 1) -> Flight:
-        """Return the flight of frames that leave; ``inflight``: bytes under way before it."""
-        if not inflight:
+    def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
+        """Return the flight of frames that leave."""
+        if not self.inflight:
             self._first_sent_s = self._delivered_s = now_s
+        self.inflight += size
         is_limited = self._limited_until > self.delivered
-        return Flight(
-            size, frames, now_s, self._first_sent_s, self.delivered, self._delivered_s, is_limited, inflight + size
+        flight = Flight(
+            size, frames, now_s, self._first_sent_s, self.delivered, self._delivered_s, is_limited, self.inflight
         )
+        self._flights[flight] = None
+        self._leaving.append(flight)
+        return flight
 
-    def app_limited(self, inflight: int) -> None:
+    def frames_sent(self, now_s: float) -> None:
+        """Note when the flights counted since the last call really leave: their frames are sealed after ``sent``."""
+        for flight in self._leaving:
+            flight.sent_s = now_s
+        self._leaving.clear()
+
+    def remove(self, flight: Flight) -> bool:
+        """Take a flight off the account; return whether it was on it."""
+        was_under_way, flight.is_under_way = flight.is_under_way, False
+        if was_under_way:
+            del self._flights[flight]
+            self.inflight -= flight.size
+        return was_under_way
+
+    def forget(self, flights: Iterable[Flight]) -> None:
+        """Take flights off the account whose fate will not be known."""
+        for flight in flights:
+            self.remove(flight)
+
+    def forget_before(self, sent_s: float) -> None:
+        """Take flights off the account that left before ``sent_s``."""
+        self.forget(list(takewhile(lambda flight: flight.sent_s < sent_s, self._flights)))
+
+    def forget_all(self) -> None:
+        """Take everything under way off the account."""
+        self.forget(list(self._flights))
+
+    def app_limited(self) -> None:
         """Mark what is under way, and what follows it: the program had nothing to send."""
-        self._limited_until = self.delivered + max(inflight, 1)
+        self._limited_until = self.delivered + max(self.inflight, 1)
 
-    def acknowledged(self, newest: Flight, size: int, now_s: float, least_s: float) -> RateSample | None:
-        """Return the sample of one acknowledgement; None if its interval is shorter than ``least_s``.
+    def acknowledged(self, newest: Flight, size: int, now_s: float, least_s: float) -> float | None:
+        """Return the bytes a second of one acknowledgement; None if its interval is shorter than ``least_s``.
 
         Args:
             newest: of the frames that it confirms, the one that left last.
@@ -80,5 +108,4 @@ class DeliveryRate:
         interval_s = max(newest.sent_s - newest.first_sent_s, now_s - newest.delivered_s)
         if interval_s <= 0 or interval_s < least_s:
             return None
-        rate = (self.delivered - newest.delivered) / interval_s
-        return RateSample(rate, newest.delivered, newest.is_app_limited)
+        return (self.delivered - newest.delivered) / interval_s

@@ -23,18 +23,15 @@ class WindowedExtreme:
         self._sign = 1.0 if is_lowest else -1.0
         self._waiting = deque[tuple[float, float]]()  # moment, signed value; ascending in both
 
-    def add(self, at: float, value: float, oldest: float) -> None:
-        """Add a sample, and forget those before ``oldest``; moments never decrease."""
+    def add(self, at: float, value: float, oldest: float) -> float:
+        """Add a sample, and forget those before ``oldest``; moments never decrease. Return the extreme."""
         signed, waiting = self._sign * value, self._waiting
         while waiting and waiting[-1][1] >= signed:
             waiting.pop()
         waiting.append((at, signed))
         while waiting[0][0] < oldest:
             waiting.popleft()
-
-    def value(self, default: float) -> float:
-        """Return the extreme; ``default`` where there is no sample."""
-        return self._sign * self._waiting[0][1] if self._waiting else default
+        return self._sign * waiting[0][1]
 
     def clear(self) -> None:
         """Forget all samples."""

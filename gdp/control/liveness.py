@@ -46,7 +46,7 @@ class LivenessMonitor:
         self._hello_s = settings.hello_s
         self._dead_s = settings.dead_s
         self._is_only_way = is_only_way
-        self._uplinks: dict[int, int] = {}  # of ports whose links share one
+        self.uplinks: dict[int, int] = {}  # of ports whose links share one
         self._failed_s: dict[int, float] = {}  # by uplink: when a link over it failed alone
         self._polled: set[int] = set()  # ports at which a neighbour has polled us
         self._lateness_s = 0.0  # how long, in all, this node was called later than it had requested
@@ -60,15 +60,7 @@ class LivenessMonitor:
 
     def set_uplink(self, index: int, uplink: int) -> None:
         """State which uplink carries the links of a port: ports of one uplink have an address in common."""
-        self._uplinks[index] = uplink
-
-    def uplink_of(self, index: int) -> int | None:
-        """Return the uplink of a port, or None."""
-        return self._uplinks.get(index)
-
-    def remove_port(self, index: int) -> None:
-        """Forget the uplink of a port."""
-        self._uplinks.pop(index, None)
+        self.uplinks[index] = uplink
 
     def probe_uplink(self, uplink: int, now_s: float, *, is_restarted: bool) -> None:
         """Poll all neighbours over an uplink; those that others outlive are lost soon.
@@ -77,7 +69,7 @@ class LivenessMonitor:
             is_restarted: polls that were sent before came from the former address.
         """
         for index, port in self._ports.items():
-            if self._uplinks.get(index) == uplink:
+            if self.uplinks.get(index) == uplink:
                 for neighbour in port.neighbours.values():
                     if neighbour.keepalives is not None and neighbour.keepalives.is_alive:
                         neighbour.keepalives.begin_probe(now_s, is_restarted=is_restarted)
@@ -126,10 +118,10 @@ class LivenessMonitor:
         """Note that an uplink has failed, if it no longer reaches a node that another link reaches."""
         for neighbour in lost:
             session = neighbour.keepalives
-            if session is None or session.probe is None or session.probe.is_moved or port.index not in self._uplinks:
+            if session is None or session.probe is None or session.probe.is_moved or port.index not in self.uplinks:
                 continue
             if now_s >= self._failed_at_s(neighbour, session):
-                self._failed_s[self._uplinks[port.index]] = now_s
+                self._failed_s[self.uplinks[port.index]] = now_s
 
     def note_silence(self, neighbour: Neighbour, session: KeepaliveSession, now_s: float) -> None:
         """Note at a silent neighbour whether other frames come from its port, if no other way leads to it."""
@@ -172,11 +164,11 @@ class LivenessMonitor:
 
     def _others(self, neighbour: Neighbour, *, of_uplink: bool) -> Iterator[KeepaliveSession]:
         """Return the sessions on other ports with the same neighbour, then, if asked, with others over its uplink."""
-        uplink = self._uplinks.get(neighbour.port)
+        uplink = self.uplinks.get(neighbour.port)
         ports = [each for index, each in self._ports.items() if index != neighbour.port]
         found = [port.neighbours[neighbour.name] for port in ports if neighbour.name in port.neighbours]
         if of_uplink and uplink is not None:
-            on_uplink = (port for port in ports if self._uplinks.get(port.index) == uplink)
+            on_uplink = (port for port in ports if self.uplinks.get(port.index) == uplink)
             found += (each for port in on_uplink for each in port.neighbours.values() if each.name != neighbour.name)
         return (each.keepalives for each in found if each.keepalives is not None and each.keepalives.is_alive)
 
@@ -187,7 +179,7 @@ class LivenessMonitor:
             return NEVER_S
         for other in self._others(neighbour, of_uplink=probe.is_moved):
             probe.note_other(other.quality.confirmed_s)
-        uplink = self._uplinks.get(neighbour.port)
+        uplink = self.uplinks.get(neighbour.port)
         if not probe.is_moved and uplink is not None:
             failed_s = self._failed_s.get(uplink, float("-inf"))
             if failed_s >= probe.since_s - _UPLINK_FAILS_S:

@@ -338,7 +338,7 @@ class HelloProtocol:
         """Note where a neighbour sees this end; another endpoint than before means that a NAT on the way has moved."""
         before = neighbour.observed
         neighbour.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
-        uplink = self.liveness.uplink_of(port.index)
+        uplink = self.liveness.uplinks.get(port.index)
         if uplink is not None and None not in (before, neighbour.observed) and before != neighbour.observed:
             self.probe_uplink(uplink, now_s, is_restarted=False)
 
@@ -396,7 +396,7 @@ class HelloProtocol:
         self._next_s = None
         self.neighbours.remove_port(index)
         self._timings.pop(index, None)
-        self.liveness.remove_port(index)
+        self.liveness.uplinks.pop(index, None)
         self.preshared_keys.remove(index)
 
     def drop_silent(self, now_s: float) -> list[Change]:

@@ -67,7 +67,7 @@ class OwnEndpoints:
             except LocalError as error:
                 log.warning("own addresses not read, the former ones count on reason=%s", error)
         known, candidates = self._published, self._candidates()[:CANDIDATES_MAX]
-        refusal = self._switch.tunnels.endpoint_refusal
+        refusal = self._switch.tunnels.endpoints.refusal
         sequence = time.time_ns() // 1_000_000
         is_stale = refusal is not None and refusal.reason is DropReason.STALE
         kept_sequence = refusal.kept_sequence if refusal is not None and is_stale else 0

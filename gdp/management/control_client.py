@@ -6,12 +6,14 @@ directory of the node's keys is therefore enough to find it.
 
 from __future__ import annotations
 
+import base64
 import errno
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from gdp.crypto.cbor import decode
 from gdp.errors import LocalError
 from gdp.host.single_instance import lock_directories, lock_directory
 from gdp.management.control_socket import CONTROL_SOCKET, connect_control
@@ -216,6 +218,23 @@ class NodeConnection:
                 raise ControlRequestError(f"{self._path}: the node sent no table that this version reads")
             rows += some
         return rows
+
+    def journal(self) -> tuple[Any, list[bytes]]:
+        """Return head and blocks of the node's journal.
+
+        Raises:
+            LocalError: the node keeps none, or writes it faster than this reads.
+        """
+        blocks: list[bytes] = []
+        head: Any = None
+        asked: dict[str, object] = {}
+        while head is None or asked["from"] != asked["until"]:
+            self.send_request(Request(Command.INCIDENT, asked))
+            page: Any = self.read_result()
+            head = head or decode(base64.b64decode(page["head"]))
+            blocks += map(base64.b64decode, page["blocks"])
+            asked = {"from": page["next"], "until": page["until"]}
+        return head, blocks
 
     def read_result(self, timeout_s: float | None = None) -> Mapping[str, object]:
         """Return the next response's result.

@@ -64,6 +64,10 @@ def _show_nothing(_arguments: Mapping[str, object]) -> Mapping[str, object]:
     raise LocalError("this process keeps no tables")
 
 
+def _keep_no_journal(_arguments: Mapping[str, object]) -> Mapping[str, object]:
+    raise LocalError("this node keeps no journal; set journal in its configuration, and start it again")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlHandlers:
     """Actions of a node on request.
@@ -78,6 +82,7 @@ class ControlHandlers:
         lookup: return JSON fields about a name, as far as known now; None: the node asks no RIB and is none.
         ask: send a diagnostic request, and call back once, at once or later; raises ``GdpError`` if it is not sent.
         show: return a page of a table; raises ``GdpError`` if there is no such table.
+        incident: return a page of the journal; raises ``GdpError`` if the node keeps none.
     """
 
     status: Callable[[], Mapping[str, object]]
@@ -88,6 +93,7 @@ class ControlHandlers:
     lookup: Callable[[Name], Mapping[str, object]] | None = None
     ask: Callable[[Mapping[str, object], Respond], None] = _ask_nothing
     show: Callable[[Mapping[str, object]], Mapping[str, object]] = _show_nothing
+    incident: Callable[[Mapping[str, object]], Mapping[str, object]] = _keep_no_journal
     snapshot: Callable[[], Mapping[str, object]] = dict
     topology: Callable[[], Mapping[str, object]] = dict
 
@@ -200,6 +206,8 @@ class ControlServer:
                 return None
             if command is Command.SHOW:
                 return Response(self._handlers.show(request.arguments))
+            if command is Command.INCIDENT:
+                return Response(self._handlers.incident(request.arguments))
             if command is Command.RELOAD:
                 self._handlers.reload()
                 return Response({"state": "reloaded"})

@@ -36,9 +36,8 @@ _LENGTH: Final = struct.Struct("!H")
 _FIELDS: Final = struct.Struct("!IBB")
 _LENGTH_AT: Final = 6  # in the header
 SHARD_OVERHEAD_BYTES: Final = _LENGTH.size
-OVERHEAD_BYTES: Final = (
-    _FIELDS.size + SHARD_OVERHEAD_BYTES
-)  # what a parity body has beyond the payload that it may restore
+# what a parity body has beyond the payload that it may restore
+OVERHEAD_BYTES: Final = _FIELDS.size + SHARD_OVERHEAD_BYTES
 _LAST: Final = int(Flag.LAST)
 
 

@@ -32,14 +32,9 @@ def repair_allowance() -> TokenBucket:
 
 
 class RetransmissionQueue:
-    """Fragments to be sent again, in the order of the requests.
-
-    Attributes:
-        retransmissions: fragments sent again so far.
-    """
+    """Fragments to be sent again, in the order of the requests."""
 
     def __init__(self) -> None:
-        self.retransmissions = 0
         self._queue: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._round_s = _NEVER  # when the present round began
         self._round_bytes = 0  # bytes that it may still send again
@@ -99,7 +94,6 @@ class RetransmissionQueue:
             (number, part), _ = self._queue.popitem(last=False)
             if number in cache.messages and (is_lacked is None or is_lacked(number, part)):
                 frames.append(cache.note_repair(number, part, now_s))
-        self.retransmissions += len(frames)
         return frames
 
     def clear(self) -> None:

@@ -209,9 +209,8 @@ class SendWindow:
         position = message.position(acknack.next_part) if message else self.cache.begin_of(acknack.next_number)
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
-            if self.readers.active and position < self.readers.acked_at(
-                self._sent_at
-            ):  # the others must not wait for it
+            # the others must not wait for it
+            if self.readers.active and position < self.readers.acked_at(self._sent_at):
                 suspended.next_number = max(suspended.next_number, acknack.next_number)
                 self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()

@@ -3,6 +3,7 @@
 I/O. The kinds differ in the core, the plane and what clients may ask; the rest is here::
 
     Node            identity and policy, lock of the identity, service manager, stored revocations, audit folder
+    build_core      the core, with a journal where the configuration has one
     drive           log of neighbours and waits, measured links, credentials: periodic calls of the loop
     follow_clients  signals, watchdog, control socket
     confine         the rights that are no longer needed
@@ -20,9 +21,10 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from gdp.config.schema import Metrics
+from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
@@ -46,12 +48,17 @@ from gdp.stores.audit_log import AuditLog
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
+if TYPE_CHECKING:
+    from gdp.journal.journal import Journal
+    from gdp.rib.state import RibSettings
+
 __all__ = ["Loop", "Node", "common_handlers", "common_sources"]
 
 log = logging.getLogger(__name__)
 
 
 Loop: TypeAlias = Runtime | RelayLoop
+_C = TypeVar("_C")
 
 
 class Node:
@@ -98,7 +105,30 @@ class Node:
         self._counters = PortCounters()
         stack.callback(self._counters.close)
         self._audit_log = None if audit is None else AuditLog(audit)
+        self._journal: Journal | None = None
         self._credentials = Credentials(config.identity, config.domain, self.identity, self.policy)
+
+    def build_core(
+        self,
+        make: Callable[[Identity, Policy, NodeSettings], _C],
+        settings: NodeSettings,
+        journal_mib: int | None,
+        *,
+        rib: RibSettings | None = None,
+        unrepeatable: str = "",
+    ) -> _C:
+        """Return the node's core.
+
+        Args:
+            journal_mib: MiB of memory for its journal; None: it keeps none.
+            rib, unrepeatable: as in ``Journal``.
+        """
+        if journal_mib is None:
+            return make(self.identity, self.policy, settings)
+        from gdp.journal.journal import Journal  # it loads more of a RIB than a library needs
+
+        self._journal = Journal(journal_mib << 20, unrepeatable)
+        return self._journal.build(make, self.identity, self.policy, settings, now(), rib)
 
     def drive(self, state: NodeState, loop: Loop, on_wait: OnWait | None = None) -> None:
         """Log from within the loop what changes, and measure the links.
@@ -140,6 +170,14 @@ class Node:
         self._stack.enter_context(loop.signals(hang_up or handlers.reload))
         if self._notifier is not None:
             self._notifier.follow(loop.every)
+        if (journal := self._journal) is not None:
+            ports = self.node_log.state.plane.ports
+            handlers = replace(
+                handlers,
+                incident=lambda arguments: journal.page(
+                    arguments, {each.index: each.ifname for each in ports.values()}
+                ),
+            )
         self._stack.enter_context(_served(loop, path or control_path(self._instance), handlers))
 
     def begin(self, loop: Loop, metrics: Metrics | None = None, sources: Sources | None = None) -> None:

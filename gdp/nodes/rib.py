@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from gdp.client.rib_host import RibHost
-from gdp.config.config import RibConfig
+from gdp.config.config import ClusterConfig, RibConfig
 from gdp.crypto.certificates import Role
 from gdp.extras import Seam
 from gdp.links.uplink import load_plane, open_uplink
@@ -33,7 +33,6 @@ from gdp.state.name_lookup import rib_lookup
 from gdp.state.node_state import RibState
 from gdp.state.snapshot import rib_snapshot
 from gdp.state.state_answers import answer_for_rib
-from gdp.stores.cluster_address import ClusterAddress
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
@@ -45,7 +44,7 @@ log = logging.getLogger(__name__)
 class _OpenStore(Protocol):
     """Opens a store outside of the RIB's process, with its upkeep."""
 
-    def __call__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> Upkeep: ...
+    def __call__(self, cluster: ClusterConfig, policy: Policy, *, allow_unowned: bool) -> Upkeep: ...
 
 
 _STORES: Final[Seam[_OpenStore]] = Seam("gdp.store")
@@ -70,9 +69,16 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             confine_rib(config)  # before the thread of the store starts; the device can still be opened
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
-        rib = RibCore(identity, policy, upkeep.store, _settings(config))
-        host = RibHost(identity, policy, rib, fresh_settings(config.lease_s))
-        upkeep.start(rib, now())
+        host = node.build_core(
+            lambda identity, policy, settings: RibHost(
+                identity, policy, RibCore(identity, policy, upkeep.store, _settings(config)), settings
+            ),
+            fresh_settings(config.lease_s),
+            config.journal,
+            rib=_settings(config),
+            unrepeatable="" if config.store == "memory" else "what its cluster answered is not in its journal",
+        )
+        upkeep.start(host.rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
@@ -111,7 +117,7 @@ def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     if config.store == "memory":
         return MemoryUpkeep(config.snapshot)
     open_store = _STORES.get("cluster", "store: cluster")
-    return open_store(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
+    return open_store(config.store.cluster, policy, allow_unowned=config.allow_unowned)
 
 
 def rib_handlers(state: RibState, sources: Sources, store: Store) -> ControlHandlers:

@@ -70,10 +70,15 @@ def run_switch(
         raise LocalError("a switch needs at least one port: --iface, or ports, links or relay in the configuration")
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
-    switch = SwitchCore(identity, policy, table, _settings(config))
     with contextlib.ExitStack() as stack:
         audit = audit_folder(config.audit)
         node = Node("switch", member, config, stack, state_folder=config.state, audit=audit)
+        switch = node.build_core(
+            lambda identity, policy, settings: SwitchCore(identity, policy, table, settings),
+            _settings(config),
+            config.journal,
+            unrepeatable="" if config.links is None else "calls about tunnels are not in its journal",
+        )
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]

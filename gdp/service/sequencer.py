@@ -271,9 +271,8 @@ class Sequencer(Generic[A]):
             return
         best = elected.position
         self.log = self._replication.log = elected.log
-        if (
-            best.log.incarnation_id != self.log.incarnation_id
-        ):  # otherwise it accepted this log, and its status was lost
+        # where it is the same one it accepted this log, and its status was lost
+        if best.log.incarnation_id != self.log.incarnation_id:
             self._base = best.log, best.at
         self._is_keeping, self._election.leader = True, None
         for replica in self._replicas.values():

@@ -12,7 +12,7 @@ Sans-I/O. A request is one line of at most ``LINE_MAX_BYTES``, each response is 
     --> {"command": "ask", "id": 7, "ask": "ping", "target": "75e0...", "timeout_s": 0.5}
     <-- {"ok": true, "result": {"id": 7, "state": "answered", "rtt_ms": 0.8, ...}}
     --> {"command": "dance"}
-    <-- {"ok": false, "error": "unknown command 'dance'; expected ask, drain, lookup, reload, ..."}
+    <-- {"ok": false, "error": "unknown command 'dance'; expected ask, drain, incident, lookup, ..."}
 
 A lookup names a 256-bit name as well: ``{"command": "lookup", "name": "75e1..."}``. The response to ``ask`` comes when
 the reply has come, so that responses may overtake each other.
@@ -63,11 +63,12 @@ class Command(Enum):
     LOOKUP = "lookup"
     ASK = "ask"  # send a diagnostic request as the member that the node is
     SHOW = "show"  # one page of a table
+    INCIDENT = "incident"  # one page of the journal
     SNAPSHOT = "snapshot"  # see ``snapshot``: what a live view shows
     TOPOLOGY = "topology"
 
 
-_WITH_ARGUMENTS: Final = (Command.ASK, Command.LOOKUP, Command.SHOW)
+_WITH_ARGUMENTS: Final = (Command.ASK, Command.INCIDENT, Command.LOOKUP, Command.SHOW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class Request:
     """Request of a client.
 
     Args:
-        arguments: JSON fields; only ``ask``, ``lookup`` and ``show`` have any.
+        arguments: JSON fields; only ``ask``, ``incident``, ``lookup`` and ``show`` have any.
     """
 
     command: Command

@@ -110,9 +110,8 @@ class AdvertisementHandler:
                 self._state.resolver.queries.watch(advertisement.name, now.mono_s)
             for location in cache.of(advertisement.name, now.mono_s):
                 self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
-        is_alone = (
-            self._rib_client.rib is None and advertisement.previous != ZERO
-        )  # no RIB sends an AdvertiseAck to a node that has moved
+        # no RIB sends an AdvertiseAck to a node that has moved
+        is_alone = self._rib_client.rib is None and advertisement.previous != ZERO
         if advertisement.right is Right.READ or is_alone:
             self._acknowledge(neighbour, advertisement.name, None, advertisement.sequence)
         if advertisement.right is not Right.READ:

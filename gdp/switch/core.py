@@ -91,6 +91,7 @@ class SwitchCore:
             lease_s=settings.lease_s,
         )
         self.state = state
+        self.name = state.me
         self.table = table
         self.attached = state.attached
         self.resolver = state.resolver
@@ -152,11 +153,6 @@ class SwitchCore:
             Kind.REDIRECT: self._locations.receive_redirect,
             Kind.WHERE: self._locations.answer_query,
         }
-
-    @property
-    def name(self) -> Name:
-        """Return the switch's name."""
-        return self.state.me
 
     @property
     def rib(self) -> Name | None:
@@ -258,7 +254,7 @@ class SwitchCore:
         self._reassembler.drop_expired(now_s)
         self._locations.expire(now_s)
         for key in self.table.expire(now_s):
-            self.unicast.expired(key)
+            self.unicast.entry_removed(key)
         for attachment in self.attached.expire(now_s):
             self.unicast.remove(attachment.advertisement.name)
         for topic in self.multicast.handle_timer(now_s):

@@ -90,6 +90,7 @@ class MulticastTrees:
 
     def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""
+        place = location.switch, location.domain, location.sequence, location.advertisement
         for at, reader in self._state.readers.of(location.name).items():
             if (
                 reader.advertisement.node == location.advertiser
@@ -99,9 +100,7 @@ class MulticastTrees:
             allowed = (self._state.policy.transit & location.transit) | {self._state.policy.own, location.domain}
             tree = self._tree(location.name, location.advertiser, allowed)
             if location.sequence >= tree.version:
-                self.upstream.place_at(
-                    tree, location.switch, location.domain, location.sequence, location.advertisement
-                )
+                self.upstream.place_at(tree, *place)
                 tree.allowed = allowed
             branch = Branch(
                 expires_s=reader.expires_s,
@@ -126,11 +125,10 @@ class MulticastTrees:
 
     def publisher_moved(self, location: Location, now_s: float) -> None:
         """Reroute a publisher's tree to its new location, if it passes here and its readers allow the path there."""
+        place = location.switch, location.domain, location.sequence, location.advertisement
         for tree in self.trees.both(location.name, location.advertiser):
             if location.sequence >= tree.version and location.domain in tree.allowed:
-                self.upstream.place_at(
-                    tree, location.switch, location.domain, location.sequence, location.advertisement
-                )
+                self.upstream.place_at(tree, *place)
                 self._route_pair(tree, now_s)
                 if tree.branches and not self.upstream.follow(tree, now_s):
                     self.upstream.restate(tree)

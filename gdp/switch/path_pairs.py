@@ -67,8 +67,8 @@ class PathPairs:
             if len(self._held) >= _TARGETS_MAX:
                 del self._held[next(iter(self._held))]
             held = self._held[key] = _Held()
-        if held.version != self._paths.version or (held.due_s is not None and held.due_s <= now_s):
-            held.version, held.due_s = self._paths.version, None
+        if held.version != self._paths.link_states.version or (held.due_s is not None and held.due_s <= now_s):
+            held.version, held.due_s = self._paths.link_states.version, None
             self._renew(held, self._paths.disjoint(switch, domain), now_s)
         return held.pair
 

@@ -225,11 +225,6 @@ class Paths:
         borders = {s.origin for s in states if any(link.domain != self._domain for link in s.links)}
         return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
-    @property
-    def version(self) -> int:
-        """Return a number that rises with every change that may change a path."""
-        return self.link_states.version
-
     def cost_of(self, path: DirectedPath) -> int | None:
         """Return the cost of a path; None where one of its links is gone."""
         self._refresh()

@@ -11,7 +11,7 @@ from gdp.control.endpoint_record import EndpointRecord
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.direct_tunnels import Action, DirectTunnels
-from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
+from gdp.switch.endpoint_exchange import EndpointExchange
 from gdp.switch.forwarding_state import ForwardingState
 
 __all__ = ["TunnelPlanner"]
@@ -27,16 +27,11 @@ class TunnelPlanner:
 
     def __init__(self, state: ForwardingState, endpoints: EndpointExchange, wake: Callable[[], None]) -> None:
         self._state = state
-        self._endpoints = endpoints
+        self.endpoints = endpoints
         self._wake = wake
         self._tunnels = DirectTunnels(state.me)
         self._ports: dict[int, Name] = {}  # ports of direct tunnels
         self._configured: frozenset[Name] = frozenset()  # peers of the operator's tunnels
-
-    @property
-    def endpoint_refusal(self) -> Refusal | None:
-        """Return why the RIB refused this switch's endpoint record, or None; STALE: publish with a higher sequence."""
-        return self._endpoints.refusal
 
     def publish_endpoints(self, record: EndpointRecord) -> None:
         """Publish this switch's endpoint record to the RIB; from the first one on, it learns those of other switches.
@@ -44,7 +39,7 @@ class TunnelPlanner:
         Raises:
             StatementError: STALE, its sequence is not higher than that of the one before.
         """
-        self._endpoints.set_own(record)
+        self.endpoints.set_own(record)
         self._wake()
 
     def set_configured_peers(self, names: Collection[Name]) -> None:
@@ -70,19 +65,19 @@ class TunnelPlanner:
 
         Empty until ``publish_endpoints``.
         """
-        own = self._endpoints.own
+        own = self.endpoints.own
         if own is None:
             return []
         up = self._state.neighbours.all_up()
         linked = {each.name for each in up if each.port not in self._ports} | self._configured
         wanted = self._tunnels.peers(self._state.paths.members(), linked)
-        due_s = self._endpoints.get_timer()
-        self._endpoints.want(wanted, now.mono_s)
-        if self._endpoints.get_timer() != due_s:
+        due_s = self.endpoints.get_timer()
+        self.endpoints.want(wanted, now.mono_s)
+        if self.endpoints.get_timer() != due_s:
             self._wake()
         return self._tunnels.poll_actions(
             own=own,
-            records=self._endpoints.records(now),
+            records=self.endpoints.records(now),
             linked=linked,
             up={each.name for each in up if self._ports.get(each.port) == each.name},
             now_s=now.mono_s,

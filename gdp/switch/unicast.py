@@ -118,11 +118,8 @@ class Unicast:
         for key in list(self._keys_of.get(name, ())):
             self._uninstall(key)
 
-    def expired(self, key: bytes) -> None:
-        """Handle the expiry of a table entry."""
-        self._let_go(key)
-
-    def _let_go(self, key: bytes) -> _Installed | None:
+    def entry_removed(self, key: bytes) -> _Installed | None:
+        """Forget an entry that is not in the table any more; return why it stood there, if it was one of these."""
         why = self._installed.pop(key, None)
         if why is not None:
             keys = self._keys_of[why.destination]
@@ -133,12 +130,12 @@ class Unicast:
 
     def _uninstall(self, key: bytes) -> None:
         """Remove an entry of ours, but not a tree that may have replaced a negative one."""
-        why = self._let_go(key)
+        why = self.entry_removed(key)
         if why is not None and (not why.is_negative or self._state.table.entries.get(key) == NOWHERE):
             self._state.table.remove(key)
 
     def _note(self, key: bytes, why: _Installed) -> None:
-        self._let_go(key)
+        self.entry_removed(key)
         self._installed[key] = why
         self._keys_of.setdefault(why.destination, set()).add(key)
 
@@ -208,9 +205,9 @@ class Unicast:
             return None
         places = found.locations
         if all(place.domain == self._own_domain for place in places) and self._is_of_own_domain(source, now_s):
-            best = self._nearest(places, frozenset({self._own_domain}))
+            best = self._nearest(places, frozenset({self._own_domain}), now_s)
             if best is not None:
-                self._install_place(destination, b"", best, source, now_s)
+                self._install_way(destination, b"", best[0], source, best[1], now_s)
                 return None
         transit = self._transit
         if not self._is_known_here(source):
@@ -221,9 +218,12 @@ class Unicast:
                 self._install_negative(destination, source, origin.reason, now_s)
                 return None
             transit = origin.locations[0].transit | {origin.locations[0].domain}
-        best = self._nearest(places, transit & self._transit)
-        reasons = [self._why(place.switch, place.domain) for place in places] if best is None else []
-        self._install_place(destination, source, best, source, now_s, max(reasons, default=DropReason.NO_ROUTE))
+        best = self._nearest(places, transit & self._transit, now_s)
+        if best is None:
+            reasons = [self._why(place.switch, place.domain) for place in places]
+            self._install_negative(destination, source, max(reasons, default=DropReason.NO_ROUTE), now_s)
+        else:
+            self._install_way(destination, source, best[0], source, best[1], now_s)
         return None
 
     def _why(self, switch: Name, domain: Name) -> DropReason:
@@ -241,33 +241,18 @@ class Unicast:
         places = self._state.resolver.cache.of(source, now_s)
         return bool(places) and all(place.domain == self._own_domain for place in places)
 
-    def _nearest(self, takers: list[Location], allowed: frozenset[Name]) -> tuple[Location, Path] | None:
+    def _nearest(self, takers: list[Location], allowed: frozenset[Name], now_s: float) -> tuple[Path, float] | None:
+        """Return the path to the nearest location, and how long its entry stands; a stale one is checked again soon."""
         paths = self._state.paths
         ways = [
             (place, way)
             for place in takers
             if (way := paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
         ]
-        return min(ways, key=lambda each: (each[1].distance, each[0].advertiser), default=None)
-
-    def _install_place(
-        self,
-        destination: Name,
-        source_key: bytes,
-        best: tuple[Location, Path] | None,
-        source: Name,
-        now_s: float,
-        otherwise: DropReason = DropReason.NO_ROUTE,
-    ) -> None:
-        if best is None:
-            self._install_way(destination, source_key, None, source, now_s, now_s, otherwise)
-        else:
-            self._install_way(destination, source_key, best[1], source, self._until_s(best[0], now_s), now_s)
-
-    @staticmethod
-    def _until_s(location: Location, now_s: float) -> float:
-        """Return how long an entry stands for a location; a stale one is checked again soon."""
-        return max(location.expires_s, now_s + STALE_S)
+        if not ways:
+            return None
+        best, way = min(ways, key=lambda each: (each[1].distance, each[0].advertiser))
+        return way, max(best.expires_s, now_s + STALE_S)
 
     def _install_way(
         self,

@@ -28,10 +28,11 @@ from redis.exceptions import (
 )
 from redis.retry import Retry
 
+from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError, StoreError
+from gdp.host_port import split_host_port
 from gdp.intervals import PACE_S, PROMPT_S, UPKEEP_S
 from gdp.names import Name
-from gdp.stores.cluster_address import Address, ClusterAddress
 
 __all__ = ["CHANNELS", "ClusterLink", "Command", "tag_of"]
 
@@ -41,6 +42,7 @@ _REPLICA_MS: Final = 100  # a replica confirms within about a millisecond
 _ELSEWHERE: Final = (AskError, ClusterDownError, MasterDownError, MovedError, ReadOnlyError, TryAgainError)
 _NO_REPLICAS: Final = "NOREPLICAS"
 
+Address = tuple[str, int]
 Command = tuple[bytes | str | int, ...]  # the second item is the key that decides the slot
 
 
@@ -56,8 +58,10 @@ class ClusterLink:
         LocalError: no server is reachable at the start, or the servers are no cluster.
     """
 
-    def __init__(self, address: ClusterAddress) -> None:
-        self._address = address
+    def __init__(self, config: ClusterConfig) -> None:
+        self._config = config
+        self._password = config.password()
+        self._nodes: tuple[Address, ...] = tuple(map(split_host_port, config.nodes))
         self._clients: dict[Address, Redis] = {}
         self._primaries: dict[bytes, Address] = {}  # by hash tag
         self._refreshed_s = float("-inf")
@@ -196,12 +200,12 @@ class ClusterLink:
     def _client(self, at: Address) -> Redis:
         client = self._clients.get(at)
         if client is None:
-            its = self._address
+            its = self._config
             client = self._clients[at] = Redis(
                 host=at[0],
                 port=at[1],
                 username=its.username or None,
-                password=its.password or None,
+                password=self._password or None,
                 socket_timeout=PROMPT_S,
                 socket_connect_timeout=PROMPT_S,
                 retry=Retry(NoBackoff(), 0),
@@ -224,7 +228,7 @@ class ClusterLink:
         if time.monotonic() - self._refreshed_s < PACE_S:
             raise StoreError("read the map of slots a moment ago")
         reason = "no server is configured"
-        for at in dict.fromkeys([*self._primaries.values(), *self._address.nodes]):
+        for at in dict.fromkeys([*self._primaries.values(), *self._nodes]):
             try:
                 shards = self._client(at).execute_command("CLUSTER SLOTS")
             except (RedisError, OSError) as error:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import logging
 from typing import Final
 
+from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError
 from gdp.intervals import UPKEEP_S
 from gdp.nodes.rib_upkeep import Upkeep
 from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
-from gdp.stores.cluster_address import ClusterAddress
 from gdp.trust.domain import Policy
 from gdp.trust.verifier import AdvertisementVerifier
 from gdp_extensions.cluster.link import ClusterLink
@@ -38,8 +38,8 @@ class ClusterUpkeep(Upkeep):
 
     every_s = KEEP_ALIVE_S
 
-    def __init__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> None:
-        self._link = ClusterLink(address)
+    def __init__(self, cluster: ClusterConfig, policy: Policy, *, allow_unowned: bool) -> None:
+        self._link = ClusterLink(cluster)
         self.sources = (self._link,)  # the connections that listen, as one source
         self.is_complete = load_functions(self._link)
         self._load_at_s = float("-inf")

@@ -31,7 +31,8 @@ from gdp.ports.listening import listen_tcp
 from gdp.ports.socket_owners import SocketOwners
 from gdp_extensions.doors.core.arrivals import Arrivals
 from gdp_extensions.doors.core.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
-from gdp_extensions.doors.core.hub import DoorSession, Hub, Rights
+from gdp_extensions.doors.core.hub import DoorSession, Hub
+from proxy.bridge.core.delegated_rules import DelegatedRules
 from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos
@@ -105,7 +106,7 @@ class DoorEndpoint(InProcessEndpoint):
 
     kind = "a door"
 
-    def __init__(self, settings: DoorSettings, new_session: NewSession, rights: Callable[[], Rights]) -> None:
+    def __init__(self, settings: DoorSettings, new_session: NewSession, rights: Callable[[], DelegatedRules]) -> None:
         require_extra("doors", ["websockets"], settings.label)
         super().__init__()
         self._settings = settings

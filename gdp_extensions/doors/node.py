@@ -13,7 +13,6 @@ from gdp.cli.node import emit, emit_wait, report
 from gdp.intervals import TICK_S, TURN_S
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
-from gdp_extensions.doors.core.hub import Rights
 from gdp_extensions.doors.endpoint import DoorEndpoint
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
@@ -24,7 +23,7 @@ __all__ = ["OpenDoor", "run_door"]
 
 log = logging.getLogger(__name__)
 
-OpenDoor = Callable[[Callable[[], Rights]], DoorEndpoint]
+OpenDoor = Callable[[Callable[[], DelegatedRules]], DoorEndpoint]
 
 
 def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:

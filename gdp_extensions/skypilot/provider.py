@@ -21,12 +21,13 @@ from fog.machine import Machine, MachineBundle, MachineSpec
 from fog.offer import Offer
 from fog.providers.cloud_init import lines_of, shell_script
 from fog.providers.skypilot_config import SkyPilotConfig
+from fog.site import Site
 from gdp.errors import LocalError, StoreError
 from gdp.extras import install_command
 from gdp.intervals import HOUR_S
 from gdp_extensions.skypilot.record import being_made, cluster_name, labels_of, machine_of
 
-__all__ = ["SkyPilotProvider"]
+__all__ = ["SkyPilotProvider", "open_skypilot"]
 
 _SERVICE: Final = "fog-machine"
 _WRONG: Final = (  # names in sky.exceptions of permanent errors
@@ -177,3 +178,8 @@ def _resources(hardware: Hardware) -> dict[str, str]:
 
 def _accelerators(hardware: Hardware) -> str:
     return f"{hardware.gpu}:{hardware.gpus}"
+
+
+def open_skypilot(site: Site) -> SkyPilotProvider:
+    """Return the provider of a site."""
+    return SkyPilotProvider(site.skypilot)

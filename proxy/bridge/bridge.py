@@ -228,7 +228,7 @@ class Bridge:
     @property
     def offered_qos(self) -> list[tuple[FlowSpec, Qos]]:
         """Return the QoS of the live topics that are exposed, or only lack a delegation for it; unknown ones miss."""
-        found = [(spec, flow.profile) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
+        found = [(spec, flow.qos.profile) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
         lacking = [spec for spec in self.undelegated if spec.is_exposed and spec.rule.kind == "topic"]
         for view in [_View(graph, self._me) for graph in self.graphs()] if lacking else ():
             found += [(spec, LiveQos(spec.rule, view.ends(Role.PUBLISHES, spec)).profile) for spec in lacking]
@@ -465,7 +465,7 @@ class Bridge:
         _, flow = self._flows.get(key, (flow_spec, None))
         if isinstance(flow, ExposedTopic):
             flow.follow(view.ends(Role.PUBLISHES, flow_spec))
-            if flow.has_timer:
+            if flow.qos.asks_depth:  # it may have a timer while its local publishers stay
                 self._probed[flow] = flow_spec.local
             else:
                 self._probed.pop(flow, None)

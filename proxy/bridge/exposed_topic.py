@@ -17,9 +17,9 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.adaptation import adaptation_of
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.encoder import MessageEncoder, description_of
+from proxy.bridge.core.reduction import adaptation_of, encoders_of
 from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.bridge.depth_probe import DepthProbe
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -27,7 +27,7 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
-from proxy.serial.channel import Channel, Qos
+from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 
 __all__ = ["ExposedTopic"]
@@ -61,7 +61,7 @@ class ExposedTopic:
         self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
-        self._qos: StreamQos = (
+        self.qos: StreamQos = (
             LiveQos(flow_spec.rule, ends) if dispatcher.endpoint.is_live else RecordedQos(flow_spec.rule)
         )
         self.publisher: Publisher | None = None
@@ -75,7 +75,7 @@ class ExposedTopic:
         self.local_publishers = len(ends)
         self._depth_probe: DepthProbe | None = None
         self._keys = {end.key for end in ends}
-        self._compressor = compressor_of(flow_spec.rule)
+        self._new_encoder = encoders_of(flow_spec.rule)
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self._adaptation = adaptation_of(flow_spec.rule)
         self.handle = self._subscribe()
@@ -93,8 +93,8 @@ class ExposedTopic:
         if is_other and probe is not None:
             probe.close()
             self._depth_probe = None
-            self._qos.set_depth(None)
-        change = self._qos.receive_publishers(ends)
+            self.qos.set_depth(None)
+        change = self.qos.receive_publishers(ends)
         if change is Change.NONE and not (is_other and probe is not None and probe.depth is not None):
             return
         if change is Change.SUBSCRIPTION:
@@ -116,11 +116,6 @@ class ExposedTopic:
         elif isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
-    @property
-    def has_timer(self) -> bool:
-        """Return whether ``get_timer`` may return a time while its local publishers stay."""
-        return self._qos.asks_depth
-
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return None if self._depth_probe is None else self._depth_probe.get_timer()
@@ -128,7 +123,7 @@ class ExposedTopic:
     def handle_timer(self, now_s: float) -> None:
         """Keep as much for late joiners as the local publisher does, once that is known."""
         if self._depth_probe is not None and self._depth_probe.handle_timer(now_s):
-            self._qos.set_depth(self._depth_probe.depth)
+            self.qos.set_depth(self._depth_probe.depth)
             self._describe(self._channels)
 
     def finish(self, now_s: float) -> None:
@@ -153,16 +148,6 @@ class ExposedTopic:
         readers = publisher.matched
         return [Party("reader", Name(each).to_text(), is_silent=readers.is_suspended(each)) for each in readers.names()]
 
-    @property
-    def profile(self) -> Qos | None:
-        """Return the QoS that its local publishers offer; None: not known."""
-        return self._qos.profile
-
-    @property
-    def depth(self) -> int:
-        """Return how many messages late joiners get."""
-        return self._qos.depth
-
     def renew(self, topic: Topic) -> None:
         """Replace the delegation."""
         self._topic = topic
@@ -170,13 +155,13 @@ class ExposedTopic:
             self._context.member.renew(topic)
 
     def _subscribe(self) -> int:
-        return self._dispatcher.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self._qos.request)
+        return self._dispatcher.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self.qos.request)
 
     def _describe(self, channels: Sequence[Channel]) -> None:
         rule = self._flow_spec.rule
         self._channels = tuple(channels)
-        described = self._qos.describe(channels, rule.global_name_of(self._flow_spec.local))
-        self._encoders = [MessageEncoder(channel, rule, self._compressor) for channel in described]
+        described = self.qos.describe(channels, rule.global_name_of(self._flow_spec.local))
+        self._encoders = [self._new_encoder(channel) for channel in described]
         opaque = {each.serializer.opaque for each in self._encoders if each.serializer.opaque}
         if opaque and rule.encoding != "cdr":
             detail = f"messages travel as bytes, unread: {', '.join(sorted(opaque))}"
@@ -186,18 +171,18 @@ class ExposedTopic:
         wire = description_of(rule, described).to_wire()
         if self.publisher is not None:
             self.publisher.describe(wire)
-            self.publisher.set_depth(self._qos.depth)
-            self.publisher.set_options(self._qos.options)
+            self.publisher.set_depth(self.qos.depth)
+            self.publisher.set_options(self.qos.options)
             return
         self.publisher = self._context.member.advertise(
             self._topic,
             wire,
-            reliable=self._qos.is_reliable,
-            depth=self._qos.depth,
+            reliable=self.qos.is_reliable,
+            depth=self.qos.depth,
             is_global=rule.is_global,
             urgent=is_urgent(rule.priority),
             paths=paths_value(rule.paths),
-            options=self._qos.options,
+            options=self.qos.options,
         )
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
@@ -208,10 +193,10 @@ class ExposedTopic:
         if self.last_s is None and self._dispatcher.endpoint.is_live:
             publisher.await_readers(now_s + READER.lease_s)  # the path to readers that wait may come later
         self.last_s = now_s
-        if self._qos.asks_depth:
+        if self.qos.asks_depth:
             if self._depth_probe is None:
                 spec = self._flow_spec
-                self._depth_probe = DepthProbe(self._dispatcher, spec.local, spec.type_name, self._qos.request)
+                self._depth_probe = DepthProbe(self._dispatcher, spec.local, spec.type_name, self.qos.request)
             self._depth_probe.handle_message(now_s)
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
@@ -228,22 +213,18 @@ class ExposedTopic:
             self._count(event)
             return
         adaptation, path = self._adaptation, publisher.governing_paths
-        if adaptation is not None and not adaptation.may_send(
-            publisher.losses, publisher.acknowledgements.acknowledged, path.bytes_s, now_s
-        ):
+        acknowledged = publisher.acknowledgements.acknowledged
+        if not adaptation.may_send(publisher.losses, acknowledged, path.bytes_s, now_s):
             traffic.thinned += 1
             return
         if not publisher.has_space():
-            if adaptation is not None:
-                adaptation.handle_refused(now_s)
+            adaptation.handle_refused(now_s)
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
             publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
             return
-        body, steps = self._encoders[event.channel].encode(
-            event.raw, rule.quality if adaptation is None else adaptation.quality
-        )
+        body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)
         message = RosMessage(event.channel, event.stamp_ns, body, steps).to_wire()
         try:
             count = publisher.publish(message, now_s)
@@ -251,7 +232,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if adaptation is not None and count is not None:
+        if count is not None:
             adaptation.handle_sent(count, len(message), now_s)
         traffic.sent(len(message))
         self._count(event)

@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError
+from gdp.extras import MissingExtraError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.expander import MessageExpander
+from proxy.bridge.core.reduction import MessageExpander, expander_of
 from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.bridge.decoder_cache import DecoderCache
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -28,7 +29,6 @@ from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPubl
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
-from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
@@ -107,7 +107,7 @@ class ImportedTopic:
     def _receive(self, message: Message, now_s: float) -> None:
         try:
             self._deliver(message, now_s)
-        except LibraryError as error:
+        except MissingExtraError as error:
             self._refuse(Fault.NO_LIBRARY, str(error))
         except LocalError as error:
             self._refuse(Fault.REFUSED, str(error))
@@ -212,7 +212,7 @@ class ImportedTopic:
             return None
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
-            expanders = [MessageExpander(description, source, self._flow_spec.rule.max_bytes) for source in sources]
+            expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
         except DefinitionError as error:
             self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None

@@ -262,7 +262,7 @@ def _exposed(flow: ExposedTopic, now: Timestamps) -> dict[str, object]:
     known: dict[str, object] = {
         "messages": flow.taken,
         "thinned": flow.thinned,
-        "depth": flow.depth,
+        "depth": flow.qos.depth,
         "idle_s": None if flow.last_s is None else round(now.mono_s - flow.last_s, 3),
     }
     if publisher is not None:

@@ -5,23 +5,27 @@ Section of a configuration file. Validation reads a dictionary file and changes 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, model_validator
 from pydantic.config import JsonDict
 
 from gdp.config.schema import Section, relative
 from gdp.errors import LocalError
-from proxy.reduce.adaptive import MIN_HZ, MIN_QUALITY
-from proxy.reduce.compression import LEVEL_MAX, check_dictionary
-from proxy.reduce.picture import QUALITY
-from proxy.reduce.region import Bounds
-from proxy.reduce.region import Region as RegionBounds
+from gdp.extras import Seam
 
-__all__ = ["Adapt", "Compress", "Region", "SomeAdapt", "SomeCompress"]
+__all__ = ["CLOUD", "IMAGE", "QUALITY", "Adapt", "Bounds", "Compress", "Region", "SomeAdapt", "SomeCompress"]
 
+CLOUD: Final = "sensor_msgs/msg/PointCloud2"
+IMAGE: Final = "sensor_msgs/msg/Image"
+QUALITY: Final = 80  # of JPEG, where none is stated
+MIN_HZ: Final = 1.0
+MIN_QUALITY: Final = 30
+LEVEL_MAX: Final = 19  # higher ones need more memory than a robot may have
 _LEVEL: Final = 3
+_DICTIONARIES: Final[Seam[Callable[[bytes], bytes]]] = Seam("gdp.dictionary", {"zstd": "proxy"})
 _RATE_MAX_HZ: Final = 1e6
 
 
@@ -31,7 +35,7 @@ def _dictionary(value: object, info: ValidationInfo) -> object:
         return value
     path = relative(Path(value), info)
     try:
-        return check_dictionary(path.read_bytes())
+        return _DICTIONARIES.get("zstd", "dictionary")(path.read_bytes())
     except OSError as error:
         raise ValueError(f"expected a dictionary of zstd --train: {path}: {error.strerror}") from error
     except LocalError as error:
@@ -48,6 +52,7 @@ def _bounds(value: object) -> object:
     return value
 
 
+Bounds: TypeAlias = tuple[float, float]
 Dictionary = Annotated[bytes, BeforeValidator(_dictionary), WithJsonSchema({"type": "string", "minLength": 1})]
 SomeBounds = Annotated[Bounds | None, BeforeValidator(_bounds)]
 
@@ -65,16 +70,11 @@ class Compress(Section):
 
 
 class Region(Section):
-    """The part of an image or a point cloud that crosses."""
+    """The part of an image or a point cloud that crosses; of bounds, the first is inside."""
 
     x: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the left, or metres.")
     y: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the top, or metres.")
     z: SomeBounds = Field(default=None, description="`[low, high]` in metres, of point clouds.")
-
-    @property
-    def bounds(self) -> RegionBounds:
-        """Return the bounds along each axis."""
-        return RegionBounds(self.x, self.y, self.z)
 
 
 class Adapt(Section):

@@ -50,11 +50,9 @@ from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
 from proxy.config.history import SomeHistory
 from proxy.config.readiness import Readiness
-from proxy.config.reduction import Region, SomeAdapt, SomeCompress
-from proxy.reduce.cloud import CLOUD
-from proxy.reduce.image import IMAGE
-from proxy.reduce.picture import QUALITY, PictureFormat
+from proxy.config.reduction import CLOUD, IMAGE, QUALITY, Region, SomeAdapt, SomeCompress
 from proxy.serial.serializer import Encoding
+from proxy.wire.message import PictureFormat
 
 __all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
 

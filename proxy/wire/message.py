@@ -12,18 +12,16 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Annotated, Final, NamedTuple, TypeVar
+from typing import Annotated, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 from gdp.crypto.cbor import Value
 from gdp.crypto.schema import FieldSet, Form, Keyed, literal, many, mapped, octets
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
-from proxy.reduce.compression import DICTIONARY_MAX_BYTES
-from proxy.reduce.picture import PictureFormat
 from proxy.serial.channel import CHANNEL, Channel
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 from proxy.serial.serializer import ENCODING, Encoding
 
-__all__ = ["RosMessage", "Step", "TopicDescription"]
+__all__ = ["DICTIONARY_MAX_BYTES", "PictureFormat", "RosMessage", "Step", "TopicDescription"]
 
 _T = TypeVar("_T")
 
@@ -45,6 +43,8 @@ def _known(form: Form[_T], what: str) -> Form[_T]:
     return replace(form, read=read)
 
 
+PictureFormat: TypeAlias = Literal["jpeg", "png"]
+DICTIONARY_MAX_BYTES: Final = 32 << 10  # it travels to each reader within the description
 _PICTURES: Final[Form[PictureFormat | None]] = literal("jpeg", "png")
 _IMAGE: Final = _known(_PICTURES, "an image format")
 _CODEC: Final = _known(mapped(literal("zstd"), lambda _: True, lambda _: "zstd"), "a codec")

@@ -20,7 +20,8 @@ policy leave connected (``faults/plan.py``) must continue. Promises:
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --cluster          # RIBs share a Valkey or Redis Cluster
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --thin 4           # all links are thin and full
 
-A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
+A run that fails prints its seed, its faults, what broke, and the last lines of the logs, and saves the journals of
+its switches and RIBs, which ``gdp incident replay`` runs again; the seed draws the same again.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -309,7 +311,7 @@ def run_seed(seed: int, options: Options) -> list[str]:
     begun_s = time.monotonic()
     with (
         new_run() as run,
-        Overlay(run, plan, has_clocks=True, has_disk=True, in_store=in_store, more=more) as overlay,
+        Overlay(run, plan, has_clocks=True, has_journals=True, has_disk=True, in_store=in_store, more=more) as overlay,
     ):
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
@@ -329,6 +331,8 @@ def run_seed(seed: int, options: Options) -> list[str]:
         _show(seed, chaos)
         if broke:
             _explain(seed, faults, broke, overlay)
+            overlay.save_journals(folder := options.journals / f"seed-{seed}")
+            print(f"what came in at each switch and RIB: gdp incident show {folder}/*.incident, or replay")
             if options.logs is not None:
                 secret = shutil.ignore_patterns("domains", "nodes", "owner")
                 shutil.copytree(run.directory, options.logs / f"seed-{seed}", ignore=secret, dirs_exist_ok=True)
@@ -424,6 +428,12 @@ def main() -> None:
         "--keepalive-ms",
         type=int,
         help="of switches; longer ones leave a slow machine more time (default: that of gdp-switch)",
+    )
+    parser.add_argument(
+        "--journals",
+        type=Path,
+        default=Path(tempfile.gettempdir(), "gdp-chaos"),
+        help="a folder for the journals of a failed run (default: %(default)s)",
     )
     parser.add_argument("--logs", type=Path, help="a folder to copy the logs of a failed run to")
     options = parser.parse_args()

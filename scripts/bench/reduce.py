@@ -26,12 +26,11 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from lab.process import FailedError
 from proxy.bridge.core.decoder import MessageDecoder
-from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
-from proxy.bridge.core.expander import MessageExpander
-from proxy.config.reduction import Compress, Region
+from proxy.bridge.core.encoder import description_of
+from proxy.bridge.core.reduction import encoders_of, expander_of
+from proxy.config.reduction import IMAGE, Compress, Region
 from proxy.config.rule import Rule
 from proxy.recordings.reader import BagReader
-from proxy.reduce.image import IMAGE
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 
@@ -192,9 +191,9 @@ def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]
     """
     rule = Rule.model_construct(encoding="cdr", **settings)
     messages = case.messages[:MESSAGES]
-    encoder = MessageEncoder(case.channel, rule, compressor_of(rule))
+    encoder = encoders_of(rule)(case.channel)
     description = description_of(rule, (case.channel,))
-    expander = MessageExpander(description, case.channel, MAX_BYTES)
+    expander = expander_of(description, case.channel, MAX_BYTES)
     decoder = MessageDecoder(case.channel, "cdr", case.channel, None)
     quality = rule.quality
     is_lossless = not {"voxel_m", "region", "quality"} & settings.keys()

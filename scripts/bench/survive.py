@@ -17,8 +17,11 @@ import random
 import signal
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
@@ -132,7 +135,11 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
     refuses.
     """
     found = Measured()
-    with new_run() as run, Overlay(run, row.plan(HZ)) as overlay:
+    with (
+        new_run() as run,
+        Overlay(run, row.plan(HZ), has_journals=options.journals is not None) as overlay,
+        _journals_kept(overlay, row, found, options.journals),
+    ):
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -146,6 +153,19 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         found.lost, found.doubled = flow.count(sent)
         found.published, found.reported_lost = len(sent), flow.reported_lost
     return found
+
+
+@contextmanager
+def _journals_kept(overlay: Overlay, row: Row, found: Measured, folder: Path | None) -> Iterator[None]:
+    """Save the journals of a row that has failed or lost something."""
+    try:
+        yield
+    except GdpError:
+        found.never += 1
+        raise
+    finally:
+        if folder is not None and (found.lost or found.never):
+            overlay.save_journals(folder / row.what.replace(" ", "-"))
 
 
 def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
@@ -235,6 +255,7 @@ def measure(options: Options) -> Outcome:
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
+    parser.add_argument("--journals", type=Path, help="keep journals, and save those of a row that loses or fails here")
     parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
     parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
     run_bench(parser, measure)

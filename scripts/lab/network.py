@@ -10,9 +10,9 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES, ethernet
@@ -23,6 +23,7 @@ from gdp.switch.table import Table
 _STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
 _SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
+_UNLIMITED: Final = float("inf")
 
 Tap = Callable[[float, str, str, bytes], None]
 
@@ -45,9 +46,9 @@ class SimLink:
     loss: float = 0.0
     mtu: int = 1_500
     is_up: bool = True
-    bytes_s: float = float("inf")
+    bytes_s: float = _UNLIMITED
     burst_frames: float = 1.0
-    fifo_s: float = float("inf")
+    fifo_s: float = _UNLIMITED
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
     in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
 
@@ -67,6 +68,8 @@ class SimLink:
 
     def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
         """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
+        if self.bytes_s == _UNLIMITED and self.free_s.get(to, now_s) <= now_s:
+            return now_s
         self.free_s[to] = max(self.free_s.get(to, now_s), now_s) + size / self.bytes_s
         return self.free_s[to]
 
@@ -78,11 +81,33 @@ class _End:
     mac: bytes
 
 
+_Wired = tuple[SimLink, _End, _End]  # link, own end, far end
+
+
+class _Mtus(Mapping[int, int]):
+    """MTU of each port that is up, looked up in the links as they are now."""
+
+    def __init__(self, ports: dict[int, _Wired]) -> None:
+        self._ports = ports
+
+    def __getitem__(self, port: int) -> int:
+        sim_link = self._ports[port][0]
+        if not sim_link.is_up:
+            raise KeyError(port)
+        return sim_link.mtu
+
+    def __iter__(self) -> Iterator[int]:
+        return (port for port, (sim_link, _, _) in self._ports.items() if sim_link.is_up)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
 @dataclass(slots=True, kw_only=True)
 class _Node:
     machine: ProtocolCore
     table: Table | None
-    ports: dict[int, tuple[SimLink, _End, _End]] = field(default_factory=dict)  # link, own end, far end
+    ports: dict[int, _Wired] = field(default_factory=dict)
     costs: dict[int, int] = field(default_factory=dict)  # by port
     timer_s: float | None = None
     due_s: float | None = None  # of its own timer; one that moved later keeps the event at ``timer_s``
@@ -91,6 +116,10 @@ class _Node:
     is_alive: bool = True
     came: Counter[int] = field(default_factory=Counter)  # frames, by port
     stalled: list[tuple[_End, bytes]] | None = None  # frames that arrived while it was frozen
+    mtus: _Mtus = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.mtus = _Mtus(self.ports)
 
 
 class SimNetwork:
@@ -103,7 +132,7 @@ class SimNetwork:
     def __init__(self, seed: int = 1) -> None:
         self._random = random.Random(seed)
         self._nodes: dict[str, _Node] = {}
-        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._events: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._count = 0
         self._now_s = 1_000.0
         self.taps: list[Tap] = []
@@ -200,9 +229,9 @@ class SimNetwork:
         if until is not None and until():
             return True
         while self._events and self._events[0][0] <= end_s:
-            at_s, _, action = heapq.heappop(self._events)
+            at_s, _, action, arguments = heapq.heappop(self._events)
             self._now_s = max(self._now_s, at_s)
-            action()
+            action(*arguments)
             if until is not None and until():
                 return True
         self._now_s = end_s
@@ -229,9 +258,9 @@ class SimNetwork:
         self._count += 1
         return b"\x02" + self._count.to_bytes(5, "big")
 
-    def _push(self, at_s: float, action: Callable[[], None]) -> None:
+    def _push(self, at_s: float, action: Callable[..., None], *arguments: object) -> None:
         self._count += 1
-        heapq.heappush(self._events, (at_s, self._count, action))
+        heapq.heappush(self._events, (at_s, self._count, action, arguments))
 
     def _arm(self, name: str) -> None:
         """Schedule the call of a core for when its next timer is due."""
@@ -240,7 +269,7 @@ class SimNetwork:
         if due_s is None or node.stalled is not None or (node.timer_s is not None and node.timer_s <= due_s):
             return
         node.timer_s = max(due_s, self._now_s)
-        self._push(node.timer_s, lambda: self._timer(name, node))
+        self._push(node.timer_s, self._timer, name, node)
 
     def _timer(self, name: str, node: _Node) -> None:
         if self._nodes[name] is not node or not node.is_alive:
@@ -273,7 +302,7 @@ class SimNetwork:
         for frame in transmit.frames:
             self._send(wired, ethernet(transmit.mac, wired[1].mac) + frame)
 
-    def _send(self, wired: tuple[SimLink, _End, _End], frame: bytes) -> None:
+    def _send(self, wired: _Wired, frame: bytes) -> None:
         sim_link, own, far = wired
         for tap in self.taps:
             tap(self._now_s, own.node, far.node, frame)
@@ -286,7 +315,7 @@ class SimNetwork:
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)
             left_s = sim_link.leaves_s(far.mac, len(frame), self._now_s)
-            self._push(left_s + delay_s, lambda: self._arrive(sim_link, far, frame))
+            self._push(left_s + delay_s, self._arrive, sim_link, far, frame)
 
     def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> None:
         if sim_link.is_up:
@@ -294,7 +323,8 @@ class SimNetwork:
 
     def _deliver(self, end: _End, frame: bytes) -> None:
         node = self._nodes[end.node]
-        if not node.is_alive or frame[:6] not in (end.mac, BROADCAST):
+        to = frame[:6]
+        if not node.is_alive or (to != end.mac and to != BROADCAST):
             return
         if node.stalled is not None:
             if len(node.stalled) < _STALLED_MAX:
@@ -302,8 +332,7 @@ class SimNetwork:
             return
         node.came[end.port] += 1
         if node.table is not None:
-            mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
-            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
+            decision = decide(frame, node.table.entries, node.mtus, node.table.sides, end.port)
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
                 return

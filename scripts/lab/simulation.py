@@ -6,9 +6,10 @@ No I/O. ``namespaces`` realises the same topology with kernel namespaces and rea
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Final
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, TypeVar
 
 from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -21,6 +22,8 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.validity import Validity
 from gdp.intervals import ADVERTISEMENT, NEIGHBOUR, SCAPY_KEEPALIVE_MS
+from gdp.journal.incident import Incident
+from gdp.journal.journal import Journal
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore
@@ -35,6 +38,7 @@ from gdp.trust.right import Right
 from lab.network import EPOCH_UNIX_S, SimLink, SimNetwork
 from lab.topology import Attachment, Topology
 
+_C = TypeVar("_C", SwitchCore, RibHost, Participant)
 _YEAR_S = 365 * 86_400
 _ORDER: Final = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551  # of P-256
 
@@ -53,6 +57,10 @@ class Simulation:
         keepalive_ms: as in ``NodeSettings``; by default those of the Scapy plane, since half of all frames would be
             keepalives. None: of the other planes, which detect a silent link within 0.21 s.
         leaves: switches whose certificate has the role ``leaf``.
+        journal_bytes: of the journal of each node; 0: none.
+
+    Attributes:
+        journals: by node; of one that was restarted also by the number of the incarnation.
     """
 
     topology: Topology
@@ -66,6 +74,8 @@ class Simulation:
     trusts: dict[str, tuple[str, ...]] | None = None
     transits: Mapping[str, tuple[str, ...]] | None = None
     leaves: Collection[str] = ()
+    journal_bytes: int = 0
+    journals: dict[str, Journal] = field(default_factory=dict)
     network: SimNetwork = field(init=False)
     authorities: dict[str, CertificateAuthority] = field(default_factory=dict)
     identities: dict[str, Identity] = field(default_factory=dict)
@@ -125,8 +135,8 @@ class Simulation:
     def add_member(self, label: str, switch: str, domain: str | None = None) -> Participant:
         """Attach a member to a switch; its domain is the switch's unless given."""
         domain = domain or self.topology.domain_of(switch).label
-        member = Participant(self.identity(Role.PROXY, label, domain), self.policy(domain), self._settings())
-        self.members[label] = member
+        identity = self.identity(Role.PROXY, label, domain)
+        member = self.members[label] = self._kept(label, Participant, identity, self.policy(domain))
         self.network.add(label, member)
         self.leads[label] = self.network.connect(switch, label, SimLink(0.0001, mtu=self.lead_mtu))
         return member
@@ -136,7 +146,7 @@ class Simulation:
         before = self.members[label]
         identity = next(each for each in self.identities.values() if each.name == before.name)
         domain = next(domain for domain, each in self.authorities.items() if each.root.domain == identity.root.domain)
-        member = self.members[label] = Participant(identity, self.policy(domain), self._settings())
+        member = self.members[label] = self._kept(label, Participant, identity, self.policy(domain))
         self.network.replace(label, member)
         return member
 
@@ -198,7 +208,12 @@ class Simulation:
 
     def _switch(self, name: str, domain: str) -> tuple[SwitchCore, Table]:
         table = Table()
-        switch = self.switches[name] = SwitchCore(self.identities[name], self.policy(domain), table, self._settings())
+        switch = self.switches[name] = self._kept(
+            name,
+            lambda identity, policy, settings: SwitchCore(identity, policy, table, settings),
+            self.identities[name],
+            self.policy(domain),
+        )
         return switch, table
 
     def _rib_places(self) -> dict[str, Attachment]:
@@ -230,10 +245,37 @@ class Simulation:
         domain = next(each for each in self.topology.domains if each.label == label.split("#", maxsplit=1)[0])
         upper, peers = self._upper_names(domain.upper), self._rib_names(domain.label)
         identity = self.identities[f"rib:{label}"]
-        policy = self.policy(domain.label)
-        rib = RibCore(identity, policy, MemoryStore(), RibSettings(upper=upper, peers=peers))
-        host = self.ribs[label] = RibHost(identity, policy, rib, self._settings())
-        return host
+        chosen = RibSettings(upper=upper, peers=peers)
+
+        def host(identity: Identity, policy: Policy, settings: NodeSettings) -> RibHost:
+            return RibHost(identity, policy, RibCore(identity, policy, MemoryStore(), chosen), settings)
+
+        made = self.ribs[label] = self._kept(self.rib_node(label), host, identity, self.policy(domain.label), chosen)
+        return made
+
+    def _kept(
+        self,
+        name: str,
+        make: Callable[[Identity, Policy, NodeSettings], _C],
+        identity: Identity,
+        policy: Policy,
+        rib: RibSettings | None = None,
+    ) -> _C:
+        """Return a node's core, with a journal if the simulation keeps them."""
+        settings = self._settings()
+        if not self.journal_bytes:
+            return make(identity, policy, settings)
+        unrepeatable = "" if identity.role is not Role.PROXY else "calls of a member's program are not in its journal"
+        lives = sum(each.partition("~")[0] == name for each in self.journals)
+        journal = self.journals[f"{name}~{lives + 1}" if lives else name] = Journal(self.journal_bytes, unrepeatable)
+        return journal.build(make, replace(identity), policy, settings, self.network.now, rib)
+
+    def save_journals(self, folder: Path) -> None:
+        """Write the incident of each node that has a journal, not sealed: a simulation has no secrets."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, journal in self.journals.items():
+            data = Incident.from_blocks(journal.head(), journal.blocks()).to_bytes()
+            (folder / f"{name.replace('/', '-')}.incident").write_bytes(data)
 
     def _settings(self) -> NodeSettings:
         self._incarnation += 1

@@ -23,7 +23,6 @@ from fog.bootstrap.bundles import machine_boot
 from fog.host.bundle import JOIN_FILE, install, pack
 from fog.host.joining import join
 from fog.machine import MachineBundle, MachineSpec
-from fog.providers.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup, placed, shell_script, user_data
 from fog.site import Site
 from fog.supervisor.journal import Journal
@@ -51,11 +50,10 @@ from gdp.trust.enrolment_wire import (
 )
 from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, join_id
 from tests.fog.bootstrap.desk import BINDING, CLUSTER, NONCE, Desk, Machine, desk_of, made_desk, memberships
-from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, journal, site, supervisor, work
 from tests.gdp.enrolment.lab import running_lab
 
-__all__ = ["aws", "cloud", "journal", "site"]
+__all__ = ["journal", "site"]
 
 _END_S = 15.0  # of a stranger's connection, with reserve
 
@@ -133,19 +131,6 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
     assert b"GDP SECRET" not in reported
     assert not [path for path in boot.files if path.endswith((".key", ".delegation", ".csr", ".crt"))]
     assert not [each for each in launchers_secrets(desk) if each in reported]
-
-
-def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
-    reported = cloud.user_data(aws.create(spec("enrolled"), rented()))
-    paths = [each["path"] for each in reported["write_files"]]
-    assert f"/var/lib/fog/{JOIN_FILE}" in paths
-    assert not [path for path in paths if path.endswith(".key")]
-    contents = [
-        base64.b64decode(each["content"]) if "encoding" in each else each["content"].encode()
-        for each in reported["write_files"]
-    ]
-    assert not [each for each in contents if b"PRIVATE KEY" in each]
-    assert not [each for each in launchers_secrets(desk) if any(each in content for content in contents)]
 
 
 def test_a52_an_enrolled_machine_keeps_no_token(desk: Desk, tmp_path: Path) -> None:

@@ -11,11 +11,9 @@ import cbor2
 import pytest
 
 from gdp.control.boundary import ErrorBoundary
-from gdp.errors import RemoteError
 from proxy.bridge.core.decoder import MessageDecoder
-from proxy.bridge.core.expander import MessageExpander
+from proxy.bridge.core.reduction import MessageExpander
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.reduce.compression import BodyDecompressor
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.empty import NoAnswer
@@ -28,7 +26,6 @@ from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
-BROKEN = bytes.fromhex("37a430ec") + b"\xff" * 200  # the magic number of a dictionary, and no dictionary
 RULE = "=" * 80 + "\n"
 CHATTER, OTHER = f"name: /chatter, type: {STRING}", f"name: /other, type: {STRING}"
 SWITCH, LAMP = (f"kind: service, name: {name}, type: {SET_BOOL}" for name in ("/switch", "/lamp"))
@@ -59,25 +56,6 @@ def fitting(codec: Serializer, ros: RosVersion) -> bytes:
     """Return the shortest message of zeros that fits a definition."""
     head = b"" if ros == 1 else b"\0\1\0\0"
     return next(head + bytes(size) for size in range(64) if b"$raw" not in codec.encode(head + bytes(size)))
-
-
-def broken(encoding: Encoding = "cdr", *channels: Channel) -> bytes:
-    """Return a description with a dictionary that is none."""
-    return TopicDescription(encoding, channels or (channel(),), is_compressed=True, dictionary=BROKEN).to_wire()
-
-
-def test_y01_a_broken_dictionary_is_refused_with_its_description() -> None:
-    with pytest.raises(RemoteError, match="zstd"):
-        BodyDecompressor(100, BROKEN)
-
-
-def test_y01_a_description_with_a_broken_dictionary_costs_its_publisher_only() -> None:
-    recorder = Recorder()
-    recorder.receive(broken(), *[RosMessage(0, 0, b"x" * 40, Step.ZSTD).to_wire()] * 5, ros_message())
-    assert recorder.faults.counts["malformed"] == 1
-    assert (recorder.lost, recorder.sink.written) == (6, [])
-    recorder.receive(described(channel()), ros_message(), publisher=b"q" * 32)
-    assert recorder.sink.written == [("/chatter", b"\0\1\0\0x")]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

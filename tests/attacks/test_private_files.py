@@ -104,6 +104,6 @@ def test_a48_the_password_of_a_store_that_others_may_read_is_refused(tmp_path: P
     path.chmod(0o644)
     config = ClusterConfig(nodes=("[::1]:6379",), password_file=path)
     with pytest.raises(LocalError, match="chmod 600"):
-        config.address()
+        config.password()
     path.chmod(0o600)
-    assert config.address().password == "secret"
+    assert config.password() == "secret"

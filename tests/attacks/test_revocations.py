@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 
@@ -26,11 +26,19 @@ from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right
 from lab.simulation import Simulation
+from tests.insiders.oracle import signing_oracle
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 
 THIEF = "nuc1/thief"
 MINE = SigningKey.generate()
+
+
+@pytest.fixture(autouse=True)
+def _signatures() -> Iterator[None]:
+    """Sign by the ideal scheme: of thousands of statements, what they fill and cause is the subject."""
+    with signing_oracle():
+        yield
 
 
 def until(world: Simulation) -> int:

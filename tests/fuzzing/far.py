@@ -6,6 +6,7 @@ states, ``z`` whether the body is compressed here before it is sent.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from io import BytesIO
 from types import SimpleNamespace
@@ -32,7 +33,6 @@ from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Origin, RosEndpoint
 from proxy.recordings.mcap_writer import McapWriter
-from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
 from proxy.serial.rosbridge_json import RosbridgeCodec, cbor_raw
@@ -40,6 +40,11 @@ from proxy.serial.serializer import Encoding
 from proxy.tools.message_text import MessageText
 from proxy.wire.message import RosMessage, Step
 from tests.fuzzing.decoder import Decoder
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 __all__ = ["DECODERS"]
 
@@ -129,7 +134,7 @@ def _fields(data: bytes) -> tuple[dict[Any, Any], bytes, Step]:
         match cbor2.loads(data):
             case {"d": {**described}, "b": bytes(body), "s": int(steps), "z": packs}:
                 if packs is True:
-                    body = BodyCompressor(1).compress(body) or body
+                    body = zstd.compress(body)
                 return described, body, Step(steps & 255)
     except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, cbor2.CBORError) as error:
         raise RemoteError(DropReason.MALFORMED, "no input") from error

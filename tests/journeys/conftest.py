@@ -15,15 +15,13 @@ from lab.simulation import Simulation
 from tests.insiders.oracle import signing_oracle
 
 LEASES = 3
-_REAL_SIGNATURES = ("test_attacks", "test_policy", "test_revocation", "test_session_authentication")
 _WORLDS = pytest.StashKey[list[Simulation]]()
 
 
 @pytest.fixture(autouse=True)
 def _signatures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Sign by the ideal scheme, but for the files whose subject is who may have said something."""
-    is_real = request.module.__name__.rpartition(".")[2] in _REAL_SIGNATURES
-    with nullcontext() if is_real else signing_oracle():
+    """Sign by the ideal scheme, but for the tests whose subject is a signature itself."""
+    with nullcontext() if request.node.get_closest_marker("real_signatures") else signing_oracle():
         yield
 
 

@@ -60,8 +60,8 @@ class Flow:
     def collect(self) -> None:
         """Poll the received messages of each reader."""
         for label, got in self.got.items():
-            messages = self.world.members[label].poll_messages()
-            got += [each.delivered for each in messages if each.topic == self.topic.name]
+            if messages := self.world.members[label].poll_messages():
+                got += [each.delivered for each in messages if each.topic == self.topic.name]
 
     def numbers(self, label: str) -> list[int]:
         """Return the numbers that ``stream`` gave to the messages that a reader has."""

@@ -34,6 +34,7 @@ SIMULATED: Final = (
     FaultKind.CUT, FaultKind.SILENT, FaultKind.LOSS, FaultKind.REORDERED, FaultKind.KILL_SWITCH, FaultKind.KILL_RIB,
     FaultKind.KILL_MEMBER, FaultKind.FREEZE, FaultKind.PARTITION, FaultKind.ROAM,
 )  # fmt: skip
+JOURNAL_BYTES: Final = 64 << 20
 AFTER_S: Final = 8.0  # observation after the last fault
 _HEAD: Final = struct.Struct("!HHIQ")  # channel, publisher, incarnation, number
 _STEP_S: Final = 0.05
@@ -58,7 +59,7 @@ class SimulatedChaos:
 
     def __init__(self, plan: Plan, faults: Sequence[Fault], seed: int) -> None:
         self._plan, self._faults = plan, faults
-        self.world = Simulation(topology=_topology(plan), seed=seed)
+        self.world = Simulation(topology=_topology(plan), seed=seed, journal_bytes=JOURNAL_BYTES)
         self._labels = {label.rpartition("/")[2]: label for label in self.world.members}
         self._at = {mover: homes[0] for mover, homes in plan.homes.items()}
         self._incarnations: Counter[str] = Counter()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from faults.plan import random_network
 from faults.schedule import make_schedule
@@ -17,11 +19,14 @@ LIMIT_S, WELL_S = 8.0, 2.0
 
 
 @pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
-def test_flows_over_thin_full_links_outlive_overlapping_faults(seed: int) -> None:
+def test_flows_over_thin_full_links_outlive_overlapping_faults(seed: int, tmp_path: Path) -> None:
     plan = random_network(seed, SWITCHES, rate=RATE, image_bits_s=IMAGE_SHARE * THIN_BITS_S)
     faults = make_schedule(plan, seed, SECONDS, kinds=SIMULATED)
     with signing_oracle():
         chaos = SimulatedChaos(plan, faults, seed)
         chaos.settle(thin_bits_s=THIN_BITS_S, fifo_s=FIFO_S)
         chaos.run()
-    assert chaos.broken_promises(LIMIT_S, WELL_S) == [], "\n".join(map(str, faults))
+        broken = chaos.broken_promises(LIMIT_S, WELL_S)
+        if broken:
+            chaos.world.save_journals(tmp_path)
+    assert broken == [], "\n".join([*map(str, faults), f"journals of its nodes: {tmp_path}"])

@@ -159,15 +159,13 @@ class ClientCore:
     def _follow(self, now_s: float) -> None:
         """Update the set of servers."""
         self._follow_at_s = now_s + LOOK_S
-        member = self._member
-        peers = set(
-            member.services.peers(self._name) or member.services.connected_peers(self._name)
-        )  # a slow server is better than none
+        name, services = self._name, self._member.services
+        peers = set(services.peers(name) or services.connected_peers(name))  # a slow server is better than none
         if not peers:  # and a silent one may return: its calls go on
-            peers = self._servers.keys() & set(member.services.silent_peers(self._name))
+            peers = self._servers.keys() & set(services.silent_peers(name))
         heard = {
             writer_proxy.publisher: writer_proxy
-            for writer_proxy in member.subscriptions.writer_proxies_of(self._name)
+            for writer_proxy in self._member.subscriptions.writer_proxies_of(name)
             if writer_proxy.publisher in peers
         }
         for name, incarnation in list(self._servers.items()):

@@ -10,9 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
+from proxy.bridge.core.delegated_rules import DelegatedRules
 from proxy.endpoints.core.endpoint import (
     Event,
     Graph,
@@ -27,7 +28,7 @@ from proxy.endpoints.core.qos import DEPTH_MAX, default, depth_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = ["REASON_MAX", "DoorSession", "Hub", "Publication", "Rights", "TopicType"]
+__all__ = ["REASON_MAX", "DoorSession", "Hub", "Publication", "TopicType"]
 
 REASON_MAX: Final = 4_096  # characters of an error that a client hears: it may repeat what the client sent
 REPLACED_S: Final = 0.5  # a publisher that is closed and opened again within this time keeps its number
@@ -36,22 +37,6 @@ _EARLY_MAX_BYTES: Final = 16 << 20  # of all topics
 _HIDDEN: Final = "/_gdp_proxy"  # presence topics of proxies
 
 TopicType: TypeAlias = "tuple[str, str]"
-
-
-class Rights(Protocol):
-    """What the delegations of a door allow; each text says why not and names the command, and is empty where it may."""
-
-    def may_read(self, topic: str, type_name: str) -> str:
-        """Return why clients may not read a topic; an empty type is not known yet."""
-
-    def may_publish(self, topic: str, type_name: str) -> str:
-        """Return why clients may not publish a topic."""
-
-    def may_call(self, name: str, kind: Literal["service", "action"] = "service") -> str:
-        """Return why clients may not call a service or an action."""
-
-    def type_of(self, topic: str) -> str:
-        """Return the type of a topic that clients may publish; empty: none."""
 
 
 @dataclass(slots=True, eq=False)
@@ -163,7 +148,7 @@ class Hub:
     """
 
     emit: Callable[[Event], None]
-    rights: Callable[[], Rights]
+    rights: Callable[[], DelegatedRules]
     known: Callable[[str, str], Channel | None]
     graph: Graph = frozenset()
     sessions: dict[int, DoorSession] = field(default_factory=dict)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from proxy.bridge.core.expander import Restore
+from proxy.bridge.core.reduction import Restore
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from pyroute2 import IPRoute
+from report import progress
 
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
@@ -23,7 +24,10 @@ from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import Disk, StoreCluster
 from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
 from gdp.host.run_registry import Run
+from gdp.journal.incident import Incident
+from gdp.management.control_client import NodeConnection, find_control_socket
 from gdp.metadata import Metadata
 from gdp.stores.keyring import load_domain, load_identity
 from gdp.trust.revocation import Revocation
@@ -34,6 +38,7 @@ from lab.namespaces import received, set_link
 from lab.process import FailedError, LabProcess, end_processes
 
 READY_S: Final = 60.0
+JOURNAL_MIB: Final = 64  # about two hours of a switch, or what it takes in a minute of chaos
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 
 
@@ -45,6 +50,7 @@ class Overlay:
         plan: the nodes.
         has_clocks: processes may have their wall clock stepped.
         more: further keys of the file of every switch and RIB, by role.
+        has_journals: switches and RIBs keep journals.
         has_disk: RIBs keep snapshots on a small disk.
         in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
 
@@ -65,6 +71,7 @@ class Overlay:
         plan: Plan,
         *,
         has_clocks: bool = False,
+        has_journals: bool = False,
         more: Mapping[str, Mapping[str, object]] | None = None,
         has_disk: bool = False,
         in_store: Sequence[str] = (),
@@ -73,7 +80,8 @@ class Overlay:
         self.directory = run.directory
         self._lab = Lab(run, plan.topology)
         self._run = run
-        self._more = more or {}
+        journal = {"journal": JOURNAL_MIB} if has_journals else {}
+        self._more = {role: {**journal, **(more or {}).get(role, {})} for role in ("switch", "rib")}
         self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self.incarnation_ids: dict[str, int] = {}
         self.processes: dict[str, LabProcess] = {}
@@ -193,6 +201,22 @@ class Overlay:
             path = self.directory / f"{role}-{incarnation_id}-{node}.log"
             yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
 
+    def save_journals(self, folder: Path) -> None:
+        """Write the incident of each switch and RIB that runs; not sealed, because the keys of a run end with it."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for who in self.processes:
+            role, _, node = who.partition(" ")
+            if role == "member":
+                continue
+            try:
+                path = find_control_socket(self.directory / "nodes" / f"{role}-{node}")
+                with NodeConnection(path) as connection:
+                    incident = Incident.from_blocks(*connection.journal())
+            except LocalError as error:
+                progress(f"no journal of {who}: {error}")
+                continue
+            (folder / f"{role}-{node}.incident").write_bytes(incident.to_bytes())
+
     # links
 
     def revoke(self, member: str) -> None:
@@ -240,7 +264,7 @@ class Overlay:
         ports += [{"iface": mover, "optional": True} for mover in sorted(movers)]
         revocations = self.directory / "revocations"
         revocations.mkdir(exist_ok=True)
-        further = {"ports": ports, "revocations": str(revocations), **self._more.get("switch", {})}
+        further = {"ports": ports, "revocations": str(revocations), **self._more["switch"]}
         return self._credentials.switch(node, "auto", **further)
 
     def _rib_file(self, node: str) -> Path:
@@ -253,7 +277,7 @@ class Overlay:
             further["peers"] = self._rib_names(domain.label, but=node)
             if self.disk is not None:
                 further["snapshot"] = str(self.disk.snapshot(node))
-        return self._credentials.rib(at, **{**further, **self._more.get("rib", {})})
+        return self._credentials.rib(at, **{**further, **self._more["rib"]})
 
     def _rib_names(self, label: str | None, but: str = "") -> list[str]:
         """Return the names of the RIBs of a domain, but for the one at a switch."""

@@ -8,7 +8,7 @@ import orjson
 import pytest
 import yaml
 
-from fog.providers.aws.config import AwsConfig
+from fog.providers.aws_config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.providers.skypilot_config import SkyPilotConfig
 from gdp.config.schema import Section

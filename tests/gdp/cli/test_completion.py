@@ -63,7 +63,7 @@ def test_every_program_of_the_package_is_completed() -> None:
     [
         (["gdp", "topic", "e"], ["echo"]),
         (["gdp", "topic", "echo", "--tr"], ["--truncate-length"]),
-        (["gdp", "foxglove", "--or"], ["--origin"]),
+        (["gdp", "rule", "a"], ["add"]),
         (["gdp", "completion", ""], ["bash", "zsh", "fish"]),
         (["gdp-switch", "--if"], ["--iface"]),
         (["gdp-proxy", "--aw"], ["--await-iface"]),

@@ -25,7 +25,7 @@ def test_a_flight_that_is_never_confirmed_is_forgotten_though_others_are() -> No
         now_s += STEP_S
         freed.append(paths.handle_timer(now_s))
     assert not path.is_silent
-    assert path.controller.inflight == 0
+    assert path.controller.rate.inflight == 0
     assert freed.count(True) == 1  # a sender that waits learns that it may carry more
 
 
@@ -53,7 +53,7 @@ def test_the_lost_end_of_a_full_window_lets_one_frame_out_whose_report_frees_it(
     assert path.allowance(now_s) == 0, "there is one such frame"
     path.acknowledged([probe], 0, 0.0, now_s + TRIP_S)
     assert paths.handle_timer(now_s + 0.1)
-    assert path.controller.inflight == 0
+    assert path.controller.rate.inflight == 0
     assert not path.is_silent
 
 
@@ -63,7 +63,7 @@ def test_timeouts_that_follow_each_other_double_until_a_round_trip_is_measured()
     path.set_mtu(MTU)
     begun_s, timeouts = now_s, list[float]()
     while now_s < begun_s + 12:
-        if not path.controller.inflight:
+        if not path.controller.rate.inflight:
             paths.path(READER, now_s).sent(MTU, 1, now_s)
             path.is_silent = False
         now_s += STEP_S
@@ -95,7 +95,7 @@ def test_a_reader_node_that_restarted_has_a_new_path_at_once() -> None:
         assert path.is_silent
     paths.note_incarnation(READER, 1_001, now_s)
     assert not path.is_silent
-    assert not path.controller.inflight
+    assert not path.controller.rate.inflight
     assert path.controller.window == fresh
     assert paths.is_former(READER, 1_000)
     assert not paths.is_former(READER, 1_001)
@@ -122,6 +122,6 @@ def test_what_leaves_while_another_path_governs_delays_this_one_for_a_moment_onl
     for _ in range(600):  # 30 MB to all readers, while this one does not govern
         path.sent(50_000, 34, now_s)
         now_s += 0.01
-    path.controller.forget_all()
+    path.controller.rate.forget_all()
     assert path.next_send_s() <= now_s + 0.25
     assert path.allowance(now_s + 0.25) > 0

@@ -29,17 +29,17 @@ def test_a_lost_frame_among_those_sent_again_does_not_block_the_window() -> None
     under_way.sent([frame(part) for part in range(3)], [READER], 0.0)
     under_way.handle_report(READER, report(1), 0.01)  # two are lost
     controller = paths.path(READER, 0.01).controller
-    assert controller.inflight == 0
+    assert controller.rate.inflight == 0
     under_way.sent([frame(0), frame(1)], [READER], 0.02, again=2)
     under_way.handle_report(READER, report(2), 0.03)
-    assert controller.inflight > 0  # the other may still come
+    assert controller.rate.inflight > 0  # the other may still come
     under_way.handle_report(READER, report(2), 0.05)
-    assert controller.inflight == 0
+    assert controller.rate.inflight == 0
     under_way.sent([frame(0)], [READER], 0.06, again=1)
     under_way.handle_report(READER, report(2), 0.07)
-    assert controller.inflight > 0  # nothing of it has come
+    assert controller.rate.inflight > 0  # nothing of it has come
     under_way.handle_report(READER, report(3), 0.08)
-    assert controller.inflight == 0
+    assert controller.rate.inflight == 0
 
 
 def shown(received: int, newest: int) -> AckNack:
@@ -55,13 +55,13 @@ def test_a_repair_that_came_shows_that_the_end_of_the_flight_before_is_lost() ->
     under_way, controller = SentFrames(paths), controller_of(paths)
     under_way.sent([frame(part) for part in range(4)], [READER], 0.0)
     under_way.handle_report(READER, shown(2, 1), 0.01)  # a part of the flight
-    assert controller.inflight > 0
+    assert controller.rate.inflight > 0
     under_way.sent([frame(2), frame(3)], [READER], 0.02, again=2)
-    before = controller.loss
+    before = controller.model.loss
     under_way.handle_report(READER, shown(3, 2), 0.03)
     under_way.handle_report(READER, shown(4, 3), 0.03)
-    assert controller.inflight == 0
-    assert controller.loss > before
+    assert controller.rate.inflight == 0
+    assert controller.model.loss > before
 
 
 def test_what_was_given_up_and_comes_late_confirms_nothing_that_has_just_left() -> None:
@@ -73,10 +73,10 @@ def test_what_was_given_up_and_comes_late_confirms_nothing_that_has_just_left() 
     controller.timed_out(0.5)
     under_way.sent([frame(3), frame(4)], [READER], 0.5)
     under_way.handle_report(READER, shown(3, 2), 0.51)
-    assert controller.inflight > 0
+    assert controller.rate.inflight > 0
     under_way.handle_report(READER, shown(5, 4), 0.6)
-    assert controller.inflight == 0
-    assert controller.rtt_s == pytest.approx(0.1)
+    assert controller.rate.inflight == 0
+    assert controller.model.rtt_s == pytest.approx(0.1)
 
 
 def test_a_frame_that_was_sent_again_gives_no_round_trip_since_its_first_time() -> None:
@@ -87,8 +87,8 @@ def test_a_frame_that_was_sent_again_gives_no_round_trip_since_its_first_time() 
     under_way.sent([frame(1)], [READER], 0.1)  # lost
     under_way.sent([frame(1)], [READER], 0.4, again=1)
     under_way.handle_report(READER, shown(2, 1), 0.45)
-    assert controller.inflight == 0
-    assert controller.rtt_s == pytest.approx(0.05)
+    assert controller.rate.inflight == 0
+    assert controller.model.rtt_s == pytest.approx(0.05)
 
 
 def test_a_repair_to_several_readers_gives_no_round_trip_either() -> None:
@@ -99,7 +99,7 @@ def test_a_repair_to_several_readers_gives_no_round_trip_either() -> None:
     under_way.sent([frame(1)], [READER, other], 0.1)
     under_way.sent([frame(1)], [READER, other], 0.4, again=1)
     under_way.handle_report(READER, shown(2, 1), 0.45)
-    assert controller.rtt_s == pytest.approx(0.05)
+    assert controller.model.rtt_s == pytest.approx(0.05)
 
 
 def test_a_part_of_the_first_flight_measures_the_round_trip() -> None:
@@ -107,8 +107,8 @@ def test_a_part_of_the_first_flight_measures_the_round_trip() -> None:
     under_way, controller = SentFrames(paths), controller_of(paths)
     under_way.sent([frame(part) for part in range(4)], [READER], 0.0)
     under_way.handle_report(READER, shown(1, 0), 0.05)
-    assert controller.rtt_s == pytest.approx(0.05)
-    assert controller.inflight > 0
+    assert controller.model.rtt_s == pytest.approx(0.05)
+    assert controller.rate.inflight > 0
 
 
 def test_a_report_of_frames_that_left_for_other_readers_alone_confirms_nothing() -> None:
@@ -121,9 +121,9 @@ def test_a_report_of_frames_that_left_for_other_readers_alone_confirms_nothing()
     under_way.handle_report(READER, shown(2, 1), 0.15)
     under_way.sent([frame(3)], [READER, other], 0.2)
     under_way.handle_report(READER, shown(3, 2), 0.21)
-    assert controller.rtt_s is None
+    assert controller.model.rtt_s is None
     under_way.handle_report(READER, shown(4, 3), 0.3)
-    assert controller.rtt_s == pytest.approx(0.1)
+    assert controller.model.rtt_s == pytest.approx(0.1)
 
 
 def test_repairs_to_several_readers_confirm_the_lost_end_of_a_message() -> None:
@@ -134,10 +134,10 @@ def test_repairs_to_several_readers_confirm_the_lost_end_of_a_message() -> None:
     under_way.handle_report(READER, shown(1, 0), 0.05)
     under_way.sent([frame(1), frame(2)], [READER, other], 0.06, again=2)
     under_way.handle_report(READER, shown(1, 0), 0.07)
-    assert controller.inflight > 0
+    assert controller.rate.inflight > 0
     under_way.handle_report(READER, shown(2, 0), 0.1)
     under_way.handle_report(READER, shown(3, 0), 0.1)
-    assert controller.inflight == 0
+    assert controller.rate.inflight == 0
 
 
 def test_a_repair_to_several_readers_leaves_the_places_of_later_frames_known() -> None:
@@ -151,4 +151,4 @@ def test_a_repair_to_several_readers_leaves_the_places_of_later_frames_known() -
     for name in (READER, other):
         under_way.handle_report(name, shown(2, 2), 0.15)
     under_way.handle_report(READER, shown(3, 3), 0.15)
-    assert controller.inflight == 0
+    assert controller.rate.inflight == 0

@@ -58,7 +58,7 @@ class CubicSender:
         return 0.0 if len(self._under_way) < self.window else None
 
     def sent(self, size: int, now_s: float) -> Flight:
-        flight = self._rate.sent(size, now_s, 0)
+        flight = self._rate.sent(size, now_s)
         self._under_way.add(flight)
         return flight
 

@@ -25,7 +25,7 @@ class ClusterPair(Pair):
     """Two RIBs that share a cluster."""
 
     def __init__(self, site: Site, config: ClusterConfig) -> None:
-        self.links = [ClusterLink(config.address()) for _ in range(2)]
+        self.links = [ClusterLink(config) for _ in range(2)]
         load_functions(self.links[0])
         self.stores = [ClusterStore(link, AdvertisementVerifier(site.policy())) for link in self.links]
         super().__init__(site, (self.stores[0], self.stores[1]))

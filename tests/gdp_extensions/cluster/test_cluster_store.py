@@ -87,11 +87,11 @@ def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(ser
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore:unclosed:ResourceWarning")
 def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_later(servers: Path) -> None:
     site, config = Site(), config_of(servers)
-    link = ClusterLink(config.address())
+    link = ClusterLink(config)
     victim = link.primary_of(site.subject("/a").name)
     link.close()
     with frozen_server(servers.parent, victim[1]):
-        upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
+        upkeep = ClusterUpkeep(config, site.policy(), allow_unowned=False)
         was_complete = upkeep.is_complete
     at = site.now()
     upkeep.start(RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings()), at)
@@ -108,13 +108,13 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     servers: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site, config = Site(), config_of(servers)
-    upkeep = ClusterUpkeep(config.address(), site.policy(), allow_unowned=False)
+    upkeep = ClusterUpkeep(config, site.policy(), allow_unowned=False)
     rib = RibCore(site.ribs[0], site.policy(), upkeep.store, RibSettings())
     upkeep.start(rib, site.now())
     password = (servers.parent / "admin.password").read_text().strip()
     with monkeypatch.context() as patient:
         patient.setattr("gdp_extensions.cluster.link.PROMPT_S", 30.0)  # a busy server flushes late
-        for client in (link := ClusterLink(config.address())).primaries():
+        for client in (link := ClusterLink(config)).primaries():
             client.execute_command("AUTH", "admin", password)
             client.execute_command("FUNCTION FLUSH")
     for later_s, is_answered in ((0.0, False), (2.0, True)):
@@ -142,7 +142,7 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     pair = ClusterPair(Site(), config)
     name = pair.site.subject("/a").name
     pair.give(pair.one, pair.site.relay("/a", 1))
-    link = ClusterLink(config.address())
+    link = ClusterLink(config)
     primary = link.primary_of(name)
     kill_server(servers.parent, primary[1])
     pair.stores[1]._cache.clear()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from proxy.bridge.core.delegated_rules import DelegatedRules
 from tests.proxy.bridge import known
 
 __all__ = ["Everything", "goal_id"]
 
 
-class Everything:
+class Everything(DelegatedRules):
     """Rights to all names."""
+
+    def __init__(self) -> None:
+        super().__init__((), ())
 
     def may_read(self, topic: str, type_name: str) -> str:
         return ""

@@ -23,12 +23,11 @@ from websockets.typing import Origin, Subprotocol
 from gdp.errors import LocalError
 from gdp_extensions.doors.core.foxglove_protocol import SUBPROTOCOLS
 from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
-from gdp_extensions.doors.core.hub import Rights
 from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
 from lab.process import until
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.delegated_rules import rules_of
+from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
@@ -42,7 +41,7 @@ from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 PATIENCE_S = 20.0
 
 
-def door_of(rights: Rights | None = None, **bounds: int) -> DoorEndpoint:
+def door_of(rights: DelegatedRules | None = None, **bounds: int) -> DoorEndpoint:
     settings = DoorSettings(
         label="foxglove",
         listen="127.0.0.1:" + str(free_port()),

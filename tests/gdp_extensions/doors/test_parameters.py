@@ -10,9 +10,9 @@ import pytest
 from gdp.errors import RemoteError
 from gdp_extensions.doors.core.client_queue import ClientQueue
 from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
-from gdp_extensions.doors.core.hub import Hub, Rights
+from gdp_extensions.doors.core.hub import Hub
 from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, node_and_name, to_value
-from proxy.bridge.core.delegated_rules import rules_of
+from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.endpoints.core.endpoint import Event, RequestReceived
 from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
@@ -49,7 +49,7 @@ def service(node: str, what: tuple[str, str]) -> Service:
 class Node:
     """A node with parameters behind a hub, and a client."""
 
-    def __init__(self, rights: Rights | None = None) -> None:
+    def __init__(self, rights: DelegatedRules | None = None) -> None:
         self.values: dict[str, dict[str, object]] = {
             "gain": {"type": 3, "double_value": 2.0},
             "names": {"type": 9, "string_array_value": ["a"]},

@@ -15,10 +15,10 @@ import pytest
 
 from gdp.errors import GdpError, RemoteError
 from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
-from gdp_extensions.doors.core.hub import Hub, Rights
+from gdp_extensions.doors.core.hub import Hub
 from gdp_extensions.doors.core.rosbridge_session import RosbridgeSession
 from gdp_extensions.doors.core.throttle import Throttle
-from proxy.bridge.core.delegated_rules import rules_of
+from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
 from proxy.serial.known_types import known_channel
@@ -33,7 +33,7 @@ NUMBERS = known.custom("own_msgs/msg/Numbers", "float64 x\nfloat32[] y\nuint8[] 
 class Site:
     """A hub with one session, and what leaves it."""
 
-    rights: Rights = field(default_factory=Everything)
+    rights: DelegatedRules = field(default_factory=Everything)
     now_s: float = 100.0
     events: list[Event] = field(default_factory=list)
 

@@ -105,9 +105,9 @@ def test_what_no_reader_waits_for_is_kept_for_a_moment_and_counted(sites: Sites)
     for number in range(100):
         talker.publish(string(str(number)))
     sites.run(1)
-    assert len(robot.stream.queue.deferred) == 64
+    assert len(robot.stream.queue.deferred.waiting) == 64
     sites.run(READER.lease_s)
-    assert len(robot.stream.queue.deferred) == 0
+    assert len(robot.stream.queue.deferred.waiting) == 0
     assert robot.stream.losses.total == 100
     talker.publish(string("?"))
     sites.run(1)

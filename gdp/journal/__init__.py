@@ -1,0 +1,1 @@
+"""Journal of a node's core: kept in memory, saved as an incident, replayed. Sans-I/O."""
