@@ -32,7 +32,7 @@ def test_a_goal_whose_servers_all_die_in_one_moment_fails_and_breaks_nothing(sit
     sites.run(0.1)
     with pytest.MonkeyPatch.context() as patch:
         for who in ("peers", "connected_peers"):
-            patch.setattr(client.member, who, lambda _: [])
+            patch.setattr(client.member.services, who, lambda _: [])
         assert sites.run(2, lambda: len(caller.goals.outcomes) == 1)
     sites.run(1)
     assert client.bridge.flows
