@@ -43,7 +43,7 @@ from gdp.enrolment.domain_files import DomainConfig, DomainFiles
 from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
 from gdp.host_port import split_host_port
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
@@ -101,7 +101,7 @@ class SiteConfig(Section):
     )
     credential_days: float = Field(default=7.0, gt=0, le=3_650, description="Days for which a machine's keys hold.")
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S, description="Lease of the machines' advertisements, in seconds."
+        default=ADVERTISEMENT.lease_s, description="Lease of the machines' advertisements, in seconds."
     )
     enrolment: EnrolmentConfig = Field(default=EnrolmentConfig(), description="Enrolment of machines.")
     software: SoftwareConfig = Field(
@@ -233,7 +233,7 @@ class Site:
     topology: Gateway = AUTOMATIC
     machine_iface: str = "eth0"
     credential_days: float = 7.0
-    lease_s: float = ADVERTISEMENT_LEASE_S
+    lease_s: float = ADVERTISEMENT.lease_s
     idle_s: float | None = None
     budget_usd: float | None = None
     latency_ms: Mapping[str, float] = field(default_factory=dict)

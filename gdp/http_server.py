@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from gdp.intervals import Rate
 from gdp.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ __all__ = ["Answer", "HttpServer"]
 log = logging.getLogger(__name__)
 
 _READ_BYTES: Final = 8 * 1024
-_ACCEPTS_PER_S: Final = 500.0  # 20 to 400 us each, including the kernel's share
+_ACCEPTS_RATE: Final = Rate(500.0, burst=500.0)  # 20 to 400 us each, including the kernel's share
 _BURST: Final = 64  # connections accepted before open ones are served
 _REQUEST_MAX_BYTES: Final = 8 * 1024
 _PIECE_BYTES: Final = 1 << 18
@@ -90,7 +91,7 @@ class HttpServer:
         self._connections_max = connections
         self._timeout_for_s = timeout_s
         self._tls = tls
-        self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
+        self._accepts = TokenBucket(*_ACCEPTS_RATE)
         self._connections: dict[int, _Connection] = {}  # the oldest first
         self._resume_s: float | None = None  # when the server accepts connections again
         self._is_closed = False
@@ -205,7 +206,7 @@ class HttpServer:
     def _pause(self, now_s: float) -> None:
         """Leave further connections in the kernel's queue for a moment."""
         self._selector.unregister(self._listener)
-        self._resume_s = now_s + 10.0 / _ACCEPTS_PER_S
+        self._resume_s = now_s + 10.0 / _ACCEPTS_RATE.per_s
 
     def _proceed(self, connection: _Connection) -> None:
         events = 0

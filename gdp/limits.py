@@ -1,11 +1,13 @@
 """Bounds that several packages share; a bound of one mechanism is in its module.
 
-Sans-I/O; imports nothing of this project. Units end the names.
+Sans-I/O. Units end the names.
 """
 
 from __future__ import annotations
 
 from typing import Final
+
+from gdp.intervals import LINK_STATE, Rate
 
 # Frames
 HOPS_MAX: Final = 64  # hops left at the source
@@ -43,15 +45,10 @@ REPORT_PAUSE_S: Final = 0.004  # ... within a message: its publisher may be wait
 REPORT_GAP_S: Final = 0.002  # ... or this long after it detected a gap: frames may overtake each other
 REPAIRS_ABOVE_PARTS: Final = 2  # a best-effort message of more fragments is repaired while that can be in time
 REPAIR_S: Final = 0.5  # ... which is this time, unless its publisher states a deadline
-PROBE_MIN_S: Final = 0.03
-PROBE_MAX_S: Final = 0.25
-REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
 SENDS_MAX: Final = 3  # times that an urgent frame is sent against loss: 0.05 ** 3 is below 0.1 %
-READER_LEASE_S: Final = 6.0  # a reader that does not report for this time no longer blocks its publisher
-READER_GRACE_S: Final = 60.0  # ... but what it lacks is cached for this time, as far as the window allows
-CALL_LAG_S: Final = 1.0  # ... or a reader of requests that has not confirmed in this time what another server has
-CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
-CALL_QUIET_S: Final = 2.0  # a server that does not report for this time is no peer meanwhile
+CALL_GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
+CALLER_AWAY_S: Final = 30.0  # a client that is silent for this time has ended its wait
+PATH_LAG_MAX_S: Final = 0.5  # a path that is further behind the other one is not awaited
 EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, reports of readers under the previous one are still accepted
 NACKS_PER_REPORT: Final = 23  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
 
@@ -61,7 +58,6 @@ ADVERTISEMENT_MAX_BYTES: Final = (
     6_500  # with its evidence, so that a relay or response around one, or a join around two, fits a statement
 )
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
-SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most this far ahead
 RECORD_OVERHEAD_BYTES: Final = 33  # what a channel adds to a statement: head and tag
 CONTROL_PARTS_MAX: Final = 64
 CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node
@@ -71,40 +67,15 @@ CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
 # of a membership or delegation; a revocation may count for this time
 CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0
-CLOCK_EARLY_S: Final = 3_600.0  # a certificate is accepted this long before it begins
-CLOCK_SKEW_S: Final = 3_600.0  # ... and this long after it has ended
-CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
-
-# Leases
-LEASE_MIN_S: Final = 1.0
-LEASE_MAX_S: Final = 3_600.0
-ADVERTISEMENT_LEASE_S: Final = (
-    24.0  # lease that a node requests unless its configuration sets another; renewed after a third
-)
-NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it
+CLOCK_SKEW_S: Final = 3_600.0  # a certificate is accepted this long before it begins, and after it has ended
 
 # Neighbours and link state
-HELLO_S: Final = 0.25  # between hellos on a port, until keepalives of its neighbours arrive
-HELLO_IDLE: Final = 16  # hello intervals between two hellos, from then on
-DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is lost after this time of silence
-KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
-SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
-DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
 COST_DEFAULT: Final = 10  # of a link
 COST_AUTO: Final = 0  # of a port: the cost of its links is measured
-LINK_STATE_REFRESH_S: Final = 30.0
-LINK_STATE_LEASE_S: Final = 100.0
-LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
-JOIN_REFRESH_S: Final = 2.0
-JOIN_LEASE_S: Final = 7.0
-JOIN_PROOF_S: Final = 60.0  # a join whose terms do not change is sent whole at least this often, else by its number
-JOIN_PROOF_LEASE_S: Final = 3 * JOIN_PROOF_S  # no refresh lets a branch outlive its last whole join by more
+LINK_STATE_AGE_MAX_S: Final = 2 * CLOCK_SKEW_S + LINK_STATE.lease_s  # by two clocks
 JOINS_AGAIN_MAX: Final = 16  # whole joins that one reply about unknown ones causes
 # Refreshes are sent more often over a link that loses frames: they find the joins that were lost.
 JOINS_LOST_FROM: Final = 0.01  # share of frames
-JOIN_REFRESH_LOSSY_S: Final = 0.5
-
-WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for this time reports why
 
 # Tables
 TABLE_MAX: Final = 1 << 20
@@ -114,38 +85,33 @@ PENDING_S: Final = 1.5
 ATTACHED_MAX: Final = 16_384  # advertisements of the nodes attached to a switch, some 3 KiB each
 READERS_MAX: Final = 16_384  # advertisements of the readers attached to a switch
 TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
-JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
-JOINS_BURST: Final = 16_384.0
-ADVERTISEMENTS_PER_S: Final = 2_048.0  # advertisements and withdrawals of one neighbour; each is verified and relayed
-ADVERTISEMENTS_BURST: Final = 2.0 * ATTACHED_MAX
+JOINS_RATE: Final = Rate(2_000.0, burst=16_384.0)  # of one neighbouring switch; each is verified
+# advertisements and withdrawals of one neighbour; each is verified and relayed
+ADVERTISEMENTS_RATE: Final = Rate(2_048.0, burst=2.0 * ATTACHED_MAX)
 ADVERTISEMENTS_WINDOW: Final = 1_024  # how far advertisements of one node may overtake each other
-QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may cause queries to a RIB for
-QUESTIONS_BURST: Final = 256.0
-SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
-SWITCH_QUESTIONS_BURST: Final = 2_048.0
+QUESTIONS_RATE: Final = Rate(16.0, burst=256.0)  # new names that an attached node may cause queries to a RIB for
+SWITCH_QUESTIONS_RATE: Final = Rate(256.0, burst=2_048.0)  # ... or a neighbouring switch
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
 # of responses that one sender's queries may cause at a RIB; some 2,000 responses
-ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)
-ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch queries at a RIB that is new
-ENDPOINT_LEASE_S: Final = 60.0  # for which a RIB keeps an endpoint record; renewed after a third
+# ... and at once: all that a switch queries at a RIB that is new
+ANSWER_BYTES_RATE: Final = Rate(4.0 * (1 << 20), burst=64.0 * (1 << 20))
 ENDPOINT_RECORDS_MAX: Final = 8_192  # at one RIB, one of each switch
 ENDPOINT_RECORDS_OF_OTHERS_MAX: Final = 2_048  # ... of other domains
-ENDPOINT_RECORDS_PER_S: Final = 4.0  # of one switch that a RIB verifies
-ENDPOINT_RECORDS_BURST: Final = 16.0
-ENDPOINT_QUERIES_PER_S: Final = 8.0  # of one switch or RIB
-ENDPOINT_QUERIES_BURST: Final = 64.0
+ENDPOINT_RECORDS_RATE: Final = Rate(4.0, burst=16.0)  # of one switch that a RIB verifies
+ENDPOINT_QUERIES_RATE: Final = Rate(8.0, burst=64.0)  # of one switch or RIB
 RELAY_RATE_MIN: Final = 10_000  # bytes per second into one tunnel: below it hellos would be late
 RELAY_RATE_MAX: Final = (1 << 32) - 1
 DIRECT_TUNNELS_MAX: Final = 32  # of one switch to others that are behind a NAT, too
-LINK_STATES_PER_S: Final = 10.0  # of one origin that are accepted, and flooded
-LINK_STATES_BURST: Final = 100.0
+LINK_STATES_RATE: Final = Rate(10.0, burst=100.0)  # of one origin that are accepted, and flooded
+# new connections that a relay or an enrolment server accepts: a handshake costs about a millisecond
+CONNECTIONS_RATE: Final = Rate(50.0, burst=50.0)
+ADDRESS_CONNECTIONS_RATE: Final = Rate(25.0, burst=100.0)  # of one address: a site behind a NAT starts together
 
 # Diagnostics
-DIAGNOSTICS_PER_S: Final = 32.0  # requests of one member that a node answers
-DIAGNOSTICS_BURST: Final = 64.0
-DIAGNOSTIC_FRAMES_PER_S: Final = 1_024.0  # frames of one neighbour that are read for it, before a signature is verified
-DIAGNOSTIC_FRAMES_BURST: Final = 2_048.0
+DIAGNOSTICS_RATE: Final = Rate(32.0, burst=64.0)  # requests of one member that a node answers
+# frames of one neighbour that are read for it, before a signature is verified
+DIAGNOSTIC_FRAMES_RATE: Final = Rate(1_024.0, burst=2_048.0)
 DIAGNOSTIC_REPLY_MAX_BYTES: Final = 8_000  # longest reply that one request may ask for, and pays with its own length
 DIAGNOSTIC_WAIT_S: Final = 1.0  # a node that must query a RIB first answers within this time
 

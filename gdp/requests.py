@@ -47,6 +47,14 @@ class Backoff:
             return self.most_s
         return min(self.first_s * 2.0 ** (max(tries - 1, 0) // self.equal), self.most_s)
 
+    def bounded_s(self, estimate_s: float) -> float:
+        """Return an estimate of the first pause, within the first one and the bound (RFC 6298, section 2.4)."""
+        return min(max(estimate_s, self.first_s), self.most_s)
+
+    def after_s(self, pause_s: float) -> float:
+        """Return the pause after one of this length."""
+        return min(2 * pause_s, self.most_s)
+
     def random_pause_s(self, tries: int, chance: float) -> float:
         """Return the pause of one of many clients, which do not come back together.
 

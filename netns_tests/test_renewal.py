@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
+from gdp.intervals import TICK_S
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.issue import renew_node
 from gdp.stores.rollover import begin_rollover, finish_rollover, trust_successor
@@ -22,7 +22,7 @@ _REPLAY = "gdp-replay drive.mcap --config robot/proxy.yaml --rate 0.5 --json"
 _NODES = {"robot": ("robot/switch", "robot/rib", "robot/proxy"), "server": ("server/switch", "server/proxy")}
 _AUDITS = {"robot": ("robot/audit-switch", "robot/audit-rib"), "server": ("server/audit-switch",)}
 _RENEWALS = 4
-_TAKEN_UP_S = 4 * RECONCILE_PERIOD_S  # two reconcile periods of every node
+_TAKEN_UP_S = 4 * TICK_S  # two reconcile periods of every node
 
 
 class _Audited(Machines):

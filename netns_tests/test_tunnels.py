@@ -165,7 +165,7 @@ def test_changes_while_wireguard_go_hangs_are_applied_when_it_goes_on(
 ) -> None:
     one, two = sites
     until(crosses(one.frames(), two.frames()), *ends)
-    monkeypatch.setattr(uapi, "_PAUSE_S", 0.5)
+    monkeypatch.setattr(uapi, "RETRY_S", 0.5)
     pid = process_of(two.ifname)
     os.kill(pid, signal.SIGSTOP)
     try:

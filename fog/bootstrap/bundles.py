@@ -26,7 +26,7 @@ from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
 from fog.host.joining import join_file
 from fog.machine import MachineBundle, Program
 from gdp.crypto.certificates import Role
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.join_token import JoinToken
 
@@ -80,7 +80,7 @@ def machine_boot(
     *,
     iface: str = "",
     uplink: str = "",
-    lease_s: float = ADVERTISEMENT_LEASE_S,
+    lease_s: float = ADVERTISEMENT.lease_s,
     has_relay: bool = False,
     software: Mapping[str, bytes] | None = None,
 ) -> MachineBundle:

@@ -20,6 +20,7 @@ from fog.bootstrap.members import Authority, metadata_of
 from fog.cluster import ExportedInterface
 from gdp.config.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import RELOAD_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import load_public_key
@@ -31,7 +32,6 @@ __all__ = ["add_rules", "control_socket_of", "reload", "reload_proxy", "remove_r
 log = logging.getLogger(__name__)
 
 _HEAD: Final = "# Rules of cluster {cluster}; fog writes this file, and removes it with the cluster.\nimport:\n"
-_RELOAD_S: Final = 10.0
 
 
 def add_rules(
@@ -84,7 +84,7 @@ def reload(identity: Path, configured: Path | None = None) -> bool:
     A node that rejects it keeps its old configuration; the reason is logged.
     """
     try:
-        answer = ask_node(control_socket_of(identity, configured), Command.RELOAD, _RELOAD_S)
+        answer = ask_node(control_socket_of(identity, configured), Command.RELOAD, RELOAD_S)
     except NotRunningError:
         return False
     except GdpError as error:

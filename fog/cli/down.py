@@ -22,13 +22,12 @@ from fog.supervisor.background import ensure, is_running, pid_of
 from fog.supervisor.infrastructure import local_provider, open_provider, tear_down
 from fog.supervisor.journal import Journal
 from gdp.errors import LocalError, StoreError
+from gdp.intervals import LOOK_S, STOP_S
 from gdp.terminal import echo
 
 __all__ = ["clear", "down", "end_cluster"]
 
 _PATIENCE_S: Final = 20.0  # time for the supervisor; afterwards this process releases the machines
-_LEAVE_S: Final = 5.0
-_STEP_S: Final = 0.05
 _TRIES: Final = 5
 
 IfUp = Annotated[bool, typer.Option("--if-up", hidden=True)]  # for a launch that may not have started
@@ -91,7 +90,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
         end_s = time.monotonic() + _PATIENCE_S
         while is_known and journal.machines(name, gone=False) and time.monotonic() < end_s:
             ensure(site)
-            time.sleep(_STEP_S)
+            time.sleep(LOOK_S)
         rest = _release(site, name)
         now_s = time.time()
         left = journal.machines(name, gone=False)
@@ -157,6 +156,6 @@ def _leave(site: Site) -> None:
     for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
             os.kill(pid, number)
-        end_s = time.monotonic() + _LEAVE_S
+        end_s = time.monotonic() + STOP_S
         while is_running(site) and time.monotonic() < end_s:
-            time.sleep(_STEP_S)
+            time.sleep(LOOK_S)

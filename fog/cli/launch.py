@@ -31,15 +31,15 @@ from fog.supervisor.infrastructure import command_of, is_up, open_provider, set_
 from fog.supervisor.journal import Entry, Journal
 from gdp.cli.console import Columns
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S
 from gdp.stores.keyring import load_salt
 from gdp.terminal import echo
 
-__all__ = ["GatewayKind", "begin", "follow", "launch"]
+__all__ = ["WAIT_S", "GatewayKind", "begin", "follow", "launch"]
 
 log = logging.getLogger(__name__)
 
-_WAIT_S: Final = 600.0
-_STEP_S: Final = 0.05
+WAIT_S: Final = 600.0  # for the replicas, unless another time is given
 
 
 class GatewayKind(Enum):
@@ -75,7 +75,7 @@ def launch(
     dry_run: DryRun = False,
     detach: Detach = False,
     keep: Keep = False,
-    wait: Wait = _WAIT_S,
+    wait: Wait = WAIT_S,
     gateway: Gateway = None,
     region: Regions = None,
     ends_with: EndsWith = "",
@@ -210,7 +210,7 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
                     f" the supervisor's words are in {site.state / LOG}"
                 )
             ensure(site)
-            time.sleep(_STEP_S)
+            time.sleep(LOOK_S)
     if not as_json:
         console.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
 

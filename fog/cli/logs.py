@@ -22,13 +22,13 @@ from fog.supervisor.final_logs import MACHINE
 from fog.supervisor.infrastructure import open_provider
 from fog.supervisor.journal import Journal
 from gdp.errors import LocalError
+from gdp.intervals import WATCH_S
 from gdp.terminal import echo
 
 __all__ = ["logs", "new_lines"]
 
 _LINES: Final = 50
 _WINDOW: Final = 2_000  # lines in which a poll looks for those that it knows
-_LOOK_S: Final = 0.3
 _SUPERVISOR: Final = "supervisor"
 _PROGRAMS: Final = ("node", PROXY, SWITCH)
 
@@ -75,7 +75,7 @@ def logs(
             def lines_of_file() -> list[str] | None:
                 return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
 
-            _show(lines_of_file, lines, say, _LOOK_S if follow else None)
+            _show(lines_of_file, lines, say, WATCH_S if follow else None)
             return
         record = machine_of(journal, cluster, machine)
         if record.is_gone:
@@ -90,7 +90,7 @@ def logs(
                     return None
                 return provider.log(record.id, program, _WINDOW if follow else lines).splitlines()
 
-            is_empty = _show(lines_of_machine, lines, say, max(_LOOK_S, provider.poll_s) if follow else None)
+            is_empty = _show(lines_of_machine, lines, say, max(WATCH_S, provider.poll_s) if follow else None)
             if is_empty and program not in ("", *_PROGRAMS):
                 raise LocalError(f"{machine}: no line of {program!r}; programs are {', '.join(_PROGRAMS)}")
         if follow:

@@ -27,11 +27,11 @@ from fog.site import peek_site
 from gdp.cli.console import Columns, folding
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
+from gdp.intervals import DAY_S
 from gdp.terminal import echo
 
 __all__ = ["cost_table", "plan"]
 
-_YEAR_S = 365 * 86400.0
 _MOST_ROWS = 15
 
 Target = Annotated[float, typer.Option(help="largest share of time without any replica, such as 0.0005")]
@@ -294,7 +294,7 @@ def _sources(provider: str) -> tuple[str, ...]:
 
 
 def _chance(chance: float) -> tuple[str, str]:
-    return f"{chance:.4%}", duration_text(round(chance * _YEAR_S, 2))
+    return f"{chance:.4%}", duration_text(round(chance * 365 * DAY_S, 2))
 
 
 def _right(*headers: str) -> tuple[Column, ...]:

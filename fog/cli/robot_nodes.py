@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from fog.child_environment import child_environment
 from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
+from gdp.intervals import STOP_S, UPKEEP_S
 from gdp.terminal import echo
 
 if TYPE_CHECKING:
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
 __all__ = ["INTERRUPTED", "Started", "resolved", "run"]
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
-_OWN_S: Final = 1.0  # at a terminal Ctrl-C reaches the nodes as well; a second signal would interrupt their shutdown
-_END_S: Final = 5.0
-_CHECK_S: Final = 1.0  # the journal of clusters has no change notification
 
 Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"
 
@@ -50,7 +48,7 @@ def run(nodes: Sequence[Started], logs: Path, check: Callable[[], None] = lambda
     try:
         for index, (each, words) in enumerate(nodes):
             processes.append(_start(each, words, logs / f"{index}-{each.node.executable.rpartition('/')[2]}.log"))
-        while not _await(processes, _CHECK_S):
+        while not _await(processes, UPKEEP_S):  # the journal of clusters has no change notification
             check()
         return max((abs(process.returncode) for process in processes), default=0)
     except KeyboardInterrupt:
@@ -74,11 +72,12 @@ def _start(each: RobotNode, words: Sequence[str], path: Path) -> subprocess.Pope
 def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
     """Wait for nodes to end, then send SIGINT, then kill them; a further Ctrl-C kills at once."""
     with suppress(KeyboardInterrupt):
-        if _await(processes, _OWN_S):
+        # at a terminal Ctrl-C reaches the nodes as well; a second signal would interrupt their shutdown
+        if _await(processes, UPKEEP_S):
             return
         for process in processes:
             process.send_signal(signal.SIGINT)  # no effect on a process that has ended
-        _await(processes, _END_S)
+        _await(processes, STOP_S)
     for process in processes:
         process.kill()
         process.wait()

@@ -13,7 +13,7 @@ from typing import Annotated, Final, Optional
 
 import typer
 
-from fog.cli.launch import follow
+from fog.cli.launch import WAIT_S, follow
 from fog.cli.market import choices, market, refusal
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened, the_cluster
 from fog.cli.views import print_json, stage
@@ -27,7 +27,6 @@ from gdp.terminal import echo
 __all__ = ["push", "scale", "ssh", "supervise"]
 
 _LINES: Final = 50
-_WAIT_S: Final = 600.0
 
 scale = typer.Typer(no_args_is_help=True, help="Add or take away replicas while all runs.")
 
@@ -76,7 +75,7 @@ def up(
         journal.put_cluster(wider, time.time(), why=f"{len(plan.machines)} -> {len(wider.machines)} machines")
         ensure(here)
         if not detach:
-            follow(here, journal, wider, last, _WAIT_S, as_json=as_json)
+            follow(here, journal, wider, last, WAIT_S, as_json=as_json)
 
 
 @scale.command("down")

@@ -34,11 +34,11 @@ from fog.supervisor.background import pid_of
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
 from gdp.cli.console import Columns
+from gdp.intervals import WATCH_S
 from gdp.terminal import echo
 
 __all__ = ["cost", "ls", "status"]
 
-_STEP_S: Final = 0.2
 _EVENTS: Final = 20
 _LATEST: Final = 6
 _FLEETING: Final = {"age_s", "usd", "usd_ever"}
@@ -110,7 +110,7 @@ def status(
                 with Live(console=a_console(), auto_refresh=False) as live:
                     while True:
                         live.update(_page(here, journal, journal.cluster(name), gone=all_), refresh=True)
-                        time.sleep(_STEP_S)
+                        time.sleep(WATCH_S)
             else:
                 show(_page(here, journal, found, gone=all_))
         except KeyboardInterrupt:
@@ -199,7 +199,7 @@ def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoRetu
             else:
                 console.print(event_line(entry))
         sys.stdout.flush()
-        time.sleep(_STEP_S)
+        time.sleep(WATCH_S)
 
 
 def _as_json(look: Callable[[], dict[str, object]], *, follow: bool) -> None:
@@ -213,7 +213,7 @@ def _as_json(look: Callable[[], dict[str, object]], *, follow: bool) -> None:
             sys.stdout.flush()
         if not follow:
             return
-        time.sleep(_STEP_S)
+        time.sleep(WATCH_S)
 
 
 def _lasting(value: object) -> object:

@@ -23,13 +23,13 @@ from fog.host.program_supervisor import ProgramSupervisor
 from fog.host.status import Status
 from fog.machine import MachineState
 from gdp.errors import LocalError
+from gdp.intervals import DRAIN_S
 
 __all__ = ["DRAINS", "MachineAgent"]
 
 log = logging.getLogger(__name__)
 
 DRAINS: Final = "proxy"  # the program that tracks calls in progress
-_DRAIN_S: Final = 60.0
 _SIGNALS: Final = {signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2}
 
 
@@ -118,7 +118,7 @@ class MachineAgent:
             if supervisor.program.name == DRAINS and (answered := supervisor.send_signal(signal.SIGUSR1)) is not None:
                 answered.add_done_callback(lambda _: end.set())
                 with suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(end.wait(), _DRAIN_S)
+                    await asyncio.wait_for(end.wait(), DRAIN_S)
 
     def _take_notice(self) -> None:
         leaves_at_unix_s = read_notice(self._home)

@@ -21,11 +21,12 @@ from gdp.errors import LocalError
 from gdp.stores.files import read_private
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["join", "join_file"]
+__all__ = ["JOIN_DEADLINE_S", "join", "join_file"]
 
 log = logging.getLogger(__name__)
 
-_DEADLINE_S: Final = 900.0  # the token has expired by then
+# a cloud machine must boot an image and install packages; the token has expired by then
+JOIN_DEADLINE_S: Final = 900.0
 _KEYS: Final = "keys"  # until the machine has joined
 
 
@@ -34,7 +35,7 @@ def join_file(token: JoinToken, label: str) -> bytes:
     return json.dumps({"token": token.to_text(), "label": label}).encode()
 
 
-def join(home: Path, *, deadline_s: float = _DEADLINE_S, wait: Callable[[float], None] = time.sleep) -> bool:
+def join(home: Path, *, deadline_s: float = JOIN_DEADLINE_S, wait: Callable[[float], None] = time.sleep) -> bool:
     """Join the domain of the token in a machine's folder; return whether there was one.
 
     An enrolment server that cannot be reached is tried again: the network of a machine that boots may come late.

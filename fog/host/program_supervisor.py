@@ -16,6 +16,7 @@ from fog.host.bounded_log import BoundedLog
 from fog.host.managed_process import ManagedProcess
 from fog.host.status import ProgramStatus
 from fog.machine import Program
+from gdp.intervals import STEADY_S
 from gdp.requests import Backoff
 
 __all__ = ["ProgramSupervisor"]
@@ -23,7 +24,6 @@ __all__ = ["ProgramSupervisor"]
 log = logging.getLogger(__name__)
 
 RESTARTS: Final = Backoff(0.1, 10.0)
-_STEADY_S: Final = 30.0  # a program that ran this long is restarted at once
 _END_PATIENCE_S: Final = 2.0
 
 
@@ -48,7 +48,7 @@ class ProgramSupervisor:
             self._become(ProgramStatus(restarts=restarts))
             if not self.program.restarts:
                 return f"{self.program.name} {how}"
-            failures = 1 if asyncio.get_running_loop().time() - begun_s > _STEADY_S else failures + 1
+            failures = 1 if asyncio.get_running_loop().time() - begun_s > STEADY_S else failures + 1
             pause_s = RESTARTS.pause_s(failures)
             log.warning("program ended program=%s how=%s pause_s=%.1f", self.program.name, how, pause_s)
             await asyncio.sleep(pause_s)

@@ -18,6 +18,7 @@ from fog.latency.config import LatencyConfig, ProbeEndpoint
 from fog.latency.probe import Probed, probe_all
 from fog.plan.duration import duration_text
 from gdp.errors import StoreError
+from gdp.intervals import CACHE_S
 
 __all__ = ["NO_ENDPOINT", "Latencies", "Latency"]
 
@@ -26,7 +27,6 @@ log = logging.getLogger(__name__)
 _FILE: Final = "latency.json"
 NO_ENDPOINT: Final = "not measured: latency.endpoints of fog.yaml names no endpoint"
 _EARLY: Final = 0.5  # share of its lifetime after which a measurement is repeated
-_FAILED_S: Final = 60.0  # a region without an answer is probed again after this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class Latencies:
     def _holds(self, kept: _Kept | None, endpoint: ProbeEndpoint, now_unix_s: float) -> bool:
         if kept is None or kept.endpoint != endpoint.to_text() or kept.unix_s > now_unix_s:
             return False
-        limit_s = _FAILED_S if kept.ms is None else self._config.lifetime_s * _EARLY
+        limit_s = CACHE_S if kept.ms is None else self._config.lifetime_s * _EARLY
         return now_unix_s - kept.unix_s < limit_s
 
     def _read(self) -> dict[str, _Kept]:

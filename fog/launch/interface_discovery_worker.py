@@ -20,6 +20,7 @@ from typing import Final, TypedDict
 
 from fog.child_environment import child_environment
 from gdp.errors import LocalError
+from gdp.intervals import STOP_S
 from gdp.ports.readiness import readable
 from gdp.ros_names import is_of_every_node
 from proxy.bridge.core.action_interface import action_of, is_part
@@ -30,7 +31,6 @@ __all__ = ["main", "offers"]
 
 PATIENCE_S: Final = 30.0
 QUIET_S: Final = 2.0  # after the last change; a node rarely takes longer between two of its services
-_END_S: Final = 5.0
 _LINES: Final = 8
 
 
@@ -116,7 +116,7 @@ def _started(start: _Start, log: Path) -> Iterator[tuple[int, Path]]:
         os.close(descriptor)
         process.send_signal(signal.SIGINT)  # ROS nodes end on SIGINT
         try:
-            process.wait(_END_S)
+            process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

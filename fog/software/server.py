@@ -33,6 +33,7 @@ from cryptography.x509.oid import NameOID
 from fog.software.config import SoftwareConfig
 from fog.software.offer import Offered, offered, remove_unused_archives, signature
 from gdp.http_server import Answer, HttpServer
+from gdp.intervals import SERVER_S
 from gdp.stores.files import private, read_private, write_all
 
 __all__ = ["SOFTWARE_FILE", "SoftwareServer"]
@@ -40,7 +41,6 @@ __all__ = ["SOFTWARE_FILE", "SoftwareServer"]
 SOFTWARE_FILE: Final = "software.json"  # on the machine, too: what ``fetch`` reads
 _FETCHES_MAX: Final = 8  # of one file with one URL; a machine repeats a download that was cut
 _CONNECTIONS_MAX: Final = 32
-_TIMEOUT_S: Final = 30.0  # to ask, and for each piece of an answer
 _KEY_BYTES: Final = 32
 _VALID: Final = timedelta(days=3_650)
 _NOT_FOUND: Final = Answer("404 Not Found")
@@ -81,7 +81,7 @@ class SoftwareServer:
             self._find,
             name="software",
             connections=_CONNECTIONS_MAX,
-            timeout_s=_TIMEOUT_S,
+            timeout_s=SERVER_S,
             tls=_tls(kept),
             is_for_downloads=True,
         )

@@ -6,7 +6,6 @@ I/O; reads the call counters of proxies, and writes an event for each change. ``
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Final
 
 from fog.cluster import ClusterPlan, MachineRequest
 from fog.scaling import Autoscaler, CallCounts
@@ -14,10 +13,9 @@ from fog.site import Site
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import calls_of
+from gdp.intervals import POLL_S
 
 __all__ = ["Autoscaling"]
-
-_ASK_S: Final = 2.0  # between two readings of the counters
 
 
 class Autoscaling:
@@ -52,7 +50,7 @@ class Autoscaling:
             self._asked_s.pop(plan.name, None)
         there = sum(not each.is_gone and not each.is_outgoing for each in records)
         before = self._counts.get(plan.name) or there or len(plan.machines)
-        if now_s - self._asked_s.get(plan.name, 0.0) >= _ASK_S:
+        if now_s - self._asked_s.get(plan.name, 0.0) >= POLL_S:
             self._asked_s[plan.name] = now_s
             scaler.observe(_total([calls_of(path, services) for path in self._site.robots]), now_s)
             self._counts[plan.name] = scaler.decide(before, _usd_per_hour(records), now_s)

@@ -17,14 +17,13 @@ from typing import Final
 
 from fog.site import Site
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S, UPKEEP_S
 
 __all__ = ["LOG", "ensure", "held", "is_running", "pid_of"]
 
 _LOCK: Final = "supervisor.lock"
 LOG: Final = "supervisor.log"
 _LOG_MAX_BYTES: Final = 4 << 20
-_CONFLICT_S: Final = 1.0  # the lock is held for a check, or by another supervisor
-_STEP_S: Final = 0.05
 
 
 def is_running(site: Site) -> bool:
@@ -89,7 +88,7 @@ def held(site: Site, descriptor: int | None) -> Iterator[None]:
             yield
         return
     with (site.state / _LOCK).open("a") as file:
-        end_s = time.monotonic() + _CONFLICT_S
+        end_s = time.monotonic() + UPKEEP_S  # the lock is held for a check, or by another supervisor
         while True:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -97,7 +96,7 @@ def held(site: Site, descriptor: int | None) -> Iterator[None]:
             except BlockingIOError as error:
                 if time.monotonic() >= end_s:
                     raise LocalError(f"a supervisor of {site.state} lives already") from error
-                time.sleep(_STEP_S)
+                time.sleep(LOOK_S)
         _sign(site)
         yield
 

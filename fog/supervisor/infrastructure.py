@@ -27,6 +27,7 @@ from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
 from gdp.extras import Seam
 from gdp.host.run_registry import RunRegistry
+from gdp.intervals import LOOK_S, MINUTE_S
 
 if TYPE_CHECKING:
     from fog.providers.local.provider import LocalProvider
@@ -38,8 +39,6 @@ log = logging.getLogger(__name__)
 _OWN_SPACE: Final = Path("/proc/self/ns/net")
 _GATEWAY_DAYS: Final = 3_650.0
 _PROVIDERS: Final[Seam[Callable[[Site], Provider]]] = Seam("fog.provider")
-_BOOT_S: Final = 60.0
-_STEP_S: Final = 0.05
 
 
 def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
@@ -136,9 +135,9 @@ def _start_robot(site: Site, home: Path) -> None:
 
 def _await_up(home: Path) -> None:
     """Wait until all programs are up, by polling: status files have no change notification."""
-    end_s = time.monotonic() + _BOOT_S
+    end_s = time.monotonic() + MINUTE_S
     while (status := Status.read(home)) is None or status.state is not MachineState.RUNNING:
         restarts = sum(each.restarts for each in status.programs.values()) if status is not None else 0
         if time.monotonic() > end_s or restarts > 2 or (status is not None and status.state is MachineState.GONE):
             raise LocalError(f"the robot's side does not come up; its programs' words are in {home / 'logs'}")
-        time.sleep(_STEP_S)
+        time.sleep(LOOK_S)

@@ -28,13 +28,12 @@ from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.placement import place, stopgap
 from gdp.errors import LocalError
+from gdp.intervals import CACHE_S
 
 __all__ = ["ATTACH", "DETACH", "MachineActions"]
 
 ATTACH: Final = "attach uplink"
 DETACH: Final = "detach uplink"
-
-_OFFERS_S: Final = 60.0  # validity of a price list
 
 
 class OfferCache:
@@ -51,7 +50,7 @@ class OfferCache:
     def get(self, provider: Provider, wanted: MachineRequest, now_s: float) -> list[Offer]:
         """Return the provider's offers for a request, at most one minute old."""
         at_s, offers = self._offers.get(wanted, (0.0, []))
-        if now_s - at_s >= _OFFERS_S or not offers:
+        if now_s - at_s >= CACHE_S or not offers:
             offers = provider.offers(wanted.hardware, spot=wanted.is_spot)
             self._offers[wanted] = now_s, offers
             self.latencies.refresh_in_background((each.region for each in offers), now_s)

@@ -22,7 +22,7 @@ from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from gdp.config.config import SwitchConfig
 from gdp.errors import GdpError, LocalError, StoreError
-from gdp.stores.issue import DAY_S
+from gdp.intervals import DAY_S
 from gdp.stores.keyring import load_domain
 
 __all__ = ["MachineCredentials", "Release", "remove_member"]

@@ -13,13 +13,13 @@ from fog.cluster import MachineRequest
 from fog.offer import Offer
 from fog.plan.choice import Choice, choose
 from fog.supervisor.core.record import Outcome, Record
+from gdp.intervals import HOUR_S
 from gdp.requests import Backoff
 
 __all__ = ["held_until", "place", "stopgap", "wary_until"]
 
 _WARINESS: Final = Backoff(60.0, 3_600.0)  # by losses
 _HOLDS: Final = Backoff(1.0, 300.0)  # by failed requests
-_MEMORY_S: Final = 3_600.0  # how long a loss counts
 _PATIENCE: Final = 4  # after this many consecutive failures in any region, the cause is probably not a region
 
 
@@ -107,5 +107,6 @@ def _is_resting(records: Sequence[Record], now_s: float) -> bool:
 
 
 def _moments(records: Iterable[Record], ending: Outcome, now_s: float) -> list[float]:
+    """Return when machines ended in this way in the last hour."""
     moments = (each.gone_unix_s for each in records if each.ending is ending and each.gone_unix_s is not None)
-    return sorted(moment for moment in moments if moment > now_s - _MEMORY_S)
+    return sorted(moment for moment in moments if moment > now_s - HOUR_S)

@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Final
 
 from fog.bootstrap.domain_members import DomainMembers
+from fog.host.joining import JOIN_DEADLINE_S
 from fog.site import Site, topology_now
 from fog.software.server import SoftwareServer
 from fog.supervisor.background import held
@@ -40,7 +41,6 @@ __all__ = ["supervise"]
 
 log = logging.getLogger(__name__)
 
-_ELSEWHERE_S: Final = 900.0  # a cloud machine must boot an image and install packages
 _DONE_S: Final = 2.0  # it ends after this time without a wanted cluster
 
 
@@ -53,7 +53,7 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
     Raises:
         LocalError: another supervisor runs, the provider is not available, or a port for machines is taken.
     """
-    timeouts = Timeouts() if site.provider == "local" else Timeouts(boot_s=_ELSEWHERE_S)
+    timeouts = Timeouts() if site.provider == "local" else Timeouts(boot_s=JOIN_DEADLINE_S)
     with (
         held(site, lock),
         closing(Journal(site.journal)) as journal,

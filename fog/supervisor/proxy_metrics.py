@@ -17,6 +17,7 @@ from urllib.request import urlopen
 from fog.bootstrap.robot_config import control_socket_of
 from fog.scaling import CallCounts
 from gdp.errors import GdpError
+from gdp.intervals import PROMPT_S
 from gdp.management.control_client import ask_node, find_control_socket_of
 from gdp.names import Name
 from gdp.state.control_protocol import Command
@@ -25,7 +26,6 @@ from proxy.config.config import ProxyConfig
 __all__ = ["calls_of", "received_by", "sent_by"]
 
 _SENT: Final = re.compile(rb'^gdp_messages_total\{direction="out"\} (\S+)$', re.MULTILINE)
-_TIMEOUT_S: Final = 0.5
 
 
 def received_by(proxy: str) -> int | None:
@@ -69,7 +69,7 @@ def calls_of(proxy: Path, services: Collection[str]) -> CallCounts | None:
     config = ProxyConfig.load(proxy)
     try:
         socket = control_socket_of(config.identity, config.control_socket)
-        match ask_node(socket, Command.STATUS, _TIMEOUT_S).result:
+        match ask_node(socket, Command.STATUS, PROMPT_S).result:
             case {"calls": dict(calls)}:
                 counts = [_answered(calls[name]) for name in services if name in calls]
                 return CallCounts(sum(each.ended for each in counts), sum(each.total_ms for each in counts))
@@ -86,7 +86,7 @@ def _answered(fields: object) -> CallCounts:
 
 
 def _count(socket: Path, direction: str) -> int | None:
-    match ask_node(socket, Command.STATUS, _TIMEOUT_S).result:
+    match ask_node(socket, Command.STATUS, PROMPT_S).result:
         case {"counters": {"messages": dict(messages)}} if isinstance(messages.get(direction), int):
             return int(messages[direction])
     return None
@@ -94,7 +94,7 @@ def _count(socket: Path, direction: str) -> int | None:
 
 def _sent_by_metrics(port: int) -> int | None:
     try:
-        with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=_TIMEOUT_S) as answer:
+        with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PROMPT_S) as answer:
             found = _SENT.search(answer.read())
     except (OSError, HTTPException):
         return None  # it does not run, or runs on another host

@@ -32,6 +32,7 @@ from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
 from fog.supervisor.watch import Watch
 from gdp.errors import GdpError
+from gdp.intervals import MINUTE_S, WATCH_S
 from gdp.stores.keyring import load_public_key
 
 __all__ = ["Heard", "Supervisor"]
@@ -40,8 +41,6 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
-_UNREADY_S: Final = 60.0  # a replica that does not pass its readiness probe for so long is replaced
-_NEWS_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
 
@@ -118,8 +117,8 @@ class Supervisor:
         """
         left_s = self._actions.provider.poll_s
         beat()
-        while left_s > 0 and not self._woken.wait(min(left_s, _NEWS_S)) and not self._has_news():
-            left_s -= _NEWS_S
+        while left_s > 0 and not self._woken.wait(min(left_s, WATCH_S)) and not self._has_news():
+            left_s -= WATCH_S
             beat()
         self._woken.clear()
 
@@ -231,7 +230,7 @@ def _patience(plan: ClusterPlan, patience: Timeouts) -> Timeouts:
     """Return the time limits of a cluster: a replica that is not ready has time to become so before it is replaced."""
     if not any("readiness" in each.served for each in plan.carried):
         return patience
-    return replace(patience, unreachable_timeout_s=max(patience.unreachable_timeout_s, _UNREADY_S))
+    return replace(patience, unreachable_timeout_s=max(patience.unreachable_timeout_s, MINUTE_S))
 
 
 def _services(plan: ClusterPlan, owner_key: bytes) -> list[str]:

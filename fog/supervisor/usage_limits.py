@@ -15,10 +15,10 @@ from fog.supervisor.core.activity import Activity
 from fog.supervisor.core.record import Record, cost_usd
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import received_by, sent_by
+from gdp.intervals import POLL_S
 
 __all__ = ["UsageLimits"]
 
-_ACTIVITY_S: Final = 2.0  # between two readings of the counters
 _ON_THIS_HOST: Final = "local"
 
 
@@ -43,7 +43,7 @@ class UsageLimits:
             spent = sum(cost_usd(each, now_s) for each in ours)
             if spent >= plan.budget_usd:
                 return f"its budget is spent: {spent:.2f} of {plan.budget_usd:.2f} USD"
-        if plan.idle_s is None or now_s - self._asked_s.get(plan.name, 0.0) < _ACTIVITY_S:
+        if plan.idle_s is None or now_s - self._asked_s.get(plan.name, 0.0) < POLL_S:
             return ""
         self._asked_s[plan.name] = now_s
         if provider == _ON_THIS_HOST:

@@ -17,11 +17,11 @@ from gdp.client.participant import Participant
 from gdp.config.schema import Domain
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
+from gdp.intervals import LOOK_S, TICK_S
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_settings, load_member
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
@@ -31,8 +31,6 @@ __all__ = ["Watch"]
 
 log = logging.getLogger(__name__)
 
-_STEP_S: Final = 0.05
-_AGAIN_S: Final = 0.5
 _SETTLED_S: Final = 3.0  # after it is attached, until a missing server counts as unreachable
 
 
@@ -79,7 +77,7 @@ class Watch:
                     reported = str(error)
             finally:
                 self._tell(None)  # earlier results are no longer valid
-            self._ended.wait(_AGAIN_S)
+            self._ended.wait(TICK_S)
 
     def _watch(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
@@ -88,14 +86,14 @@ class Watch:
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
-            runtime.every(RECONCILE_PERIOD_S, Credentials(self._identity, domain, identity, policy).reload_changed)
+            runtime.every(TICK_S, Credentials(self._identity, domain, identity, policy).reload_changed)
             called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):
                 if self._again.is_set():
                     self._again.clear()
                     called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), called)
-                runtime.step(time.monotonic() + _STEP_S)
+                runtime.step(time.monotonic() + LOOK_S)
                 member.poll_messages()
                 if not member.attachment.is_attached:
                     attached_s = None

@@ -16,6 +16,7 @@ from gdp.cli import options
 from gdp.cli.completion import complete_node
 from gdp.cli.output import show
 from gdp.errors import LocalError
+from gdp.intervals import DRAIN_S
 from gdp.management.control_client import NotRunningError, find_control_socket, request_control
 from gdp.state.control_protocol import Command, Response
 from gdp.terminal import echo
@@ -24,7 +25,6 @@ __all__ = ["drain", "reload", "status"]
 
 _FAILED: Final = 1
 _NOT_RUNNING: Final = 3
-_DRAIN_S: Final = 60.0
 
 NodeDirectory = Annotated[
     Optional[Path],  # noqa: UP045
@@ -72,7 +72,7 @@ def status(
 
 
 def drain(
-    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = _DRAIN_S, as_json: options.Json = False
+    node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = DRAIN_S, as_json: options.Json = False
 ) -> None:
     """Make a running node finish its work and end; return when the node has finished.
 

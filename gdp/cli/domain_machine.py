@@ -25,7 +25,7 @@ from gdp.enrolment.member_setup import LISTEN_PORT, RELAY_PORT
 from gdp.enrolment.preflight import check_ports, check_tunnels
 from gdp.enrolment.registry import MachineRow, Registry
 from gdp.enrolment.removal import remove_machine
-from gdp.enrolment.server import bind_server, serve_domain
+from gdp.enrolment.server import POLL_MAX_S, bind_server, serve_domain
 from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible
 from gdp.terminal import echo
@@ -34,7 +34,6 @@ from gdp.trust.join_token import JoinRole
 __all__ = ["create", "ls", "remove", "serve", "token"]
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}", re.ASCII)
-_ONLINE_S: Final = 120.0  # an agent asks at least each minute
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="of the domain")]
 Public = Annotated[
@@ -194,7 +193,7 @@ def _own_servers(listen: int) -> list[str]:
 def _row(machine: MachineRow) -> dict[str, object]:
     names = {each.role: each.name.to_text() for each in machine.nodes}
     switch = next((each.name.to_text() for each in machine.nodes if each.role in ("switch", "leaf")), "")
-    is_online = time.time() - machine.seen_unix_s < _ONLINE_S
+    is_online = time.time() - machine.seen_unix_s < 2 * POLL_MAX_S
     state = "online" if is_online else "offline"
     if machine.removed_unix_s is not None:
         state = "revoked"

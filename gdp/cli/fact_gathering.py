@@ -16,6 +16,7 @@ from gdp.diagnosis.facts import Facts
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.errors import LocalError
 from gdp.host.ros_processes import ros_processes
+from gdp.intervals import PROMPT_S
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
 from gdp.management.control_client import NodeConnection, NotRunningError, find_control_socket
 from gdp.state.state_answers import ASK
@@ -23,7 +24,6 @@ from gdp.stores.keyring import CARD, load_card
 
 __all__ = ["FactGathering", "LocalDirectory", "local_directory"]
 
-_TIMEOUT_S: Final = 0.3
 # A long request has many frames, any of which may be lost: the last attempt is for what was cut.
 _REPLY_BYTES: Final = (2_500, 2_500, DIAGNOSTIC_REPLY_MAX_BYTES)
 
@@ -99,7 +99,7 @@ class FactGathering:
     def _ask_round(
         self, near: NodeConnection, role: str, targets: Sequence[str], survey: Survey, *, is_near: bool
     ) -> None:
-        arguments = {"name": survey.name, "body": {"q": self._asked}, "timeout_s": _TIMEOUT_S}
+        arguments = {"name": survey.name, "body": {"q": self._asked}, "timeout_s": PROMPT_S}
         left = list(targets)
         for reply_bytes in _REPLY_BYTES:
             requests = [(ASK, {**arguments, "target": each, "reply_bytes": reply_bytes}) for each in left]

@@ -25,6 +25,7 @@ from gdp.enrolment.supervisor import Failures, supervise
 from gdp.enrolment.units import has_systemd, install_units
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible
+from gdp.intervals import TICK_S
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.terminal import echo
@@ -32,7 +33,6 @@ from gdp.terminal import echo
 __all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run_programs", "say", "start_machine"]
 
 BORDER_SEEN_S: Final = 20.0
-_EACH_S: Final = 0.5
 
 AtDirectory = Annotated[
     Optional[Path],  # noqa: UP045
@@ -105,7 +105,7 @@ def paths_up(directory: Path, deadline_s: float = BORDER_SEEN_S) -> tuple[list[s
         found = _labels_up(directory, "links"), bool(_labels_up(directory, "relay"))
         if any(found) or time.monotonic() >= end_s:
             return found
-        time.sleep(_EACH_S)
+        time.sleep(TICK_S)
 
 
 def _labels_up(directory: Path, key: str) -> list[str]:

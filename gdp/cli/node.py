@@ -23,7 +23,6 @@ from gdp.errors import ConfigError, GdpError, LocalError
 from gdp.terminal import echo
 
 __all__ = [
-    "AWAIT_IFACE_S",
     "WRONG",
     "AwaitIface",
     "Check",
@@ -60,7 +59,6 @@ AwaitIface = Annotated[
     float,
     typer.Option(min=0.0, metavar="SECONDS", help="Wait so long for the device, which a switch may just be making."),
 ]
-AWAIT_IFACE_S: Final = 10.0  # of nodes whose switch may be starting
 Json = Annotated[bool, typer.Option("--json", help="Say what happens as lines of JSON on standard output.")]
 MemberPlane = Annotated[str | None, typer.Option("--data-plane", help="raw or scapy; instead of the file's.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too; as --log-level debug.")]

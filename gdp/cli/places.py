@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import ANSWER_S
 from gdp.management.control_client import NodeConnection
 from gdp.names import Name
 
@@ -20,7 +21,6 @@ NOWHERE: Final = (
     " is its publisher up, does it expose the name, and are the RIBs up?"
 )
 
-_RESOLVE_S: Final = 2.0  # a switch answers within a second, or says that it does not know
 _REPLY_BYTES: Final = 4_000
 _CARRIES: Final = ("publish", "serve")
 
@@ -39,7 +39,7 @@ def find_places(connection: NodeConnection, name: Name) -> list[Place]:
     Raises:
         LocalError: the switch does not answer, or refuses.
     """
-    found = connection.ask("resolve", name=name.to_text(), timeout_s=_RESOLVE_S, reply_bytes=_REPLY_BYTES)
+    found = connection.ask("resolve", name=name.to_text(), timeout_s=ANSWER_S, reply_bytes=_REPLY_BYTES)
     if found.get("state") != "answered":
         raise LocalError("the switch of this node does not answer; look at 'gdp show neighbors'")
     result = found.get("result")

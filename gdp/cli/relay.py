@@ -15,6 +15,7 @@ from gdp.cli.program import Program
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
+from gdp.intervals import ANSWER_S
 from gdp.management.control_client import ask_node
 from gdp.nodes.membership import load_member
 from gdp.nodes.relay import Relay, relay_control_path, run_relay
@@ -25,8 +26,6 @@ __all__ = ["main"]
 
 app = Program("gdp-relay")
 main = app.run
-
-_STATUS_S = 10.0
 
 
 @app.command(
@@ -53,7 +52,7 @@ def relay(
             if check:
                 _report_check(identity, settings, json=json)
             else:
-                response = ask_node(relay_control_path(settings, identity.name), Command.STATUS, _STATUS_S)
+                response = ask_node(relay_control_path(settings, identity.name), Command.STATUS, ANSWER_S)
                 show(response.result, as_json=json)
             return
         run_relay(settings, lambda identity, relay: _report_ready(identity, relay, json=json))

@@ -5,22 +5,11 @@ I/O.
 
 from __future__ import annotations
 
-from gdp.cli.node import (
-    AWAIT_IFACE_S,
-    AwaitIface,
-    Check,
-    Config,
-    Json,
-    Logs,
-    MemberPlane,
-    emit_wait,
-    report,
-    running,
-    with_plane,
-)
+from gdp.cli.node import AwaitIface, Check, Config, Json, Logs, MemberPlane, emit_wait, report, running, with_plane
 from gdp.cli.program import Program
 from gdp.config.config import RibConfig
 from gdp.crypto.certificates import Role
+from gdp.intervals import ATTACH_S
 from gdp.links.uplink import wait_for_device
 from gdp.names import Name
 from gdp.nodes.membership import load_member
@@ -35,7 +24,7 @@ main = app.run
 @app.command(epilog="Example: gdp-rib --config rib.yaml")
 def rib(
     config: Config,
-    await_iface: AwaitIface = AWAIT_IFACE_S,
+    await_iface: AwaitIface = ATTACH_S,
     data_plane: MemberPlane = None,
     check: Check = False,
     json: Json = False,

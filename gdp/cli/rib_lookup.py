@@ -18,6 +18,7 @@ from gdp.cli.options import Host
 from gdp.cli.output import moment, show
 from gdp.cli.topic import KnownName, Sockets, none_runs
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.management.running_nodes import RunningNode, find_running_nodes, read_topics
 from gdp.names import Name
@@ -29,7 +30,6 @@ __all__ = ["app"]
 app = typer.Typer(no_args_is_help=True, help="Ask RIBs what they know.")
 
 _NONE: Final = 1
-_AGAIN_S: Final = 0.05  # between two questions whether the RIB has answered
 
 Node = Annotated[
     Optional[Path],  # noqa: UP045
@@ -124,7 +124,7 @@ def _answer(node: RunningNode, name: Name, timeout_s: float) -> Mapping[str, obj
             return {"state": "refused", "error": response.error, "rib": None, "advertisers": []}
         if response.result.get("state") != "asked" or time.monotonic() >= until_s:
             return response.result
-        time.sleep(_AGAIN_S)
+        time.sleep(LOOK_S)
 
 
 def _described(node: RunningNode, answer: Mapping[str, object]) -> dict[str, object]:

@@ -19,11 +19,12 @@ from gdp.cli.output import show, table
 from gdp.cli.salt import read_salt
 from gdp.config.schema import Directory, ExistingFile, Section, load, relative
 from gdp.errors import LocalError, StatementError
+from gdp.intervals import DAY_S
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
 from gdp.ros_names import Kind
-from gdp.stores.issue import DAY_S, DELEGATION_DAYS, valid_delegation, widened
+from gdp.stores.issue import DELEGATION_DAYS, valid_delegation, widened
 from gdp.stores.keyring import (
     CARD,
     DELEGATIONS,

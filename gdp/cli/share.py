@@ -18,9 +18,10 @@ import typer
 from gdp.cli import options
 from gdp.cli.machine import directory_of
 from gdp.cli.output import moment, show, table
-from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
+from gdp.client.send_options import RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import HOUR_S, LOOK_S
 from gdp.sharing.folder_exchange import FolderExchange
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.member_exchange import MemberExchange
@@ -40,7 +41,6 @@ SHARE_DAYS: Final = 30.0
 _PROXY_FILE: Final = "proxy.yaml"
 _SWITCH_FILE: Final = "switch.yaml"
 _OWNER: Final = "owner"
-_POLL_S: Final = 0.1
 _PARTLY: Final = 1
 _WAITS: Final = "waits for delivery"
 _NOT_IN_FORCE: Final = (NOT_USED, WITHDRAWN, _WAITS)  # states begin so
@@ -84,7 +84,7 @@ DeadlineMs = Annotated[
     typer.Option(
         "--deadline-ms",
         min=0.001,
-        max=1_000 * DEADLINE_MAX_S,
+        max=1_000 * HOUR_S,
         help="Best effort: a message that cannot leave within this time is dropped.",
     ),
 ]
@@ -171,7 +171,7 @@ def expose(
             report = sharing.expose(wanted, time.time(), is_plain=plain_name)
         until_s = time.monotonic() + wait
         while not (given := _given(folder, kind, name)) and report.is_running and time.monotonic() < until_s:
-            time.sleep(_POLL_S)  # the graph of the proxy has no event for this process
+            time.sleep(LOOK_S)  # the graph of the proxy has no event for this process
             report.problems = sharing.work(time.time()).problems
         report.granted = given
         _show_change(name, report, as_json=as_json, awaited="as soon as a local node shows it")

@@ -22,12 +22,12 @@ from gdp.enrolment.service_status import UnitState, known_units, unit_state
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import UNIT_FOLDER, has_systemd, install_units, installed_units, remove_units
 from gdp.errors import LocalError
+from gdp.intervals import SERVER_S
 
 __all__ = ["app"]
 
 _NOT_WELL: Final = 1
 _NOTHING: Final = 3
-_JOURNAL_S: Final = 30.0
 _ETC: Final = Path("/etc/gdp")
 
 
@@ -163,7 +163,7 @@ def _last_words(unit: str) -> str:
     """Return the end of a unit's journal; empty where there is none."""
     argv = ["journalctl", "--no-pager", "--lines=5", "--output=cat", f"--unit={unit}"]
     try:
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=_JOURNAL_S, check=False)
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=SERVER_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{unit}: its journal cannot be read: {error}"
     return "\n".join(f"{unit}: {line}" for line in done.stdout.splitlines() if line)

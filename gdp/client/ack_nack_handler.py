@@ -16,6 +16,7 @@ from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.reader_proxies import ReaderProxies, ReaderProxy
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
+from gdp.intervals import READER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.loss import LossReason
@@ -25,7 +26,6 @@ from gdp.message.send_window import SendWindow
 __all__ = ["AckNackHandler"]
 
 _SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, a Heartbeat states that it was the last
-_STUCK_S: Final = 1.0  # a best-effort reader without a whole message for so long learns by a Heartbeat what it lost
 
 
 class AckNackHandler:
@@ -106,7 +106,7 @@ class AckNackHandler:
             reader.advanced_s = now_s
         reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
         (sent, _), (sequence, _) = queue.sent, queue.sequences
-        is_stuck = now_s - reader.advanced_s >= _STUCK_S
+        is_stuck = now_s - reader.advanced_s >= READER.refresh_s
         is_settled = queue.is_acknowledged or is_stuck or now_s - self._sent_frames.last_s > _SETTLED_S
         if acknack.sequence < sequence and is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message

@@ -9,21 +9,17 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import Header
-from gdp.limits import (
-    REPORT_DELAY_S,
-    REPORT_EVERY_BYTES,
-    REPORT_EVERY_MAX_BYTES,
-    REPORT_GAP_S,
-    REPORT_IDLE_S,
-    REPORT_PAUSE_S,
-)
+from gdp.intervals import READER
+from gdp.limits import REPORT_DELAY_S, REPORT_EVERY_BYTES, REPORT_EVERY_MAX_BYTES, REPORT_GAP_S, REPORT_PAUSE_S
 from gdp.message.reassembly import Reassembler
 from gdp.message.receipts import sum_of_samples
+from gdp.requests import Backoff
 
 __all__ = ["AckNackSchedule"]
 
 _FIRST_BYTES: Final = 3_000
-_MISSING_MAX_S: Final = 16 * REPORT_DELAY_S  # between two requests of what is missing, while nothing comes
+# between two requests of what is missing, while nothing comes
+_MISSING: Final = Backoff(REPORT_DELAY_S, 16 * REPORT_DELAY_S)
 
 
 class AckNackSchedule:
@@ -44,7 +40,7 @@ class AckNackSchedule:
     def __init__(self, data: Reassembler, due_s: float) -> None:
         self._data = data
         self.due_s = due_s
-        self.idle_s = REPORT_IDLE_S
+        self.idle_s = READER.refresh_s
         self.received = self.receipts = 0
         self.newest = (0, -1, due_s)
         self._unreported_bytes = 0
@@ -102,7 +98,7 @@ class AckNackSchedule:
     def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
         """Schedule the report after one that is sent now: ever later while something is missing and nothing comes."""
         is_repeated = is_missing and not self._has_come
-        self._missing_s = min(2 * self._missing_s, _MISSING_MAX_S) if is_repeated else REPORT_DELAY_S
+        self._missing_s = _MISSING.after_s(self._missing_s) if is_repeated else _MISSING.first_s
         if is_missing:
             self._clean_bytes = 0
         self.due_s = now_s + (self._missing_s if is_missing else self.idle_s)

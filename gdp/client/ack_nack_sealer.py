@@ -16,12 +16,12 @@ from gdp.client.key_epochs import Secrets
 from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.frame.kinds import Kind
+from gdp.intervals import READER
 from gdp.message.acknack import AckNack
 from gdp.names import Name
 
 __all__ = ["AckNackSealer"]
 
-_SILENT_S: Final = 3.0  # without a message or a Heartbeat, until the writer is sent another introduction
 _TRIES: Final = 3  # under one epoch, before the next is tried
 
 
@@ -92,7 +92,7 @@ class AckNackSealer:
     def seal_all(self, acknack: AckNack, now_s: float) -> list[bytes]:
         """Return the frames of a report; to a silent writer also an introduction, in turn under every epoch."""
         frames = [self.seal(acknack)]
-        if now_s - self._silent_s >= _SILENT_S:
+        if now_s - self._silent_s >= READER.lease_s / 2:
             self._silent_s = now_s
             epoch = self._epoch_to_try()
             frames += self._introduction(epoch)

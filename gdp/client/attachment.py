@@ -18,6 +18,7 @@ from typing import Final
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello_port import ANSWER_S
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
@@ -35,6 +36,8 @@ from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
+from gdp.intervals import SoftState, renew_after_s
+from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
@@ -49,17 +52,11 @@ __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
 _ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
 _RENEWAL_AGAIN: Final = 1 / 12  # of a lease, until a renewal is acknowledged; the pause doubles, up to a third
-# delay of other advertisements after the node's own; without a RIB they are valid on this switch only
-_OWN_FIRST_S: Final = 0.5
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
-_ECHO_S: Final = 0.02  # the hello protocol answers a new session within this time
 _IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnation may prove ended at any moment
 _IN_USE_S: Final = 2.0  # ... and after this time with this interval
-_RTCERT_S: Final = 7_200
-_RTCERT_RENEW_S: Final = 1_800  # so that it is valid at clocks that are an hour ahead, too
+_RTCERT: Final = SoftState(1_800, periods=4)  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
-# its begin is dated back by this: CLOCK_EARLY_S is for one clock, this is for the other
-_RTCERT_BEFORE_S: Final = 4_500
 
 
 @dataclass(slots=True, kw_only=True)
@@ -117,7 +114,7 @@ class Attachment:
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
         first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * settings.lease_s)
-        self._renewals = Backoff(first_s, settings.lease_s / 3)
+        self._renewals = Backoff(first_s, renew_after_s(settings.lease_s))
         self._sequence = settings.first_sequence
         self.started = settings.first_sequence
         self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
@@ -376,11 +373,12 @@ class Attachment:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
             # frames before our echo are dropped
-            advertisement_at_s = echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s
+            advertisement_at_s = echo_at_s if echo_at_s <= now_s + ANSWER_S else now_s
             for each in self._advertisements.values():
                 # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
-                # first.
-                at_s = advertisement_at_s if each.right is Right.ATTACH else advertisement_at_s + _OWN_FIRST_S
+                # first. Without a RIB the others are valid on this switch only.
+                is_own = each.right is Right.ATTACH
+                at_s = advertisement_at_s if is_own else advertisement_at_s + _ADVERTISEMENT_AGAIN_S
                 each.advertisement_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
                 each.joins.clear()
 
@@ -407,9 +405,11 @@ class Attachment:
         rtcert, until_s = self._rtcerts.get(switch, (b"", float("-inf")))
         if self._now.mono_s >= until_s:
             unix_s = int(self._now.unix_s)
-            rtcert = RtCert.make(self._identity, switch, Validity(unix_s - _RTCERT_BEFORE_S, unix_s + _RTCERT_S))
+            # dated back: the tolerance of a certificate's begin is for one clock, this is for the other
+            begin_unix_s = unix_s - int(CLOCK_SKEW_S + _RTCERT.refresh_s / 2)
+            rtcert = RtCert.make(self._identity, switch, Validity(begin_unix_s, unix_s + int(_RTCERT.lease_s)))
             self._rtcerts.pop(switch, None)
-            self._rtcerts[switch] = rtcert, self._now.mono_s + _RTCERT_RENEW_S
+            self._rtcerts[switch] = rtcert, self._now.mono_s + _RTCERT.refresh_s
             if len(self._rtcerts) > _RTCERTS_MAX:
                 del self._rtcerts[next(iter(self._rtcerts))]
         return rtcert
@@ -456,7 +456,7 @@ class Attachment:
     def _apply_ack(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
         if ack.refused is None:
             if not each.is_taken or ack.sequence >= each.sent_sequence:
-                each.advertisement_at_s, each.renewals = now_s + self._lease_s / 3, 0
+                each.advertisement_at_s, each.renewals = now_s + renew_after_s(self._lease_s), 0
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:
                 for other in self._advertisements.values():
@@ -477,7 +477,7 @@ class Attachment:
         else:
             each.refused = ack.refused
             # it may be accepted later; frequent repetition does not help
-            each.advertisement_at_s = now_s + self._lease_s / 3
+            each.advertisement_at_s = now_s + renew_after_s(self._lease_s)
 
     def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
         if neighbour is self.switch:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from typing import Final
 
+from gdp.intervals import READER
+from gdp.limits import REPORT_DELAY_S
 from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
 
 __all__ = ["HeartbeatSchedule"]
 
-_GAP_S: Final = 0.02  # between two
 _BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
-_REMINDER_MAX_S: Final = 1.0
 _PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each sending of a new description but the last
 _NEVER: Final = float("inf")
 
@@ -90,6 +90,6 @@ class HeartbeatSchedule:
         self.starts.clear()
         self.wanted = self.is_reminder_wanted = False
         self.number += 1
-        self._at_s = now_s + max(_GAP_S, len(wire) / _BYTES_PER_S)
-        self._remind_s = max(self._at_s, now_s + min(trip_s, _REMINDER_MAX_S))
+        self._at_s = now_s + max(REPORT_DELAY_S, len(wire) / _BYTES_PER_S)
+        self._remind_s = max(self._at_s, now_s + min(trip_s, READER.refresh_s))
         return wire

@@ -16,24 +16,23 @@ from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import Flight
 from gdp.congestion.path_model import FIRST_RTT_S
 from gdp.congestion.states import State
+from gdp.intervals import FORGET_S, PACE_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
+from gdp.requests import Backoff
 
 __all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
 
 BURST_S: Final = 0.001  # frames of this time leave at once: a timer for each frame would cost more than it smooths
-_TIMEOUT_LEAST_S: Final = 0.3
+_TIMEOUTS: Final = Backoff(0.3, 4.0)
 _TIMEOUT_TRIPS: Final = 4.0
-_TIMEOUT_MOST_S: Final = 4.0
 _DOUBLINGS_MAX: Final = 3
 _PROBE_TRIPS, _PROBE_LEAST_S = 2.0, 0.1
 _LATE_TRIPS, _LATE_LEAST_S = 4.0, 0.1  # RFC 8985, section 6.2; reports of one topic may come so much after another's
-_SCAN_S: Final = 0.1
 _BEHIND_S: Final = 0.1  # a reader reports 20 ms after a frame came
 _BEHIND_REPORTS: Final = 2
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
 _MESSAGE_FRAMES: Final = 100  # of a large message, one loss among which costs a round trip
-_FORGET_S: Final = 60.0
 _NEVER: Final = float("inf")
 _UNLIMITED: Final = 1 << 30
 
@@ -205,8 +204,8 @@ class ReaderPath:
         """
         if not self.controller.rate.inflight:
             return
-        timeout_s = max(_TIMEOUT_TRIPS * self._trip_s, _TIMEOUT_LEAST_S) * 2 ** min(self._timeouts, _DOUBLINGS_MAX)
-        timeout_s = min(timeout_s, _TIMEOUT_MOST_S)
+        timeout_s = _TIMEOUTS.bounded_s(_TIMEOUT_TRIPS * self._trip_s) * 2 ** min(self._timeouts, _DOUBLINGS_MAX)
+        timeout_s = min(timeout_s, _TIMEOUTS.most_s)
         if now_s - self._confirmed_s >= timeout_s:
             self._timeouts += 1
             self.controller.timed_out(now_s)
@@ -222,7 +221,7 @@ class ReaderPath:
 
     def is_unused(self, now_s: float) -> bool:
         """Return whether nothing was confirmed for so long that the path need not be remembered."""
-        return not self.controller.rate.inflight and now_s - self._confirmed_s > _FORGET_S
+        return not self.controller.rate.inflight and now_s - self._confirmed_s > FORGET_S
 
 
 class ReaderPaths:
@@ -243,7 +242,7 @@ class ReaderPaths:
         if path is None:
             path = self._paths[reader] = ReaderPath(self._mtu, now_s)
         if self._scan_s is None:
-            self._scan_s = now_s + _SCAN_S
+            self._scan_s = now_s + PACE_S
         return path
 
     def get(self, reader: bytes) -> ReaderPath | None:
@@ -321,7 +320,7 @@ class ReaderPaths:
             if path.is_unused(now_s):
                 del self._paths[reader]
                 self._started.pop(reader, None)
-        self._scan_s = now_s + _SCAN_S if any(path.controller.rate.inflight for path in self._paths.values()) else None
+        self._scan_s = now_s + PACE_S if any(path.controller.rate.inflight for path in self._paths.values()) else None
         return timed_out or before != sum(path.is_silent for path in self._paths.values())
 
     def get_timer(self) -> float | None:

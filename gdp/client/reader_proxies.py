@@ -5,8 +5,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RTPS 2.5, sect
 A report opens under a key that depends on its reader's introduction, so no other node can change what a reader has
 confirmed.
 
-A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It does not count as a reader until it
-reports again, and is forgotten ``READER_GRACE_S`` later.
+A reader that is silent for ``READER.lease_s`` is suspended: it may have moved. It does not count as a reader until it
+reports again, and is forgotten ``FORGET_S`` later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.limits import CALL_IDLE_S, CALL_LAG_S, CALL_QUIET_S, READER_GRACE_S, READER_LEASE_S, REPORT_IDLE_S
+from gdp.intervals import FORGET_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart
 from gdp.names import Name
@@ -50,9 +50,9 @@ class ReaderTimeouts(NamedTuple):
     fastest_governs: bool = False
 
 
-TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
+TOPICS: Final = ReaderTimeouts(READER.lease_s, READER.lease_s, READER.refresh_s)
 # other replicas must not wait for a dead one
-CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S, fastest_governs=True)
+CALLS: Final = ReaderTimeouts(READER.refresh_s, SERVER.lease_s, SERVER.refresh_s, fastest_governs=True)
 _NEVER: Final = float("inf")
 
 
@@ -162,15 +162,15 @@ class ReaderProxies:
         return [*self.active.values(), *self._suspended.values()]
 
     def silent(self, now_s: float) -> list[bytes]:
-        """Return those that have not been heard for ``READER_LEASE_S``."""
-        return [name for name, reading in self.active.items() if now_s - reading.heard_s > READER_LEASE_S]
+        """Return those that have not been heard for ``READER.lease_s``."""
+        return [name for name, reading in self.active.items() if now_s - reading.heard_s > READER.lease_s]
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
         due_s = _NEVER
-        for readers, lease_s in ((self.active, READER_LEASE_S), (self._suspended, _NEVER)):
+        for readers, lease_s in ((self.active, READER.lease_s), (self._suspended, _NEVER)):
             for each in readers.values():
-                behind_s = _NEVER if each.behind_s is None else each.behind_s + READER_GRACE_S
+                behind_s = _NEVER if each.behind_s is None else each.behind_s + FORGET_S
                 heard_s = each.heard_s + lease_s
                 earlier_s = behind_s if behind_s < heard_s else heard_s
                 due_s = earlier_s if earlier_s < due_s else due_s
@@ -195,9 +195,9 @@ class ReaderProxies:
         return True
 
     def overdue(self, now_s: float) -> list[tuple[bytes, ReaderProxy]]:
-        """Return those whose window has been suspended for ``READER_GRACE_S``, and the first of too many."""
+        """Return those whose window has been suspended for ``FORGET_S``, and the first of too many."""
         everyone = [*self.active.items(), *self._suspended.items()]
-        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > READER_GRACE_S]
+        late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > FORGET_S]
         return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
 
     def is_quiet(self, name: bytes, now_s: float) -> bool:

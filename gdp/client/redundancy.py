@@ -23,12 +23,7 @@ __all__ = ["CopyBudget", "Redundancy", "parity_budget", "sends_for"]
 _OFFSETS_S: Final = (0.004, 0.007)  # of the second and the third sending after the first
 _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings leave at most 0.1 % undelivered
 _UNKNOWN: Final = 2  # sendings before anything is measured
-_SHARE: Final = 0.05  # of the path that copies may take
-_BYTES_S: Final = 64_000.0  # ... of a path of unknown rate: a twentieth of 10 Mbit/s
-_PARITY_SHARE: Final = 0.15  # of the path that parity may take
-_PARITY_BYTES_S: Final = 125_000.0  # ... of a path of unknown rate: a tenth of 10 Mbit/s
 _LEAST_BYTES_S: Final = 8_000.0
-_BURST_S: Final = 0.25
 _RATE_CHANGE: Final = 0.1
 _PARTS: Final = slice(PARTS_AT, PARTS_AT + 4)
 
@@ -38,11 +33,11 @@ class CopyBudget:
 
     Args:
         share: of the path.
-        unknown_bytes_s: bytes a second while the rate of the path is not known.
+        unknown_bytes_s: bytes a second while the rate of the path is not known: of copies a twentieth of 10 Mbit/s.
         burst_s: of this time, at once.
     """
 
-    def __init__(self, share: float = _SHARE, unknown_bytes_s: float = _BYTES_S, burst_s: float = _BURST_S) -> None:
+    def __init__(self, share: float = 0.05, unknown_bytes_s: float = 64_000.0, burst_s: float = 0.25) -> None:
         self._share, self._unknown_bytes_s, self._burst_s = share, unknown_bytes_s, burst_s
         self._bytes_s = unknown_bytes_s
         self._bucket = TokenBucket(unknown_bytes_s, unknown_bytes_s * burst_s)
@@ -59,9 +54,10 @@ class CopyBudget:
 def parity_budget() -> CopyBudget:
     """Return the budget of a participant's parity frames: 15 % of the path, and as much as a second gives at once.
 
-    A large message, which is what parity is for, has all of it at its end.
+    Of a path of unknown rate it is a tenth of 10 Mbit/s. A large message, which is what parity is for, has all of it at
+    its end.
     """
-    return CopyBudget(_PARITY_SHARE, _PARITY_BYTES_S, burst_s=1.0)
+    return CopyBudget(0.15, 125_000.0, burst_s=1.0)
 
 
 def sends_for(loss: float | None) -> int:

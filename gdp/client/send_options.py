@@ -10,10 +10,10 @@ from typing import Final, Literal, TypeAlias, get_args
 
 from gdp.client.reader_proxies import TOPICS, ReaderTimeouts
 from gdp.errors import LocalError
+from gdp.intervals import HOUR_S
 from gdp.limits import WINDOW_BYTES
 
 __all__ = [
-    "DEADLINE_MAX_S",
     "DEFAULT_OPTIONS",
     "HISTORY_BYTES_MAX",
     "HISTORY_MESSAGES_MAX",
@@ -36,7 +36,6 @@ PRIORITIES: Final[tuple[Priority, ...]] = get_args(Priority)  # first what leave
 _STRICT: Final = 2
 _WEIGHTS: Final[dict[Priority, int]] = {"high": 16, "normal": 8, "low": 4, "bulk": 2, "background": 1}
 
-DEADLINE_MAX_S: Final = 3_600.0
 WEIGHT_MAX: Final = 100
 HISTORY_MESSAGES_MAX: Final = 100_000
 HISTORY_BYTES_MAX: Final = WINDOW_BYTES
@@ -126,8 +125,8 @@ def checked(options: SendOptions) -> SendOptions:
         LocalError: one of them is out of bounds.
     """
     deadline_s, weight, max_bits_s = options.deadline_s, options.weight, options.max_bits_s
-    if deadline_s is not None and not 0 < deadline_s <= DEADLINE_MAX_S:
-        raise LocalError(f"deadline_s is above 0 and at most {DEADLINE_MAX_S:g} s, not {deadline_s!r}")
+    if deadline_s is not None and not 0 < deadline_s <= HOUR_S:
+        raise LocalError(f"deadline_s is above 0 and at most {HOUR_S:g} s, not {deadline_s!r}")
     if not isinstance(weight, int) or not 1 <= weight <= WEIGHT_MAX:
         raise LocalError(f"weight is a whole number from 1 to {WEIGHT_MAX}, not {weight!r}")
     if max_bits_s is not None and not RATE_MIN_BITS_S <= max_bits_s <= RATE_MAX_BITS_S:

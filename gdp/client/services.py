@@ -6,7 +6,6 @@ Sans-I/O. A server's responses to one client, and a client's requests to one ser
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from typing import Final
 
 from gdp.client.publications import Publications
 from gdp.client.reader_proxies import ReaderProxies
@@ -14,14 +13,13 @@ from gdp.client.request_streams import RequestStreams
 from gdp.client.subscription import Subscriptions
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import LocalError
-from gdp.limits import HELLO_S
+from gdp.intervals import NEIGHBOUR
 from gdp.names import Name
 from gdp.trust.right import Right
 
 __all__ = ["Services", "StallClock"]
 
 # a participant that is called later than this, although hellos are due, was not scheduled
-_STALL_S: Final = 2 * HELLO_S
 
 
 class StallClock:
@@ -32,7 +30,7 @@ class StallClock:
 
     def advance(self, now_s: float) -> None:
         """Set the time; after a stall, frames that the peers sent meanwhile are still to be processed."""
-        if now_s - self.now_s > _STALL_S:
+        if now_s - self.now_s > 2 * NEIGHBOUR.refresh_s:
             self.awake_s = now_s
         self.now_s = now_s
 
@@ -85,7 +83,7 @@ class Services:
     def peers(self, service: Name) -> list[Name]:
         """Return the servers of a name called here, or the clients of one served here, that are connected and keep up.
 
-        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is excluded until it confirms again.
+        A server that falls behind the others, or is silent for ``SERVER.lease_s``, is excluded until it confirms again.
         """
         publisher = self._publications.get(service)
         if publisher is None:

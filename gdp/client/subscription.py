@@ -23,7 +23,7 @@ from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.control.query import Response
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
-from gdp.limits import CALL_IDLE_S
+from gdp.intervals import SERVER
 from gdp.message.loss import Losses, LossReason, LostRange
 from gdp.message.reassembly import VerifiesDigest
 from gdp.names import Name
@@ -319,7 +319,7 @@ class Subscriptions:
         subscription.writer_proxies[party] = writer_proxy
         subscription.set_advertisement(writer_proxy, advertisement)
         if subscription.right is Right.SERVE:
-            writer_proxy.schedule.idle_s = CALL_IDLE_S
+            writer_proxy.schedule.idle_s = SERVER.refresh_s
         if subscription.right is not Right.READ:
             stream = self._stream_from(subscription, writer_proxy)
             verifier = None if subscription.has_session(writer_proxy) else advertisement.member.key

@@ -30,12 +30,12 @@ from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.crypto.session_seal import session_secret
 from gdp.errors import DropReason
 from gdp.frame.codec import Header
+from gdp.intervals import FORGET_S
 from gdp.limits import MTU_MIN_BYTES, PRIVATE_WAIT_BYTES
 from gdp.message.reassembly import VerifiesDigest
 from gdp.names import Name
 
 __all__ = [
-    "IDLE_S",
     "Party",
     "PeerIncarnation",
     "UnicastReceiver",
@@ -44,9 +44,7 @@ __all__ = [
     "private_name",
 ]
 
-IDLE_S: Final = 60.0  # without a reader and a message, after which a stream is forgotten
 # A second path by which frames of the reader came is taken to lead back to it for this time. It may be silent for long.
-_SECOND_PATH_S: Final = 60.0
 _SIGNED: Final = b"gdp-private-1"
 _SESSION: Final = b"gdp-private-session-1"
 
@@ -137,7 +135,7 @@ class UnicastStream(Publisher):
 
     def note_second_path(self, came_s: float) -> None:
         """Note when a frame of the reader last came by a second path: copies to it go up the same tree."""
-        self.governing_paths.second_until_s = came_s + _SECOND_PATH_S
+        self.governing_paths.second_until_s = came_s + FORGET_S
 
     def mark_in_use(self, now_s: float) -> None:
         """Note that the stream is in use; a silent reader becomes active."""
@@ -158,7 +156,7 @@ class UnicastStream(Publisher):
 
     def is_idle(self, now_s: float) -> bool:
         """Return whether it may be forgotten."""
-        return not self.readers and now_s - self._touched_s >= IDLE_S
+        return not self.readers and now_s - self._touched_s >= FORGET_S
 
 
 class UnicastReceiver(WriterProxy):

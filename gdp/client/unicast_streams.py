@@ -15,8 +15,9 @@ from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.send_options import RELIABLE, PublisherSettings
 from gdp.client.sequence_numbers import SequenceRegistry
-from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, UnicastStream, private_name
+from gdp.client.unicast_stream import Party, PeerIncarnation, UnicastStream, private_name
 from gdp.errors import DropReason, LocalError
+from gdp.intervals import FORGET_S
 from gdp.message.loss import LossReason
 from gdp.names import Name
 
@@ -125,9 +126,9 @@ class UnicastStreams:
             self._losses += stream.losses.counts
 
     def forget_idle(self, now_s: float) -> None:
-        """Drop streams that have been idle for ``IDLE_S``."""
+        """Drop streams that had neither a reader nor a message for ``FORGET_S``."""
         if now_s >= self._look_at_s:
-            self._look_at_s = now_s + IDLE_S / 4
+            self._look_at_s = now_s + FORGET_S / 4
             for reader in [stream.reader for stream in self if stream.is_idle(now_s)]:
                 self.forget(reader)
 

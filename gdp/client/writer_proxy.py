@@ -31,12 +31,12 @@ from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
 from gdp.frame.kinds import Flag, Kind
+from gdp.intervals import READER
 from gdp.limits import (
     NACKS_PER_REPORT,
     NUMBER_MAX,
     REPLAY_WINDOW_MESSAGES,
     REPORT_DELAY_S,
-    REPORT_IDLE_S,
     SEQUENCE_BYTES,
     SPREAD,
     STRIPES_FROM_PARTS,
@@ -138,7 +138,7 @@ class WriterProxy:
             self.state = WriterProxyState.LIVE
             self._set_reliable(_WAITING)
             self.delivery.begin_at(max(before.number, 1), max(before.sequence, 1))
-            self.schedule.due_s = now_s + REPORT_IDLE_S
+            self.schedule.due_s = now_s + READER.refresh_s
 
     @property
     def paths(self) -> int:

@@ -44,21 +44,22 @@ from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port
-from gdp.limits import (
-    ADVERTISEMENT_LEASE_S,
-    COST_AUTO,
-    COST_DEFAULT,
-    DEAD_S,
+from gdp.intervals import (
+    ADVERTISEMENT,
     DETECT_MULTIPLIER,
-    HELLO_S,
     KEEPALIVE_MS,
     LEASE_MAX_S,
     LEASE_MIN_S,
+    NEIGHBOUR,
+    SCAPY_KEEPALIVE_MS,
+)
+from gdp.limits import (
+    COST_AUTO,
+    COST_DEFAULT,
     RELAY_RATE_MAX,
     RELAY_RATE_MIN,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
-    SCAPY_KEEPALIVE_MS,
     TABLE_MAX,
 )
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT
@@ -194,15 +195,15 @@ class SwitchConfig(Section):
     metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
     audit: AuditFolder = None
     token_folders: TokenFolders = ()
-    hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0, description="Seconds between hellos.")
+    hello_s: float = Field(default=NEIGHBOUR.refresh_s, ge=0.01, le=60.0, description="Seconds between hellos.")
     dead_s: float = Field(
-        default=DEAD_S,
+        default=NEIGHBOUR.lease_s,
         ge=0.02,
         le=600.0,
         description="Silence that ends a neighbour without keepalives; at least twice `hello_s`.",
     )
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S, description="Lease of its watches, seconds; renewed after a quarter."
+        default=ADVERTISEMENT.lease_s, description="Lease of its watches, seconds; renewed after a quarter."
     )
     keepalive_ms: KeepaliveMs | None = Field(
         default=None, description="0: none. `null`: 70, or 500 with `scapy`. The slower end decides."
@@ -256,7 +257,7 @@ class SwitchConfig(Section):
     @field_validator("dead_s")
     @classmethod
     def _neighbours_outlive_a_lost_hello(cls, dead_s: float, info: object) -> float:
-        hello_s = getattr(info, "data", {}).get("hello_s", HELLO_S)
+        hello_s = getattr(info, "data", {}).get("hello_s", NEIGHBOUR.refresh_s)
         if dead_s < 2 * hello_s:
             raise ValueError(f"at least twice hello_s ({hello_s:g}), so that one lost hello loses no neighbour")
         return dead_s
@@ -327,7 +328,7 @@ class RibConfig(Section):
     )
     allow_unowned: bool = Field(default=False, description="Any member may advertise names without an owner.")
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S, description="Lease of its advertisement, seconds; renewed after a third."
+        default=ADVERTISEMENT.lease_s, description="Lease of its advertisement, seconds; renewed after a third."
     )
     store: Literal["memory"] | SharedStore = Field(default="memory", description="Where routes are kept.")
     snapshot: NewFile | None = Field(

@@ -23,6 +23,7 @@ from typing import Final
 
 from gdp.control.hello import COOKIE_BYTES, NONCE_BYTES, Hello
 from gdp.errors import DropReason, FrameError, StatementError
+from gdp.intervals import Rate
 from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["Admission", "Cookies", "cookie_payload", "read_cookie", "seal_cookie"]
@@ -34,12 +35,13 @@ _SECRET_S: Final = 120.0
 _PURPOSE: Final = b"gdp-cookie-1"
 
 # per second, and burst; a neighbour sends at most four per second after a change
-NEIGHBOUR_HELLOS: Final = (25.0, 50.0)
-ADDRESS_HELLOS: Final = (10.0, 20.0)
-STRANGER_HELLOS: Final = (100.0, 64.0)  # of all strangers on a port; 64 take 30 ms, a seventh of the time to detect
-PROVEN_HELLOS: Final = (50.0, 50.0)  # of strangers with a cookie, in addition to the former
-COOKIES: Final = (100.0, 100.0)
-REFUSALS: Final = (100.0, 200.0)  # a higher rate of refusals is a flood, too
+NEIGHBOUR_HELLOS: Final = Rate(25.0, burst=50.0)
+ADDRESS_HELLOS: Final = Rate(10.0, burst=20.0)
+# of all strangers on a port; 64 take 30 ms, a seventh of the time to detect
+STRANGER_HELLOS: Final = Rate(100.0, burst=64.0)
+PROVEN_HELLOS: Final = Rate(50.0, burst=50.0)  # of strangers with a cookie, in addition to the former
+COOKIES: Final = Rate(100.0, burst=100.0)
+REFUSALS: Final = Rate(100.0, burst=200.0)  # a higher rate of refusals is a flood, too
 _LOADED_S: Final = 10.0  # after the strangers' bucket became empty
 _ADDRESSES_MAX: Final = 256
 

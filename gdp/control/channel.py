@@ -29,6 +29,7 @@ from gdp.crypto.records import RecordKey
 from gdp.crypto.schema import NAME, OCTETS, Body, Keyed, octets
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, StatementError
+from gdp.intervals import HOUR_S, Rate
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
@@ -51,13 +52,12 @@ _OFFERS: Final = Backoff(0.1, 0.8)  # of an OPEN
 _OFFER_TRIES: Final = 4  # then the channel waits for news of the peer
 _WAITING_MAX: Final = 256  # statements that wait for a channel
 _WAITING_S: Final = 1.0  # by then the sender repeats a statement itself
-_RENEW_S: Final = 3_600.0
 _REOPEN_S: Final = 0.3  # minimum time between two reactions to a hint
 _CHANNELS_PER_PEER: Final = 2  # in use: the newest, and the one before
 _OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
 _PEERS_MAX: Final = 8_192
-_OFFERS_PER_S: Final = 20.0  # accepted of one peer
-_HINTS_PER_S: Final = 100.0
+_OFFERS_RATE: Final = Rate(20.0, burst=20.0)  # accepted of one peer
+_HINTS_RATE: Final = Rate(100.0, burst=100.0)
 _PEER_ROLES: Final = (Role.SWITCH, Role.LEAF, Role.RIB)
 
 
@@ -147,7 +147,7 @@ class _Asker:
 
     channels: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)
     offers: OrderedDict[bytes, _Channel] = field(default_factory=OrderedDict)  # by fingerprint of the OPEN
-    pace: TokenBucket = field(default_factory=lambda: TokenBucket(_OFFERS_PER_S, _OFFERS_PER_S))
+    pace: TokenBucket = field(default_factory=lambda: TokenBucket(*_OFFERS_RATE))
 
 
 class Channels:
@@ -167,7 +167,7 @@ class Channels:
         self._asked: dict[Name, _Asked] = {}
         self._offers = Requests[Name]()  # ours, by peer
         self._askers: OrderedDict[Name, _Asker] = OrderedDict()
-        self._hints = TokenBucket(_HINTS_PER_S, _HINTS_PER_S)
+        self._hints = TokenBucket(*_HINTS_RATE)
         self._out: list[Outgoing] = []
         self.drops: Counter[DropReason] = Counter()
 
@@ -178,7 +178,7 @@ class Channels:
             asked.waiting.append((statement, now_s + _WAITING_S))
             self._open(peer, asked, now_s)
             return
-        if now_s - asked.channel.begun_s >= _RENEW_S:
+        if now_s - asked.channel.begun_s >= HOUR_S:
             self._open(peer, asked, now_s)
         self._out.append(Outgoing(peer, asked.channel.seal(statement)))
 

@@ -21,14 +21,7 @@ from gdp.crypto.statements import Statement, StatementType, check_sequence, pars
 from gdp.errors import DropReason, FrameError, LocalError, StatementError
 from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
 from gdp.frame.kinds import Kind
-from gdp.limits import (
-    DIAGNOSTIC_FRAMES_BURST,
-    DIAGNOSTIC_FRAMES_PER_S,
-    DIAGNOSTIC_WAIT_S,
-    DIAGNOSTICS_BURST,
-    DIAGNOSTICS_PER_S,
-    HOPS_MAX,
-)
+from gdp.limits import DIAGNOSTIC_FRAMES_RATE, DIAGNOSTIC_WAIT_S, DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame, Timestamps
@@ -159,8 +152,8 @@ class Diagnostics:
         self._waiting: list[_Asked] = []
         self._peers = Lru[_Peer](_PEERS_MAX)
         self._knows_us: OrderedDict[Name, None] = OrderedDict()  # members that have our certificate
-        self._frames = TokenBuckets(DIAGNOSTIC_FRAMES_PER_S, DIAGNOSTIC_FRAMES_BURST)
-        self._requests = TokenBuckets(DIAGNOSTICS_PER_S, DIAGNOSTICS_BURST)
+        self._frames = TokenBuckets(*DIAGNOSTIC_FRAMES_RATE)
+        self._requests = TokenBuckets(*DIAGNOSTICS_RATE)
         self._reassembler = ControlReassembler()
         self._drops: Counter[DropReason] = Counter()
         self.evidence_of: Callable[[Name], Mapping[str, object]] = lambda _: _NO_BODY

@@ -2,7 +2,7 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node states in its hellos when its incarnation began. Of two
 live incarnations of one identity, the older one stays; hellos of the newer one are refused. Both are notified: for
-``_REPORT_INTERVAL_S`` after the last refusal, hellos name both sessions (``Hello.rivals``). A node that finds its own
+``_CLASH_S`` after the last refusal, hellos name both sessions (``Hello.rivals``). A node that finds its own
 session there, but not in ``Hello.heard``, is the refused one.
 """
 
@@ -16,8 +16,7 @@ from gdp.names import Name
 
 __all__ = ["IdentityConflicts"]
 
-_REPORT_INTERVAL_S: Final = 3.0
-_CLASH_S: Final = 3.0  # another node must have our identity for this time
+_CLASH_S: Final = 3.0  # another node must have our identity for this time, and is reported for as long
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _K = TypeVar("_K")
 _V = TypeVar("_V")
@@ -60,7 +59,7 @@ class IdentityConflicts:
         self.refusals += 1
         known = self._refused.get(name)
         self.changes += known is None or known.until_s <= now_s
-        _put(self._refused, name, _Refused(incarnation_id, now_s + _REPORT_INTERVAL_S))
+        _put(self._refused, name, _Refused(incarnation_id, now_s + _CLASH_S))
 
     def accept(self, name: Name, incarnation_id: bytes) -> None:
         """Note that a hello was accepted.
@@ -75,7 +74,7 @@ class IdentityConflicts:
     def schedule_notice(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
         """Schedule the notice of a conflict for a session; return whether it is new for the session."""
         known = self._sessions.get((port, nonce))
-        _put(self._sessions, (port, nonce), _Session(name, now_s + _REPORT_INTERVAL_S))
+        _put(self._sessions, (port, nonce), _Session(name, now_s + _CLASH_S))
         return known is None or known.until_s <= now_s
 
     def on(self, port: int, now_s: float) -> tuple[bytes, ...]:

@@ -15,7 +15,8 @@ from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.schema import NAME, NAME_OR_ZERO, STATEMENT, Body, Keyed, many, mapped, number, octets, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
-from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S, PATHS_MAX
+from gdp.intervals import LEASE_MAX_S
+from gdp.limits import FRAME_MAX_BYTES, PATHS_MAX
 from gdp.names import ZERO, Name
 
 __all__ = ["ROUTE_MAX", "Join", "Route", "RouteLink"]

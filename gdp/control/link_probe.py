@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.control.link_quality import LinkQuality
+from gdp.intervals import SCHEDULED_S
 
 __all__ = ["LinkProbe", "patience_s"]
 
 POLLS_MIN: Final = 3  # two may be lost
 _LEAST_S: Final = 0.05
-_MARGIN_S: Final = 0.02  # for the work of the far end
 _UNMEASURED_S: Final = 0.2
 _VARIATIONS: Final = 4  # RFC 6298, section 2
 _PER_LOSS: Final = 20.0  # twice the time where a twentieth of the frames is lost
@@ -76,5 +76,5 @@ def patience_s(quality: LinkQuality) -> float:
     rtt = quality.rtt
     if rtt.srtt_s is None:
         return _UNMEASURED_S
-    answer_s = max(_LEAST_S, rtt.srtt_s + _VARIATIONS * rtt.rttvar_s + _MARGIN_S)
+    answer_s = max(_LEAST_S, rtt.srtt_s + _VARIATIONS * rtt.rttvar_s + SCHEDULED_S)
     return answer_s * (1 + _PER_LOSS * max(quality.loss_in, quality.loss_out))

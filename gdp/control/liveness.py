@@ -17,16 +17,14 @@ from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.control.settings import NodeSettings
-from gdp.limits import HELLO_IDLE
+from gdp.intervals import HELLO_IDLE, NEVER_S, SCHEDULED_S
 from gdp.names import Name
 
 __all__ = ["LivenessMonitor"]
 
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
-_LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
 _OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
 _UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
-_NEVER_S: Final = float("inf")
 
 
 class LivenessMonitor:
@@ -88,7 +86,7 @@ class LivenessMonitor:
 
     def note_call(self, due_s: float, now_s: float) -> None:
         """Note when this node is called, and when it had requested that."""
-        if float("-inf") < due_s < now_s - _LATE_S:  # a neighbour to remove is due at once: that is no lateness
+        if float("-inf") < due_s < now_s - SCHEDULED_S:  # a neighbour to remove is due at once: that is no lateness
             self._lateness_s += now_s - due_s
             self._slowness.late(now_s - due_s, now_s)
 
@@ -145,7 +143,7 @@ class LivenessMonitor:
 
     def find_next(self) -> float:
         """Return the monotonic second of the next keepalive or loss of a neighbour; infinity: never."""
-        due_s, self.is_probing = _NEVER_S, False
+        due_s, self.is_probing = NEVER_S, False
         for port in self._ports.values():
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self.gone_at_s(neighbour)
@@ -178,7 +176,7 @@ class LivenessMonitor:
         """Return when a probe ends the neighbour: never unless another link has answered since it began."""
         probe = session.probe
         if probe is None:
-            return _NEVER_S
+            return NEVER_S
         for other in self._others(neighbour, of_uplink=probe.is_moved):
             probe.note_other(other.quality.confirmed_s)
         uplink = self.uplinks.get(neighbour.port)

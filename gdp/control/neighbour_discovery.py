@@ -23,20 +23,10 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from gdp.control.admission import (
-    Admission,
-    read_cookie,
-    seal_cookie,
-)
+from gdp.control.admission import Admission, read_cookie, seal_cookie
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import (
-    DIGEST_BYTES,
-    NONCE_BYTES,
-    RTCERTS_MAX,
-    Hello,
-    Timing,
-)
+from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
 from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
@@ -52,7 +42,8 @@ from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import COST_AUTO, HELLO_IDLE, MTU_MIN_BYTES
+from gdp.intervals import HELLO_IDLE, UPKEEP_S
+from gdp.limits import COST_AUTO, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
@@ -60,7 +51,6 @@ from gdp.trust.domain import Policy
 __all__ = ["HelloProtocol"]
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
-_RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalives come
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 _NEVER: Final = float("inf")
 
@@ -372,7 +362,7 @@ class HelloProtocol:
         known = port.neighbours.get(Name(header.source)) if port is not None else None
         if known is None or known.keepalives is None:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a keepalive")
-        if known.member is not None and now.mono_s >= known.checked_s + _RECHECK_S:
+        if known.member is not None and now.mono_s >= known.checked_s + UPKEEP_S:
             self._policy.check_member(known.member, now.unix_s)
             known.checked_s = now.mono_s
         known.digest = known.keepalives.open(header, arrival.frame, now.mono_s, arrival.waited_s)

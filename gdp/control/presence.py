@@ -20,14 +20,13 @@ from typing import Annotated, Final
 
 from gdp.crypto.schema import FLAG, NAME, Body, Keyed, mapped, uint
 from gdp.crypto.statements import StatementType
+from gdp.intervals import REFUSED_S
 from gdp.names import Name
 
 __all__ = ["IdentityChecks", "Presence"]
 
 NO_ANSWER_S: Final = 1.5  # above the time after which a switch gives up a silent neighbour
 _BELIEVED_S: Final = 0.5  # an answer "is there" is valid for this time, before the switch is queried again
-# a refusal from above is valid for this time; a refused node repeats its advertisement more often
-_REFUSED_ABOVE_S: Final = 10.0
 _CHECKS_MAX: Final = 1_024
 _NOT: Final = mapped(FLAG, not_, not_)  # it travels as "is a query"
 
@@ -104,7 +103,7 @@ class IdentityChecks:
         self._refused_upstream.pop(node, None)
         if len(self._refused_upstream) >= _CHECKS_MAX:
             del self._refused_upstream[next(iter(self._refused_upstream))]
-        self._refused_upstream[node] = incarnation, now_s + _REFUSED_ABOVE_S
+        self._refused_upstream[node] = incarnation, now_s + REFUSED_S  # it repeats its advertisement more often
 
     def taken_above(self, node: Name) -> None:
         """Note that the tier above accepts a node's advertisement."""

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 from gdp.crypto.schema import NAME, STATEMENT, Body, Keyed, many, number, octets, or_empty, uint
 from gdp.crypto.statements import StatementType
-from gdp.limits import LEASE_MAX_S
+from gdp.intervals import LEASE_MAX_S
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
 

@@ -19,6 +19,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
 from gdp.exchange.sync_message import SyncMessage
+from gdp.intervals import Rate
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
@@ -28,7 +29,7 @@ __all__ = ["RevocationSync"]
 
 # totals are repeated so that a lost flood is repaired; replies are at most 3 Mbit/s
 _PACE: Final = SyncPace(total_s=30.0, soon_s=0.5, fetch_s=2.0, reply_s=0.08, reply_bytes=32 << 10, draws=2)
-_TAKEN_PER_S, _TAKEN_BURST = 32.0, 256.0  # messages of one neighbour that are verified
+_TAKEN_RATE: Final = Rate(32.0, burst=256.0)  # messages of one neighbour that are verified
 _SESSIONS_MAX: Final = 1_024
 
 Say = Callable[[Neighbour, bytes], None]
@@ -52,7 +53,7 @@ class RevocationSync:
         self._sequence = first_sequence
         self._exchange = AntiEntropy[tuple[int, Name]](revoked.sets, revoked.item_of, _PACE)
         self._neighbours: dict[tuple[int, Name], Neighbour] = {}
-        self._taken = TokenBuckets(_TAKEN_PER_S, _TAKEN_BURST, _SESSIONS_MAX)
+        self._taken = TokenBuckets(*_TAKEN_RATE, _SESSIONS_MAX)
         self._received: dict[tuple[bytes, Name], int] = {}  # by session and name: the highest sequence number
 
     def neighbour_up(self, neighbour: Neighbour, now_s: float) -> None:

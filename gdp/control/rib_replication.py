@@ -10,7 +10,7 @@ from typing import Annotated
 
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, FieldSet, Keyed, many, number, uint
-from gdp.limits import LEASE_MAX_S
+from gdp.intervals import LEASE_MAX_S
 from gdp.names import Name
 
 __all__ = ["Entry", "Key"]

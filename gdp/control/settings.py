@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gdp.control.hello import Timing
-from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, DETECT_MULTIPLIER, HELLO_S, KEEPALIVE_MS
+from gdp.intervals import ADVERTISEMENT, DETECT_MULTIPLIER, KEEPALIVE_MS, NEIGHBOUR
 
 __all__ = ["NodeSettings"]
 
@@ -32,9 +32,9 @@ class NodeSettings:
     incarnation: int
     first_sequence: int
     random_bytes: Callable[[int], bytes]
-    hello_s: float = HELLO_S
-    dead_s: float = DEAD_S
-    lease_s: float = ADVERTISEMENT_LEASE_S
+    hello_s: float = NEIGHBOUR.refresh_s
+    dead_s: float = NEIGHBOUR.lease_s
+    lease_s: float = ADVERTISEMENT.lease_s
     keepalive_ms: int | None = None
     detect_multiplier: int = DETECT_MULTIPLIER
 
@@ -46,5 +46,7 @@ class NodeSettings:
     @property
     def timing(self) -> Timing:
         """Return the keepalive timing that this node requests."""
-        every_ms = round(KEEPALIVE_MS * self.dead_s / DEAD_S) if self.keepalive_ms is None else self.keepalive_ms
+        every_ms = (
+            round(KEEPALIVE_MS * self.dead_s / NEIGHBOUR.lease_s) if self.keepalive_ms is None else self.keepalive_ms
+        )
         return Timing(every_ms, every_ms, self.detect_multiplier)

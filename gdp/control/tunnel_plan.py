@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 from gdp.control.endpoint_record import UPLINKS_MAX, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.names import Name
+from gdp.requests import Backoff
 
 __all__ = [
     "DIAL_S",
-    "REBIND_MAX_S",
-    "REBIND_S",
+    "REBINDS",
     "UNDERLAY_PREFIXES",
     "Dialer",
     "RebindSchedule",
@@ -28,8 +28,7 @@ __all__ = [
 ]
 
 DIAL_S: Final = 1.0  # one candidate is tried for this time before the next one
-REBIND_S: Final = 1.0
-REBIND_MAX_S: Final = 30.0
+REBINDS: Final = Backoff(1.0, 30.0)  # between two other UDP ports of an uplink
 _DIGITS: Final = 11  # IFNAMSIZ - 1 less the prefix
 
 
@@ -117,7 +116,7 @@ class RebindSchedule:
 
     was_up: bool = False
     due_s: float = float("inf")
-    pause_s: float = REBIND_S
+    pause_s: float = REBINDS.first_s
 
     def update(self, now_s: float, *, is_up: bool, is_held: bool = False) -> bool:
         """Take in which tunnels over the uplink are up; return whether to take another port now.
@@ -127,14 +126,14 @@ class RebindSchedule:
             is_held: any other one. If it outlived the borders and is lost later, it has the longest pause to come back.
         """
         if is_up or not self.was_up:
-            self.was_up, self.due_s, self.pause_s = self.was_up or is_up, float("inf"), REBIND_S
+            self.was_up, self.due_s, self.pause_s = self.was_up or is_up, float("inf"), REBINDS.first_s
             return False
         if self.due_s == float("inf"):
             self.due_s = now_s + self.pause_s
-        if is_held and (now_s >= self.due_s or self.pause_s == REBIND_MAX_S):
-            self.pause_s, self.due_s = REBIND_MAX_S, now_s + REBIND_MAX_S
+        if is_held and (now_s >= self.due_s or self.pause_s == REBINDS.most_s):
+            self.pause_s, self.due_s = REBINDS.most_s, now_s + REBINDS.most_s
         if now_s < self.due_s:
             return False
-        self.pause_s = min(2 * self.pause_s, REBIND_MAX_S)
+        self.pause_s = REBINDS.after_s(self.pause_s)
         self.due_s = now_s + self.pause_s
         return True

@@ -17,7 +17,7 @@ from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason
-from gdp.limits import WAIT_REPORT_S
+from gdp.intervals import REPORT_S
 from gdp.names import Name
 
 __all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits", "wait_fact"]
@@ -121,7 +121,7 @@ class WaitLog:
         after_s: how long a node may make no progress before that is reported.
     """
 
-    def __init__(self, after_s: float = WAIT_REPORT_S) -> None:
+    def __init__(self, after_s: float = REPORT_S) -> None:
         self._after_s = after_s
         self._subjects: dict[tuple[object, ...], _Subject] = {}
 

@@ -20,7 +20,8 @@ from typing import Final
 from gdp.crypto.cbor import Value, decode, encode
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import CONTROL_MAX_BYTES, SEQUENCE_AHEAD_S
+from gdp.intervals import DAY_S
+from gdp.limits import CONTROL_MAX_BYTES
 from gdp.names import NAME_BYTES, Name
 
 __all__ = ["Statement", "StatementType", "Value", "assemble", "check_sequence", "parse", "sign"]
@@ -171,7 +172,7 @@ def check_sequence(sequence: int, unix_s: float) -> None:
     Raises:
         StatementError: MALFORMED.
     """
-    if sequence > (unix_s + SEQUENCE_AHEAD_S) * 1_000:
+    if sequence > (unix_s + 366 * DAY_S) * 1_000:
         raise StatementError(DropReason.MALFORMED, "a sequence number of the far future")
 
 

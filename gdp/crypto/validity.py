@@ -1,7 +1,7 @@
 """Validity period: the one time check for certificates and delegations.
 
 Sans-I/O. Clocks of honest machines differ. An expired certificate is accepted for ``CLOCK_SKEW_S`` more. A future one
-is accepted ``CLOCK_EARLY_S`` before its start. The start keeps no certificate holder out, and a machine whose clock was
+is accepted ``CLOCK_SKEW_S`` before its start. The start keeps no certificate holder out, and a machine whose clock was
 set back must not lose the certificates of the last hour.
 """
 
@@ -12,7 +12,7 @@ from typing import Final
 
 from gdp.crypto.schema import Keyed, Spread, uint
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import CLOCK_EARLY_S, CLOCK_SKEW_S
+from gdp.limits import CLOCK_SKEW_S
 
 __all__ = ["VALIDITY", "Validity"]
 
@@ -43,7 +43,7 @@ class Validity:
         """
         if unix_s > self.not_after_unix_s + CLOCK_SKEW_S:
             raise StatementError(DropReason.EXPIRED, what)
-        if unix_s < self.not_before_unix_s - CLOCK_EARLY_S:
+        if unix_s < self.not_before_unix_s - CLOCK_SKEW_S:
             raise StatementError(DropReason.EXPIRED, f"{what}: not valid yet")
 
 

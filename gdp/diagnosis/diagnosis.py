@@ -12,10 +12,10 @@ from gdp.diagnosis import name_rules, network_rules, right_rules, stream_rules
 from gdp.diagnosis.answer import Answer, Cause
 from gdp.diagnosis.facts import Facts
 from gdp.diagnosis.view import Rule, View
+from gdp.intervals import REPORT_S
 
-__all__ = ["RULES", "SETTLE_S", "diagnose"]
+__all__ = ["RULES", "diagnose"]
 
-SETTLE_S: Final = 5.0  # a node or flow that is younger may still be finding its way
 
 _RULES: Final = network_rules.RULES | name_rules.RULES | right_rules.RULES | stream_rules.RULES
 RULES: Final[Mapping[Cause, Rule]] = {cause: _RULES[cause] for cause in Cause if cause in _RULES}
@@ -60,11 +60,11 @@ def diagnose(facts: Facts) -> Answer:
 def _is_fresh(view: View) -> bool:
     ages_s = [each.uptime_s for each in view.facts.proxies]
     ages_s += [each.flow.age_s for each in view.ends if each.flow.is_carried]
-    return any(age_s < SETTLE_S for age_s in ages_s)
+    return any(age_s < REPORT_S for age_s in ages_s)
 
 
 def _starting(view: View, unknown: tuple[str, ...]) -> Answer:
-    text = f"It began less than {SETTLE_S:g} s ago and is still finding its way; ask again then."
+    text = f"It began less than {REPORT_S:g} s ago and is still finding its way; ask again then."
     return Answer(Cause.STARTING, text, f"gdp explain {view.facts.asked}", unknown)
 
 

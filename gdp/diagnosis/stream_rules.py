@@ -11,12 +11,12 @@ from typing import Final
 
 from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.view import Found, Rule, View, short
+from gdp.intervals import REPORT_S
 
 __all__ = ["RULES"]
 
 _CHECK: Final = "gdp-proxy --config proxy.yaml --check"
 _RELOAD: Final = "gdp reload NODE_DIR"
-_SILENT_S: Final = 5.0  # a publisher without a message for so long, from the start on, is silent
 
 
 def arrives(view: View) -> Iterator[Found]:
@@ -226,7 +226,7 @@ def publisher_silent(view: View) -> Iterator[Found]:
     """A publisher exists, and has published nothing since the proxy began."""
     for end in view.exporters:
         flow = end.flow
-        if flow.kind == "topic" and flow.nodes and flow.is_carried and flow.idle_s is None and flow.age_s > _SILENT_S:
+        if flow.kind == "topic" and flow.nodes and flow.is_carried and flow.idle_s is None and flow.age_s > REPORT_S:
             text = (
                 f"A node {end.place} has a publisher of {flow.local}, but has published nothing for {flow.age_s:.0f} s."
             )

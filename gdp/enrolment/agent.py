@@ -31,6 +31,7 @@ from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE, record_file_name, update_relays
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
+from gdp.intervals import RELOAD_S
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
@@ -73,7 +74,6 @@ POLL_S: Final = 45.0
 _BACKOFF: Final = Backoff(1.0, 60.0)
 _REFUSED_S: Final = 300.0  # after a refusal, which rarely changes by itself
 _RENEW_SHARE: Final = 2 / 3
-_RELOAD_S: Final = 5.0
 
 MailHandler = Callable[[MemberFiles, ReceivedMail], None]
 
@@ -142,7 +142,7 @@ class Agent:
                 while not self._ended.is_set():
                     self._renew(channel)
                     request = {"op": "poll", "digest": digest, "wait_s": self._poll_s if digest else 0.0}
-                    answer = channel.request(request, timeout_s=self._poll_s + _RELOAD_S)
+                    answer = channel.request(request, timeout_s=self._poll_s + RELOAD_S)
                     if (current := Keyed("digest", OCTETS).read(answer)) != digest:
                         self._take_news(DomainNews.from_fields(answer))
                         digest = current
@@ -211,7 +211,7 @@ class Agent:
         path = self._files.directory / RELAY_FILE
         with contextlib.suppress(NotRunningError):
             config = RelayConfig.load(path)
-            ask_node(relay_control_path(config, load_card(config.identity / CARD).name), Command.DRAIN, _RELOAD_S)
+            ask_node(relay_control_path(config, load_card(config.identity / CARD).name), Command.DRAIN, RELOAD_S)
 
     def _take_mail(self, channel: Channel) -> None:
         fetch_mail(channel, self._files.inbox)
@@ -265,7 +265,7 @@ class Agent:
 def reload_node(node: Path) -> None:
     """Make a running node read its files again; one that does not run reads them at its start."""
     with contextlib.suppress(NotRunningError):
-        response = ask_node(find_control_socket(node), Command.RELOAD, _RELOAD_S)
+        response = ask_node(find_control_socket(node), Command.RELOAD, RELOAD_S)
         if not response.is_ok:
             log.error("node not reloaded node=%s reason=%s", node.name, response.error)
 

@@ -20,6 +20,7 @@ from gdp.crypto.schema import FLAG, Keyed, text
 from gdp.crypto.server_certificate import channel_binding, verify_server_certificate
 from gdp.errors import StatementError
 from gdp.host_port import split_host_port
+from gdp.intervals import HOUR_S, TRY_S
 from gdp.management.control_socket import connect_control
 from gdp.relay.client_hello import ENROLMENT_ALPN
 from gdp.trust.enrolment_wire import (
@@ -43,9 +44,7 @@ from gdp.trust.join_token import fingerprint_of
 __all__ = ["CONNECT_S", "Channel", "client_context", "connect", "connect_any"]
 
 CONNECT_S: Final = 10.0
-_TRY_S: Final = 3.0  # for a server that others follow: a firewall may let only one of their ports through
 _GREETING_MAX_BYTES: Final = 64 << 10
-_HOUR_S: Final = 3_600.0
 
 
 def client_context() -> ssl.SSLContext:
@@ -134,7 +133,7 @@ def connect_any(servers: Sequence[str], fingerprint: bytes, *, timeout_s: float 
     reasons = []
     for number, each in enumerate(servers, 1):
         try:
-            wait_s = timeout_s if number == len(servers) else min(timeout_s, _TRY_S)
+            wait_s = timeout_s if number == len(servers) else min(timeout_s, TRY_S)
             return connect(each, fingerprint, timeout_s=wait_s)
         except UnreachableError as error:
             reasons.append(str(error))
@@ -191,7 +190,7 @@ def _verified(
         )
     apart_s = unix_s - greeting.unix_s
     if abs(apart_s) > CLOCKS_APART_MAX_S:
-        amount = f"{abs(apart_s) / _HOUR_S:.1f} hours {'ahead of' if apart_s > 0 else 'behind'}"
+        amount = f"{abs(apart_s) / HOUR_S:.1f} hours {'ahead of' if apart_s > 0 else 'behind'}"
         raise EnrolmentError(None, f"this machine's clock is {amount} the server's: set the clock, then try again")
     try:
         verify_server_certificate(certificate, root, unix_s)

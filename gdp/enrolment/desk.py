@@ -29,11 +29,12 @@ from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
 from gdp.enrolment.registry import MachineRow, Plan, Registry, TokenRow
 from gdp.errors import LocalError, RemoteError, StatementError, StoreError
+from gdp.intervals import DAY_S, HOUR_S
 from gdp.links.endpoint_files import own_record, public_candidates
 from gdp.names import Name
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import DAY_S, admit, delegate, renew
+from gdp.stores.issue import admit, delegate, renew
 from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.audit import Action, AuditTrail
@@ -69,7 +70,6 @@ __all__ = ["OPENED_MAX", "EnrolmentDesk", "MemberConnection", "refusal_of"]
 log = logging.getLogger(__name__)
 
 OPENED_MAX: Final = 64  # requests per token, an hour, whose keys are verified; a machine needs one, or a few
-_HOUR_S: Final = 3_600.0
 _PROOF_BYTES: Final = 32
 _EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
 _WHAT: Final = "enrolment"
@@ -121,7 +121,7 @@ class EnrolmentDesk:
         self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
         self._border_certificate = b""
-        self._opened = TokenBuckets(OPENED_MAX / _HOUR_S, OPENED_MAX)  # requests, by the id of their token
+        self._opened = TokenBuckets(OPENED_MAX / HOUR_S, OPENED_MAX)  # requests, by the id of their token
 
     @property
     def root(self) -> Root:

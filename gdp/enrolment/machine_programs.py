@@ -15,11 +15,11 @@ from gdp.config.yaml_source import read_yaml
 from gdp.enrolment.member_files import MEMBER_FILE, MemberFiles
 from gdp.enrolment.programs import MachineProgram, node_program, programs_of
 from gdp.errors import LocalError
+from gdp.intervals import SERVER_S
 
 __all__ = ["FOG_FILE", "Machine", "check_program", "configured_identity", "read_machine"]
 
 FOG_FILE: Final = "fog.yaml"
-_CHECK_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ def check_program(program: MachineProgram) -> None:
         return
     argv = [*program.argv[: program.argv.index("--config") + 2], "--check"]
     try:
-        done = subprocess.run(argv, cwd="/", capture_output=True, text=True, timeout=_CHECK_S, check=False)
+        done = subprocess.run(argv, cwd="/", capture_output=True, text=True, timeout=SERVER_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise LocalError(f"{program.name}: its configuration cannot be checked: {error}") from error
     if done.returncode != 0:

@@ -17,6 +17,7 @@ from typing import Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StoreError
+from gdp.intervals import DAY_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.files import write_all
@@ -31,8 +32,6 @@ MAILBOX_MAX_BYTES: Final = 4 << 20
 _SENDER_MAX: Final = MAILBOX_MAX // 4  # of them, by the nodes of one machine
 _SENDER_MAX_BYTES: Final = MAILBOX_MAX_BYTES // 4
 _FILE: Final = "registry.sqlite3"
-_DAY_S: Final = 86_400.0
-_TOKEN_KEPT_S: Final = 30 * _DAY_S  # after its end, so that its refusal can say why
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS tokens (
   id BLOB PRIMARY KEY, mac BLOB NOT NULL, role TEXT NOT NULL, label TEXT NOT NULL,
@@ -189,7 +188,7 @@ class Registry(TransactionFile):
             file.execute("DELETE FROM plans WHERE until_unix_s < ?", (unix_s,))
             file.execute(
                 "DELETE FROM tokens WHERE expires_unix_s < ? AND id NOT IN (SELECT token FROM plans)",
-                (unix_s - _TOKEN_KEPT_S,),
+                (unix_s - 30 * DAY_S,),  # kept after its end, so that its refusal can say why
             )
             if plan is not None:
                 grants = json.dumps([[dict(metadata), right.value] for metadata, right in plan.grants])
@@ -363,7 +362,7 @@ class Registry(TransactionFile):
                 for fingerprint, until in file.execute(
                     "SELECT fingerprint, until_unix_s FROM certificates WHERE until_unix_s >= ? AND name IN"
                     " (SELECT name FROM nodes WHERE machine = ?)",
-                    (int(unix_s - _DAY_S), machine),
+                    (int(unix_s - DAY_S), machine),
                 ).fetchall()
             ]
 

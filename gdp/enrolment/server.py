@@ -28,6 +28,8 @@ from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.intervals import DAY_S
+from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.management.control_socket import short_path
 from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
@@ -56,14 +58,8 @@ _BACKLOG: Final = 128
 _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
-_ACCEPTS_PER_S: Final = 50.0  # a handshake costs about 1 ms
-_EACH_PER_S: Final = 25.0  # of them, of one address
-_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
 _LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
-_REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
-_IDLE_S: Final = 2 * POLL_MAX_S
 _FLUSH_S: Final = 10.0
-_TLS_S: Final = 86_400.0
 _INSTANCES_MAX: Final = 16  # remembered starts of one machine's agent
 
 _T = TypeVar("_T")
@@ -132,8 +128,8 @@ class EnrolmentServer:
         self._desk = desk
         self._make_tls = make_tls
         self._tls = make_tls()
-        self._rate = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
-        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
+        self._rate = TokenBucket(*CONNECTIONS_RATE)
+        self._each = TokenBuckets(*ADDRESS_CONNECTIONS_RATE)
         self._strangers: OrderedDict[_Connection, None] = OrderedDict()
         self._members: dict[int, OrderedDict[_Connection, None]] = defaultdict(OrderedDict)
         self._polling: dict[int, OrderedDict[bytes, None]] = defaultdict(OrderedDict)  # instances, the newest last
@@ -164,7 +160,7 @@ class EnrolmentServer:
         return [*self._strangers, *(each for connections in self._members.values() for each in connections)]
 
     async def _accept(self) -> None:
-        wait_s = (1.0 - self._rate.left(time.monotonic())) / _ACCEPTS_PER_S
+        wait_s = (1.0 - self._rate.left(time.monotonic())) / CONNECTIONS_RATE.per_s
         if wait_s > 0:
             await asyncio.sleep(wait_s)  # further connections wait in the kernel's queue
         try:
@@ -253,12 +249,12 @@ class EnrolmentServer:
         end_s: float,
     ) -> bool:
         """Answer one request; return whether another one may follow."""
-        idle_s = _IDLE_S if connection.session is not None else end_s - time.monotonic()
+        idle_s = 2 * POLL_MAX_S if connection.session is not None else end_s - time.monotonic()
         try:
             with _cut_after(writer, idle_s):
                 head = await reader.readexactly(LENGTH_BYTES)
             size = message_bytes(head, REQUEST_MAX_BYTES if connection.session else STRANGER_MAX_BYTES)
-            with _cut_after(writer, min(_REQUEST_S, idle_s)):
+            with _cut_after(writer, min(STRANGER_S, idle_s)):
                 fields = read_message(await reader.readexactly(size))
             response = await self._response(connection, fields, binding)
             goes_on = True
@@ -276,7 +272,7 @@ class EnrolmentServer:
 
     async def _write(self, writer: asyncio.StreamWriter, fields: Mapping[str, object]) -> None:
         writer.write(encode_message(fields))
-        with _cut_after(writer, _REQUEST_S):
+        with _cut_after(writer, STRANGER_S):
             await writer.drain()
 
     async def _response(self, connection: _Connection, fields: Message, binding: bytes) -> Mapping[str, object]:
@@ -372,14 +368,14 @@ class EnrolmentServer:
 
     async def _keep_up(self) -> None:
         """Write the audit log, and replace the certificate in time."""
-        tls_s = time.monotonic() + _TLS_S
+        tls_s = time.monotonic() + DAY_S
         while True:
             await asyncio.sleep(_FLUSH_S)
             try:
                 await self._work(self._desk.flush)
                 if time.monotonic() >= tls_s:
                     self._tls = await self._work(self._make_tls)
-                    tls_s = time.monotonic() + _TLS_S
+                    tls_s = time.monotonic() + DAY_S
             except GdpError as error:
                 log.error("enrolment upkeep failed reason=%s", error)
 

@@ -14,9 +14,9 @@ from gdp.crypto.server_certificate import channel_binding, issue_server_certific
 from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import to_pem
 from gdp.errors import LocalError
+from gdp.intervals import DAY_S
 from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, write_all
-from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
 
 __all__ = ["CERTIFICATE_DAYS", "ServerTls", "make_server_tls"]

@@ -17,13 +17,13 @@ from gdp.config.yaml_source import read_yaml
 from gdp.enrolment.machine_programs import configured_identity
 from gdp.enrolment.units import UNIT_FOLDER, installed_units, systemctl
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import ANSWER_S
 from gdp.management.control_client import ask_node, control_path, find_control_socket_of
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
 
 __all__ = ["UnitState", "known_units", "unit_state"]
 
-_NODE_S: Final = 5.0
 _PACKAGED: Final = Path("/usr/lib/systemd/system")
 _RUNTIME: Final = re.compile(r"^Environment=.*?\bXDG_RUNTIME_DIR=(\S+)", re.MULTILINE)
 _EXEC: Final = re.compile(r"^ExecStart=(.*)$", re.MULTILINE)
@@ -95,7 +95,7 @@ def _node(unit: str, fragment: Path) -> tuple[str | None, float | None]:
     if section not in NODE_SECTIONS:
         return None, None
     try:
-        status = ask_node(_socket(fragment.read_text(encoding="utf-8"), section), Command.STATUS, _NODE_S)
+        status = ask_node(_socket(fragment.read_text(encoding="utf-8"), section), Command.STATUS, ANSWER_S)
     except OSError as error:
         return f"{fragment}: {error.strerror}", None
     except GdpError as error:

@@ -21,6 +21,7 @@ from typing import Final
 
 from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
+from gdp.intervals import STEADY_S
 from gdp.requests import Backoff
 from gdp.terminal import echo
 
@@ -29,7 +30,6 @@ __all__ = ["Failures", "supervise"]
 log = logging.getLogger(__name__)
 
 _RESTARTS: Final = Backoff(0.2, 15.0)
-_STEADY_S: Final = 30.0  # a program that ran this long is restarted after the shortest pause
 _END_S: Final = 8.0
 _LINE_MAX: Final = 1 << 16
 
@@ -94,13 +94,13 @@ async def _keep_running(program: MachineProgram, first: asyncio.Event, prefix: s
         try:
             code = await process.wait()
         except asyncio.CancelledError:
-            if loop.time() - begun_s > _STEADY_S:
+            if loop.time() - begun_s > STEADY_S:
                 failures.names.discard(program.name)
             if not await _end(process):
                 failures.names.add(program.name)
             await asyncio.wait([logging_output], timeout=_END_S)
             raise
-        failed = 1 if loop.time() - begun_s > _STEADY_S else failed + 1
+        failed = 1 if loop.time() - begun_s > STEADY_S else failed + 1
         pause_s = _RESTARTS.pause_s(failed)
         failures.names.add(program.name)
         log.warning("program ended program=%s code=%d pause_s=%.1f", program.name, code, pause_s)

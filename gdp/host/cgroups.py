@@ -19,6 +19,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.mounts import roots
+from gdp.intervals import LOOK_S, STOP_S
 
 __all__ = ["Cgroup"]
 
@@ -27,8 +28,6 @@ _PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow ma
 _LEAST_US: Final = 1_000  # the kernel accepts no quota below this
 _LONGEST_PERIOD_US: Final = 1_000_000
 _WEIGHT, _SHARES = 100, 1_024  # of one core: the defaults of a group
-_PATIENCE_S: Final = 3.0
-_LOOK_S: Final = 0.005
 _GONE: Final = (errno.ENOENT, errno.ENODEV)
 
 
@@ -120,7 +119,7 @@ class Cgroup:
 
     def remove(self) -> None:
         """Kill the remaining processes of the group, and remove it with the groups in it; no error if it is gone."""
-        end_s = time.monotonic() + _PATIENCE_S
+        end_s = time.monotonic() + STOP_S
         for folder in self._standing():
             while True:
                 self.kill()  # in the loop: without cgroup.kill, a process may have started another
@@ -136,7 +135,7 @@ class Cgroup:
                 except OSError as error:  # busy until the last process ends, which version 1 does not report
                     if time.monotonic() > end_s:
                         raise LocalError(f"{folder} cannot be removed: {error.strerror}") from error
-                    time.sleep(_LOOK_S)
+                    time.sleep(LOOK_S)
 
     def _standing(self) -> list[Path]:
         return [folder for folder in self._folders.values() if folder.is_dir()]

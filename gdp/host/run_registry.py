@@ -23,6 +23,7 @@ from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
 from gdp.host.mounts import unmount
 from gdp.host.processes import Process, boot_id, end_all
+from gdp.intervals import FORGET_S
 from gdp.stores.ownership import refuse_foreign_folder
 
 __all__ = ["Record", "Run", "RunRegistry", "in_first_user_namespace", "outer_uid"]
@@ -32,7 +33,6 @@ log = logging.getLogger(__name__)
 _ID_BYTES: Final = 3
 _WRITE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 _FRESH: Final = ".new"  # of a record that is being written
-_WRITTEN_S: Final = 60.0  # a longer write counts as abandoned
 _ALL_IDS: Final = 4_294_967_295  # length of the first user namespace's map; user_namespaces(7)
 
 
@@ -216,7 +216,7 @@ class RunRegistry:
         """Remove half-written records of processes that were killed before they made a resource."""
         for path in self._directory.glob(f"*{_FRESH}"):
             with suppress(FileNotFoundError):  # it was renamed, or another process removed it first
-                if time.time() - path.stat().st_mtime > _WRITTEN_S and not path.with_suffix(".json").exists():
+                if time.time() - path.stat().st_mtime > FORGET_S and not path.with_suffix(".json").exists():
                     path.unlink()
 
     def _records(self) -> list[tuple[Record, Path]]:

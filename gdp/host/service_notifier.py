@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import HOUR_S
 
 __all__ = ["ServiceNotifier", "service_notifier"]
 
@@ -21,7 +22,6 @@ log = logging.getLogger(__name__)
 
 _SOCKET, _TIMEOUT, _PROCESS = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
 _BEATS: Final = 3  # within the timeout; sd_watchdog_enabled(3) advises at least two
-_UNWATCHED_S: Final = 3_600.0
 
 
 class ServiceNotifier:
@@ -36,7 +36,7 @@ class ServiceNotifier:
         self._channel = channel
         self._is_ready = False
         self._is_watched = timeout_s is not None
-        self.period_s: Final = _UNWATCHED_S if timeout_s is None else timeout_s / _BEATS
+        self.period_s: Final = HOUR_S if timeout_s is None else timeout_s / _BEATS
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str] = os.environ) -> ServiceNotifier:

@@ -21,6 +21,7 @@ from gdp.control.tunnel_plan import Dialer, RebindSchedule, TunnelId, planned_tu
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import REPORT_S, RETRY_S
 from gdp.links.endpoint_files import record_files
 from gdp.links.own_endpoints import OwnEndpoints
 from gdp.links.tunnels import Tunnel, Tunnels
@@ -33,14 +34,11 @@ from gdp.switch.core import SwitchCore
 from gdp.switch.direct_tunnels import Close, Open, Retry, Silence
 from gdp.trust.domain import Policy
 
-__all__ = ["LINKS_PERIOD_S", "TunnelLinks"]
+__all__ = ["TunnelLinks"]
 
 log = logging.getLogger(__name__)
 
-LINKS_PERIOD_S: Final = 0.1
 _RECORDS_PERIOD_S: Final = 0.3
-_RETRY_S: Final = 5.0
-_SILENT_S: Final = 5.0  # a border that is not up after this time is reported
 
 
 @dataclass(slots=True, kw_only=True)
@@ -195,7 +193,7 @@ class TunnelLinks:
                     self._tunnels.dial(tunnel, endpoint)
                 self._report_silence(tunnel, peer, now, is_up=is_up)
             elif now.mono_s >= self._retry_s.get(tunnel, 0.0):
-                self._retry_s[tunnel] = now.mono_s + _RETRY_S
+                self._retry_s[tunnel] = now.mono_s + RETRY_S
                 self._tunnels.open(
                     tunnel,
                     peer.record,
@@ -221,7 +219,7 @@ class TunnelLinks:
         endpoints = self._dialers[tunnel].endpoints
         if is_up or not endpoints:
             self._reported.discard(tunnel)
-        elif tunnel not in self._reported and now.mono_s > self._tunnels.all[tunnel].begun_s + _SILENT_S:
+        elif tunnel not in self._reported and now.mono_s > self._tunnels.all[tunnel].begun_s + REPORT_S:
             self._reported.add(tunnel)
             where = ", ".join(each.to_text() for each in endpoints)
             cause = "it is down, its membership or ours is refused there, or UDP is blocked on the way"

@@ -22,6 +22,7 @@ from gdp.config.relay_config import RelayBorder
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
 from gdp.host_port import split_host_port
+from gdp.intervals import REFUSED_S, TRY_S
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_server import port_status
@@ -38,9 +39,7 @@ __all__ = ["BorderDialer"]
 
 log = logging.getLogger(__name__)
 
-_CONNECT_S: Final = 2.0  # for one address; then the next one has its turn
 _REDIALS: Final = Backoff(0.1, 5.0)
-_REFUSED_S: Final = 10.0  # at least, after a refusal
 _CANDIDATES_MAX: Final = 16
 _STANDBY: Final = "on standby: the tunnel over UDP is up, or has a moment to come up"
 
@@ -232,7 +231,7 @@ class BorderDialer:
             self._connecting = None
             self._failed(os.strerror(number))
             return
-        self._due_s = time.monotonic() + _CONNECT_S
+        self._due_s = time.monotonic() + TRY_S
         self._loop.wake_at(self._due_s)
         self._loop.register(opened.fileno(), select.EPOLLOUT, self._connected)
 
@@ -300,7 +299,7 @@ class BorderDialer:
             if self._last_refusal != self.reason:
                 log.error("relay refused border=%s address=%s reason=%s", *self._shown(link), self.reason)
             self._last_refusal = self.reason
-            self._wait(self.reason, at_least_s=_REFUSED_S)
+            self._wait(self.reason, at_least_s=REFUSED_S)
             return
         log.info("relay down border=%s address=%s reason=%s", *self._shown(link), self.reason)
         self._wait(self.reason)

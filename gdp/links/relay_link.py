@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from gdp.intervals import LINGER_S
 from gdp.links.relay_loop import RelayLoop
 from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionCounters, ConnectionState, RelayConnection
@@ -30,7 +31,6 @@ _INT: Final = struct.Struct("=i")
 _UNSENT_BYTES: Final = 128 << 10
 _BATCHES: Final = 4  # of ``data_to_send`` before other connections have their turn
 _FRAMES: Final = 64  # of the device before other connections have their turn
-_LINGER_S: Final = 1.0  # for the other end to read why it was refused
 _WRITE: Final = select.EPOLLOUT
 _READ: Final = select.EPOLLIN
 _BROKEN: Final = select.EPOLLERR | select.EPOLLHUP
@@ -150,7 +150,7 @@ class RelayLink:
             self._wait_for(self._events | _READ)
         self.connection.handle_timer(now_s)
         self.flush()
-        return now_s + _LINGER_S if self.is_ended else self._next_s(now_s)
+        return now_s + LINGER_S if self.is_ended else self._next_s(now_s)
 
     def flush(self) -> None:
         """Send what is ready, as far as the network takes it; end a connection that has closed."""
@@ -238,7 +238,7 @@ class RelayLink:
         if self.port is not None:
             self.port.detach(self)
         if self.connection.was_refused and not self._pending:
-            self._linger_until_s = time.monotonic() + _LINGER_S
+            self._linger_until_s = time.monotonic() + LINGER_S
             self._wait_for(_READ)
             try:
                 self._socket.shutdown(socket.SHUT_WR)

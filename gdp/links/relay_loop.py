@@ -10,8 +10,9 @@ import contextlib
 import select
 import time
 from collections.abc import Callable, Iterator
-from typing import Final, Protocol
+from typing import Protocol
 
+from gdp.intervals import UPKEEP_S
 from gdp.ports.plane import HasFileno
 from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.runtime import now
@@ -19,9 +20,6 @@ from gdp.runtime.signals import handled_signals
 from gdp.sansio import Timestamps
 
 __all__ = ["RelayLoop", "Timed"]
-
-
-_LONGEST_S: Final = 1.0
 
 
 class Timed(Protocol):
@@ -114,7 +112,7 @@ class RelayLoop:
         """Call the timers that are due, and wait once for events."""
         now_s = time.monotonic()
         if now_s >= self._due_s:
-            self._due_s = now_s + _LONGEST_S
+            self._due_s = now_s + UPKEEP_S
             for part in list(self._timed):
                 self.wake_at(part.handle_timer(now_s))
         handlers = self._handlers

@@ -12,6 +12,7 @@ from collections import deque
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import FORGET_S
 from gdp.names import Name
 from gdp.ports.netlink import LINK_GROUP, LinkAttribute, NetlinkSocket, Notifications
 from gdp.ports.tap import relay_alias
@@ -19,14 +20,12 @@ from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["RELAY_COST", "RELAY_PERIOD_S", "VIA", "RelayPorts"]
+__all__ = ["RELAY_COST", "VIA", "RelayPorts"]
 
 log = logging.getLogger(__name__)
 
 RELAY_COST: Final = 1_000
 VIA: Final = "tls (slower)"
-RELAY_PERIOD_S: Final = 0.1
-_FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
 
 
 class RelayPorts:
@@ -102,7 +101,7 @@ class RelayPorts:
     def _remove(self, ifname: str) -> None:
         port = self._ports.pop(ifname)
         self._runtime.remove_port(port)
-        self._closed.append((time.monotonic() + _FORGET_S, port))
+        self._closed.append((time.monotonic() + FORGET_S, port))
         log.info("port of the relay removed ifname=%s", ifname)
 
     def _devices(self) -> frozenset[str]:

@@ -17,8 +17,10 @@ from typing import Final
 from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
+from gdp.intervals import CONNECT_S, PACE_S, Rate
+from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.links.relay_context import RelayContext
-from gdp.links.relay_hello import HELLO_S, HelloWait, hand_over
+from gdp.links.relay_hello import HelloWait, hand_over
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_loop import RelayLoop
 from gdp.names import Name
@@ -36,11 +38,8 @@ __all__ = ["BorderServer", "listen_tls", "port_status"]
 log = logging.getLogger(__name__)
 
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
-_ACCEPTS_PER_S: Final = 50.0  # a handshake costs about a millisecond
-_EACH_PER_S: Final = 25.0  # of them, of one address
-_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
-_LOOKS_PER_S: Final = 2_000.0  # connections whose address is looked at: an address above its share costs no handshake
-_ACCEPT_PAUSE_S: Final = 0.1
+# connections whose address is looked at: an address above its share costs no handshake
+_LOOKS_RATE: Final = Rate(2_000.0, burst=2_000.0)
 
 
 def listen_tls(config: RelayServer) -> socket.socket:
@@ -92,9 +91,9 @@ class BorderServer:
         self._clients: dict[Name, _Client] = {}
         self._handshakes: set[RelayLink] = set()
         self._hellos: set[HelloWait] = set()
-        self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
-        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
-        self._looks = TokenBucket(_LOOKS_PER_S, _LOOKS_PER_S)
+        self._accepts = TokenBucket(*CONNECTIONS_RATE)
+        self._each = TokenBuckets(*ADDRESS_CONNECTIONS_RATE)
+        self._looks = TokenBucket(*_LOOKS_RATE)
         self._turned_away = 0
         self._resume_s: float | None = None
         self._ended = ConnectionCounters()
@@ -113,7 +112,7 @@ class BorderServer:
 
     def handle_timer(self, now_s: float) -> float:
         """Accept connections again after a pause, and end late hellos; return the second of the next call."""
-        for hello in [each for each in self._hellos if now_s >= each.since_s + HELLO_S]:
+        for hello in [each for each in self._hellos if now_s >= each.since_s + CONNECT_S]:
             self._end_stranger(hello, "no hello in time")
         if self._resume_s is not None and now_s >= self._resume_s:
             self._resume_s = None
@@ -235,7 +234,7 @@ class BorderServer:
     def _pause(self, now_s: float) -> None:
         """Leave further connections in the kernel's queue for a moment."""
         self._loop.unregister(self._listener.fileno())
-        self._resume_s = now_s + _ACCEPT_PAUSE_S
+        self._resume_s = now_s + PACE_S
         self._loop.wake_at(self._resume_s)
 
     def _authenticate(self, certificate: bytes, at: Timestamps) -> Membership:

@@ -23,6 +23,7 @@ from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, 
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import LocalError
+from gdp.intervals import FORGET_S, UPKEEP_S
 from gdp.limits import COST_AUTO
 from gdp.names import Name
 from gdp.ports.tunnel.outside_filter import OutsideFilter
@@ -40,10 +41,8 @@ __all__ = ["Tunnel", "Tunnels", "open_underlays"]
 log = logging.getLogger(__name__)
 
 _OUTER_MTU: Final = 1_500  # until a route to an endpoint is known
-_DEVICE_PERIOD_S: Final = 1.0
 _STATES_PAUSE_S: Final = 0.02  # between two reads of the states of all peers
 _HANDSHAKE_S: Final = 3.0  # states are read often for this time after a handshake was requested
-_FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
 
 
 @dataclass(slots=True, kw_only=True)
@@ -261,7 +260,7 @@ class Tunnels:
         found = self._tunnels.pop(tunnel)
         self._runtime.remove_port(found.port)
         self._switch.tunnels.set_direct_port(found.port, None)
-        self._closed.append((now_s + _FORGET_S, found.port))
+        self._closed.append((now_s + FORGET_S, found.port))
         self._remove(tunnel.uplink, found.ifname, found.key)
         log.info("tunnel removed peer=%s ifname=%s", tunnel.peer.short, found.ifname)
 
@@ -301,7 +300,7 @@ class Tunnels:
         self._follow_preshared()
         is_device_due = now.mono_s >= self._device_due_s
         if is_device_due:
-            self._device_due_s = now.mono_s + _DEVICE_PERIOD_S
+            self._device_due_s = now.mono_s + UPKEEP_S
             for uplink, device in enumerate(self.underlays):
                 self._read_s[uplink] = now.mono_s
                 if device.poll():

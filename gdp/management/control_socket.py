@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import IDLE_S, PROMPT_S
 from gdp.names import Name
 from gdp.ports.readiness import readable
 from gdp.state.control_protocol import (
@@ -51,9 +52,7 @@ CONTROL_SOCKET: Final = "control.sock"  # in the folder of a process without an 
 _MODE: Final = 0o600
 _BACKLOG: Final = 8
 _CONNECTIONS_MAX: Final = 16
-_IDLE_S: Final = 10.0  # a connection without a request closes in favour of a newer one
 _RECEIVE_BYTES: Final = 4_096
-_PROBE_S: Final = 0.5
 _TIMEVAL: Final = struct.Struct("@ll")
 
 
@@ -168,7 +167,7 @@ class ControlServer:
         self._epoll.register(peer.fileno(), select.EPOLLIN)
 
     def _end_oldest_idle(self, now_s: float) -> bool:
-        idle = [each for each in self._clients.values() if not each.awaits_drain and now_s - each.since_s >= _IDLE_S]
+        idle = [each for each in self._clients.values() if not each.awaits_drain and now_s - each.since_s >= IDLE_S]
         for client in idle[:1]:
             self._end(client)
         return bool(idle)
@@ -335,7 +334,7 @@ def _remove_stale(path: Path) -> None:
     if not stat.S_ISSOCK(mode):
         raise LocalError(f"{path} exists and is no socket; remove it, or name another control_socket")
     try:
-        connect_control(path, _PROBE_S).close()
+        connect_control(path, PROMPT_S).close()
     except TimeoutError:  # the process is alive, but busy
         pass
     except OSError as error:

@@ -13,6 +13,7 @@ from typing import Final
 
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
+from gdp.intervals import ANSWER_S
 from gdp.management.control_client import NotRunningError, ask_node, control_sockets
 from gdp.names import Name
 from gdp.state.control_protocol import Command, Response
@@ -20,7 +21,6 @@ from gdp.state.topic_rows import TopicRow, rows_from_fields
 
 __all__ = ["Found", "NodeTopics", "RunningNode", "find_running_nodes", "read_topics"]
 
-ANSWER_S: Final = 2.0
 _ROLES: Final = frozenset(each.value for each in Role)
 
 

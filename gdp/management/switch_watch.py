@@ -8,16 +8,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 from gdp.errors import GdpError
+from gdp.intervals import ANSWER_S, TICK_S
 from gdp.management.control_client import ask_node
 from gdp.state.control_protocol import Command
 
 __all__ = ["SwitchWatch", "peers_up"]
-
-_POLL_S: Final = 0.5
-_ANSWER_S: Final = 2.0
 
 
 class SwitchWatch:
@@ -47,9 +44,9 @@ class SwitchWatch:
             self._thread.join()
 
     def _watch(self) -> None:
-        while not self._ended.wait(_POLL_S):
+        while not self._ended.wait(TICK_S):
             try:
-                self.up = peers_up(ask_node(self._path, Command.STATUS, _ANSWER_S).result)
+                self.up = peers_up(ask_node(self._path, Command.STATUS, ANSWER_S).result)
             except GdpError:  # no switch runs: there is no tunnel either
                 self.up = frozenset()
 

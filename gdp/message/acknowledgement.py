@@ -3,7 +3,7 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Positions count bytes of frames from the first message on.
 
 An active reader blocks the send window until it acknowledges; a suspended one does not. A reader is slow when it
-acknowledges nothing for ``READER_LEASE_S``, or lags behind another one for longer than the tolerated lag.
+acknowledges nothing for ``READER.lease_s``, or lags behind another one for longer than the tolerated lag.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from gdp.message.retransmission import repair_allowance
 from gdp.token_bucket import TokenBucket
 
@@ -136,7 +136,7 @@ class ReaderPositions:
             for name, each in self.active.items()
             if each.acked_at < sent_at
             and (
-                now_s - each.last_progress_s > READER_LEASE_S
+                now_s - each.last_progress_s > READER.lease_s
                 or (now_s - each.mark_s > self._lag_s and each.acked_at < each.mark_at <= first_at)
             )
         ]

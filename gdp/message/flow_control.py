@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.limits import FLIGHT_MAX_BYTES, PROBE_MAX_S, PROBE_MIN_S
+from gdp.limits import FLIGHT_MAX_BYTES
+from gdp.requests import Backoff
 
-__all__ = ["FlowControl", "RoundTripEstimator"]
+__all__ = ["PROBES", "FlowControl", "RoundTripEstimator"]
+
+PROBES: Final = Backoff(0.03, 0.25)  # of readers from which nothing comes
 
 
 class RoundTripEstimator:
@@ -65,7 +68,7 @@ class FlowControl:
     def __init__(self) -> None:
         self.round_trip = RoundTripEstimator()
         self._quiet_s = 0.0  # since when nothing was acknowledged
-        self._probe_s = PROBE_MIN_S
+        self._probe_s = PROBES.first_s
 
     def handle_acknowledged(self, new_bytes: int, acked_at: int, now_s: float) -> None:
         """Process an acknowledgement of ``new_bytes`` up to ``acked_at``, and restart the probe timer."""
@@ -74,7 +77,7 @@ class FlowControl:
         self._quiet_s = now_s
         trip = self.round_trip
         trip.handle_acknowledged(acked_at, now_s)
-        self._probe_s = min(max(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s, PROBE_MIN_S), PROBE_MAX_S)
+        self._probe_s = PROBES.bounded_s(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
 
     def restart_probe(self, now_s: float) -> None:
         """Restart the probe timer: nothing is under way."""
@@ -89,5 +92,5 @@ class FlowControl:
         if now_s < self.next_probe():
             return False
         self._quiet_s = now_s
-        self._probe_s = min(2 * self._probe_s, PROBE_MAX_S)
+        self._probe_s = PROBES.after_s(self._probe_s)
         return True

@@ -15,6 +15,7 @@ from math import exp
 from typing import Final, Protocol
 
 from gdp.frame.codec import NUMBER_AT
+from gdp.intervals import PACE_S
 from gdp.message.acknack import FRAMES_MASK
 
 __all__ = ["FrameLoss", "Readers"]
@@ -22,7 +23,6 @@ __all__ = ["FrameLoss", "Readers"]
 _MEMORY_FRAMES: Final = 1_000
 _LEAST_FRAMES: Final = 64  # before this many were reported, nothing is known
 _MARKS_MAX: Final = 16_384  # message numbers whose place among the sent frames is remembered
-_REFRESH_S: Final = 0.1
 _NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
 _BACKWARDS: Final = FRAMES_MASK >> 1  # a larger step is a count that began again
 
@@ -98,7 +98,7 @@ class FrameLoss:
     def loss(self, readers: Readers, now_s: float) -> float | None:
         """Return the highest share of frames lost to one of ``readers``, 0 to 1; None: not known yet."""
         if self._is_stale and now_s >= self._next_s:
-            self._is_stale, self._next_s = False, now_s + _REFRESH_S
+            self._is_stale, self._next_s = False, now_s + PACE_S
             self._readers = {name: count for name, count in self._readers.items() if name in readers}
             known = [count.loss for count in self._readers.values() if count.sent >= _LEAST_FRAMES]
             self._loss = max(known, default=None)

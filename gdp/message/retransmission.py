@@ -12,22 +12,23 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from gdp.limits import PROBE_MIN_S
+from gdp.intervals import Rate
 from gdp.message.acknack import MissingRange
+from gdp.message.flow_control import PROBES
 from gdp.message.history_cache import HistoryCache
 from gdp.token_bucket import TokenBucket
 
 __all__ = ["RetransmissionQueue", "repair_allowance"]
 
-_SCAN_PARTS: Final = 8_192  # fragments examined for reports of one reader at once; a window of small frames has fewer
-_SCAN_PARTS_PER_S: Final = 131_072  # ... and in a second: more than a process sends, and 2 % of a core
-_ROUND_MIN_S: Final = PROBE_MIN_S / 3
+# fragments examined for reports of one reader: in a second more than a process sends, and 2 % of a core; at once more
+# than a window of small frames has
+_SCAN_RATE: Final = Rate(131_072, burst=8_192)
 _NEVER: Final = float("-inf")
 
 
 def repair_allowance() -> TokenBucket:
     """Return the fragments that may be examined for one reader."""
-    return TokenBucket(_SCAN_PARTS_PER_S, _SCAN_PARTS)
+    return TokenBucket(*_SCAN_RATE)
 
 
 class RetransmissionQueue:
@@ -58,7 +59,7 @@ class RetransmissionQueue:
             rtt_s: estimated round-trip time; None: unknown.
             round_bytes: most bytes that are sent again in a round trip.
         """
-        wait_s = max(1.5 * (rtt_s or 0.0), _ROUND_MIN_S)
+        wait_s = max(1.5 * (rtt_s or 0.0), PROBES.first_s / 3)
         if now_s - self._round_s >= wait_s:
             self._round_s, self._round_bytes = now_s, round_bytes
         allowed, examined = int(allowance.left(now_s)), 0

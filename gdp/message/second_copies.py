@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Final
 
-from gdp.limits import SENDS_MAX
+from gdp.limits import PATH_LAG_MAX_S, SENDS_MAX
 from gdp.message.acknack import MissingRange
 
 __all__ = ["REPEATED_PARTS_MAX", "DeferredRequests", "RepeatedFrames", "SecondCopies"]
@@ -20,7 +20,6 @@ REPEATED_PARTS_MAX: Final = 2  # fragments of a message whose frames may be repe
 _KEPT_MESSAGES, _KEPT_FRAMES = 256, 512  # that are remembered until their copies come
 _FORGET_S: Final = 1.0  # frames without a copy for this time: no copies are sent, or one path is broken
 _IDLE_S: Final = 0.25  # a pause of the writer, which says nothing of its paths
-_SECOND_MAX_S: Final = 0.5  # a path that is further behind is not awaited
 _REPEATED_MAX_S: Final = 0.025
 _REPLAY_S: Final = 0.25  # a later copy over one path is a replay
 _SPREAD: Final = 1.25  # of the lag that was measured: the next one may be longer
@@ -56,7 +55,7 @@ class SecondCopies(_CopyDelay):
     __slots__ = ("_came",)
 
     def __init__(self) -> None:
-        super().__init__(_SECOND_MAX_S)
+        super().__init__(PATH_LAG_MAX_S)
         self._came: OrderedDict[int, tuple[int, float]] = OrderedDict()  # by message: a fragment, and when it came
 
     def handle_first(self, number: int, part: int, now_s: float) -> None:

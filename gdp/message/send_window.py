@@ -20,7 +20,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from gdp.limits import FLIGHT_MESSAGES_MAX, READER_LEASE_S, REPAIRS_MAX_BYTES, WINDOW_BYTES
+from gdp.intervals import READER
+from gdp.limits import FLIGHT_MESSAGES_MAX, REPAIRS_MAX_BYTES, WINDOW_BYTES
 from gdp.message.acknack import AckNack
 from gdp.message.acknowledgement import ReaderPositions
 from gdp.message.flow_control import FlowControl
@@ -55,7 +56,7 @@ class SendWindow:
         history_depth: int = 0,
         first_number: int = 1,
         budget_bytes: int = WINDOW_BYTES,
-        lag_s: float = READER_LEASE_S,
+        lag_s: float = READER.lease_s,
     ) -> None:
         self._budget_bytes = budget_bytes
         self.cache = HistoryCache(history_depth)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.frame.codec import PARTS_AT, second_path_copy
-from gdp.limits import STRIPES_FROM_PARTS
+from gdp.limits import PATH_LAG_MAX_S, STRIPES_FROM_PARTS
 
 __all__ = ["SHARE_WHOLE", "StripedPaths", "Striper"]
 
@@ -26,7 +26,6 @@ _KEPT: Final = 64  # messages under way whose paths are compared
 _STEP: Final = 0.25  # of the share, for a path that is idle during the whole message
 _NEWS: Final = 0.02
 _SHORT_S: Final = 0.002  # a message that came faster shows nothing of its paths
-_LAG_MAX_S: Final = 0.5
 _LAG_SPREAD: Final = 1.25
 _DECAY: Final = 0.9
 
@@ -75,7 +74,7 @@ class StripedPaths:
             self.share = 0.0 if two_s is None else 1.0  # a path that brings nothing is broken
             return
         took_s = max(one_s, two_s) - arrival.begin_s
-        self._lag_s = max(min(abs(one_s - two_s), _LAG_MAX_S), self._lag_s * _DECAY)
+        self._lag_s = max(min(abs(one_s - two_s), PATH_LAG_MAX_S), self._lag_s * _DECAY)
         if took_s > _SHORT_S:
             self.share = min(max(self.share + _STEP * (one_s - two_s) / took_s, 0.0), 1.0)
 

@@ -1,7 +1,7 @@
 """Credentials of a running node: reload of its membership and trusted roots when their files change.
 
 I/O; it polls files. The issuer replaces ``node.crt``, ``root.crt`` or a root of ``domain.trusts``. The node reloads
-them within ``RECONCILE_PERIOD_S``, or at once on SIGHUP, and keeps its name and session. The node logs
+them within ``TICK_S``, or at once on SIGHUP, and keeps its name and session. The node logs
 credentials that are not valid, and keeps the present ones.
 """
 
@@ -16,6 +16,7 @@ from gdp.config.schema import Domain
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
+from gdp.intervals import DAY_S
 from gdp.sansio import Timestamps
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed
@@ -25,8 +26,6 @@ __all__ = ["Credentials", "NodeConfig", "watched_folders"]
 
 log = logging.getLogger(__name__)
 
-_DAY_S: Final = 86_400
-_SOON_S: Final = 7 * _DAY_S
 _PUBLIC: Final = (".crt", ".pem", ".cer")
 _SHARE: Final = 5  # 1/5: warn in the last fifth of a shorter validity
 _NodeState = tuple[tuple[int, int, int] | None, ...]
@@ -102,7 +101,7 @@ class Credentials:
         member = self._identity.member
         whole = member.not_after_unix_s - member.not_before_unix_s
         left_s = self.seconds_left(unix_s)
-        if left_s <= min(_SOON_S, whole / _SHARE) and self._warned != member.fingerprint:
+        if left_s <= min(7 * DAY_S, whole / _SHARE) and self._warned != member.fingerprint:
             self._warned = member.fingerprint
             log.warning("membership ends soon name=%s left_s=%d: run gdp cert renew", self._identity.name.short, left_s)
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.errors import DropReason
+from gdp.intervals import TICK_S
 from gdp.names import NAME_BYTES, Name
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.sansio import Timestamps
 from gdp.state.node_state import NodeState, SwitchState
 from gdp.switch.table import Hops, Table
@@ -29,7 +29,7 @@ def log_decisions(every: Callable[[float, Callable[[Timestamps], None]], None], 
     """Log decisions from within a loop, whose ``every`` is given, if debug lines are wanted."""
     if log.isEnabledFor(logging.DEBUG):
         table = state.switch.table if isinstance(state, SwitchState) else None
-        every(RECONCILE_PERIOD_S, DecisionLog(state.ifname, state.drops, table).log_changes)
+        every(TICK_S, DecisionLog(state.ifname, state.drops, table).log_changes)
 
 
 class DecisionLog:

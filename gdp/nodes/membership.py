@@ -19,7 +19,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.stores.keyring import load_identity, load_root, storage
 from gdp.trust.domain import Policy
 
@@ -68,7 +68,7 @@ def load_policy(domain: Domain) -> Policy:
     return Policy(own, trusted, transit, diagnostics=[labels[label] for label in domain.diagnostics])
 
 
-def fresh_settings(lease_s: float = ADVERTISEMENT_LEASE_S) -> NodeSettings:
+def fresh_settings(lease_s: float = ADVERTISEMENT.lease_s) -> NodeSettings:
     """Return the settings of a node that starts now; ``lease_s``: of what it keeps at RIBs."""
     return NodeSettings(
         incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=lease_s

@@ -28,6 +28,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
+from gdp.intervals import TICK_S
 from gdp.links.relay_loop import RelayLoop
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
@@ -35,7 +36,7 @@ from gdp.names import Name
 from gdp.nodes.audit import NodeAudit
 from gdp.nodes.credentials import Credentials, NodeConfig
 from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
+from gdp.nodes.node_log import NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
 from gdp.ports.port_counters import PortCounters
 from gdp.runtime.runtime import Runtime, now
@@ -138,13 +139,13 @@ class Node:
         self.node_log = NodeLog(state, on_wait)
         state.read_devices = self._counters.read
         for follow in (self.node_log.log_changes, state.refresh):
-            loop.every(RECONCILE_PERIOD_S, follow)
+            loop.every(TICK_S, follow)
         log_decisions(loop.every, state)
         self.follow_credentials(loop)
 
     def follow_credentials(self, loop: Loop) -> None:
         """Read certificates and roots again from within the loop, when they change."""
-        loop.every(RECONCILE_PERIOD_S, self._credentials.reload_changed)
+        loop.every(TICK_S, self._credentials.reload_changed)
 
     def reload(self) -> None:
         """Read certificates and roots again, where they changed."""
@@ -187,7 +188,7 @@ class Node:
         """
         if self._audit_log is not None:
             audit = NodeAudit(self._audit_log, self.policy.audit, self.node_log.state.core.drops)
-            loop.every(RECONCILE_PERIOD_S, audit.write_pending)
+            loop.every(TICK_S, audit.write_pending)
             self._stack.callback(lambda: audit.write_pending(now()))
         self._revocations.start(loop.every)
         if metrics is not None and sources is not None:

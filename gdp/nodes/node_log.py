@@ -18,11 +18,10 @@ from gdp.state.node_state import NodeState, SwitchState
 from gdp.telemetry.health import Health
 from gdp.trust.audit import Action
 
-__all__ = ["RECONCILE_PERIOD_S", "NodeLog", "OnWait"]
+__all__ = ["NodeLog", "OnWait"]
 
 log = logging.getLogger(__name__)
 
-RECONCILE_PERIOD_S: Final = 0.5
 
 _TEXTS: Final = {
     WaitReason.LINK_DOWN: "link down on {port}",

@@ -17,6 +17,7 @@ from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
+from gdp.intervals import TICK_S
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_dialer import BorderDialer
 from gdp.links.relay_loop import RelayLoop
@@ -28,7 +29,6 @@ from gdp.management.switch_watch import SwitchWatch
 from gdp.names import Name
 from gdp.nodes.membership import load_member
 from gdp.nodes.node import Node
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.nodes.rights import confine_relay
 from gdp.ports.host_addresses import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
@@ -130,7 +130,7 @@ class Relay:
             for dialer in self.dialers:
                 dialer.follow_tunnel(now_s, is_up=dialer.peer.to_text() in self._watch.up)
         self._health = Health(now_s, tuple(filter(None, (dialer.waiting for dialer in self.dialers))))
-        return now_s + RECONCILE_PERIOD_S
+        return now_s + TICK_S
 
     def check_members(self) -> None:
         """Read new revocations, and end connections of members that are no longer valid."""

@@ -9,19 +9,17 @@ import logging
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import Final
 
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
+from gdp.intervals import PACE_S
 from gdp.sansio import Timestamps
 from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations
 
-__all__ = ["WRITE_S", "RevocationUpkeep"]
+__all__ = ["RevocationUpkeep"]
 
 log = logging.getLogger(__name__)
-
-WRITE_S: Final = 0.05  # between two slices
 
 
 class RevocationUpkeep:
@@ -60,7 +58,7 @@ class RevocationUpkeep:
         if self._file is not None:
             self._file.start()
             if every is not None:
-                every(WRITE_S, self.work)
+                every(PACE_S, self.work)
 
     def work(self, at: Timestamps) -> None:
         """Pass one slice of changes to the file, if it is ready."""

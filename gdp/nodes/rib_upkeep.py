@@ -11,6 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
+from gdp.intervals import PACE_S
 from gdp.ports.plane import HasFileno
 from gdp.rib.core import RibCore
 from gdp.rib.store import MemoryStore, Store
@@ -21,7 +22,6 @@ __all__ = ["MemoryUpkeep", "Upkeep"]
 
 log = logging.getLogger(__name__)
 
-SNAPSHOT_S: Final = 0.1  # between two slices
 CHANGES_MAX: Final = 65_536  # that wait for disk space, or twice the number of kept routes
 
 
@@ -50,7 +50,7 @@ class Upkeep:
 class MemoryUpkeep(Upkeep):
     """A store in memory, with a snapshot on disk if there is a path for it; a period passes on a slice of changes."""
 
-    every_s = SNAPSHOT_S
+    every_s = PACE_S
 
     def __init__(self, path: Path | None) -> None:
         self.store = self._memory = MemoryStore()

@@ -17,8 +17,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.single_instance import own_devices
-from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
-from gdp.links.relay_ports import RELAY_PERIOD_S, RelayPorts
+from gdp.intervals import PACE_S, TICK_S
+from gdp.links.links import TunnelLinks
+from gdp.links.relay_ports import RelayPorts
 from gdp.links.tunnels import open_underlays
 from gdp.links.uplink import refuse_loopback
 from gdp.links.veth import attach_pairs, switch_end
@@ -27,7 +28,7 @@ from gdp.nodes.audit import audit_folder
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node import Loop, Node, common_handlers, common_sources
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, OnWait
+from gdp.nodes.node_log import OnWait
 from gdp.nodes.rights import confine_switch
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.rtnetlink import LinkMonitor
@@ -101,7 +102,7 @@ def run_switch(
         dynamic = [each for each in (links, relay) if each is not None]  # it waits for no neighbour there
         state.unwaited = lambda: attachments.union(_absent(plane, optional), *(each.ports for each in dynamic))
         node.drive(state, runtime, on_wait)
-        runtime.every(RECONCILE_PERIOD_S, lambda _: _end_if_displaced(switch))
+        runtime.every(TICK_S, lambda _: _end_if_displaced(switch))
 
         def reload() -> None:
             node.reload()
@@ -120,7 +121,7 @@ def run_switch(
         if config.sandbox:
             confine_switch(config, chosen.name)
         if links is not None:
-            runtime.every(LINKS_PERIOD_S, links.handle_timer)
+            runtime.every(PACE_S, links.handle_timer)
             stack.callback(lambda: links.close(now().mono_s))
         node.begin(runtime, config.metrics, sources)
         _report_start(identity, chosen, ready)
@@ -163,7 +164,7 @@ def _follow_relay(
     named = frozenset(port.iface for port in config.ports)
     relay = RelayPorts(name=identity.name, switch=switch, runtime=runtime, excluded=named)
     stack.callback(relay.close)
-    runtime.every(RELAY_PERIOD_S, relay.handle_timer)
+    runtime.every(PACE_S, relay.handle_timer)
     return relay
 
 
@@ -236,7 +237,7 @@ def switch_sources(state: SwitchState, chosen: Chosen, loop: Loop) -> Sources:
     """Return the sources of metrics that a switch adds."""
     switch, plane = state.switch, state.plane
     two_paths = switch.multicast.path_counts()  # read in the node's own thread
-    loop.every(RECONCILE_PERIOD_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
+    loop.every(TICK_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""

@@ -24,6 +24,7 @@ from typing import Final
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES
+from gdp.intervals import PACE_S
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
 from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, LinkCallback, Port, ReceivedFrame
 from gdp.ports.rtnetlink import Link, LinkMonitor
@@ -33,7 +34,6 @@ __all__ = ["NetdevPlane", "NoDeviceError"]
 
 log = logging.getLogger(__name__)
 
-_OPEN_AGAIN_S: Final = 0.2
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
 _AUDIT_POLLS: Final = 256  # a busy plane reads the kernel's drops every so many polls, an idle one at each poll
 
@@ -255,7 +255,7 @@ class NetdevPlane(ABC):
         """Retry the devices that could not be opened, if it is time; return the longest wait in seconds."""
         now_s = time.monotonic()
         if now_s >= self._open_again_s:
-            self._open_again_s = now_s + _OPEN_AGAIN_S
+            self._open_again_s = now_s + PACE_S
             for index in list(self._unopened):
                 link = self._links.get(self._ports[index].ifname)
                 if link is not None:

@@ -33,6 +33,7 @@ from gdp.frame.codec import (
     second_path_key,
 )
 from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
+from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
@@ -64,7 +65,7 @@ _CLASSES: Final = (
     TrafficClass.ORDINARY,
     TrafficClass.GUEST,
 )  # in the order of service
-_GREETINGS: Final = (500.0, 128.0)  # per second, and at once; each costs at most 30 us before its rejection
+_GREETINGS: Final = Rate(500.0, burst=128.0)  # per second, and at once; each costs at most 30 us before its rejection
 
 
 @lru_cache(maxsize=4_096)  # more than the number of frequent sizes

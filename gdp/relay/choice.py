@@ -13,13 +13,8 @@ up, and routing prefers the tunnel, because the relay's port costs more::
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
-__all__ = ["LOST_S", "STABLE_S", "START_S", "RelayChoice"]
-
-START_S: Final = 5.0
-LOST_S: Final = 3.0
-STABLE_S: Final = 30.0
+__all__ = ["RelayChoice"]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -34,9 +29,9 @@ class RelayChoice:
     """
 
     begun_s: float
-    start_s: float = START_S
-    lost_s: float = LOST_S
-    stable_s: float = STABLE_S
+    start_s: float = 5.0
+    lost_s: float = 3.0
+    stable_s: float = 30.0
     _was_up: bool = False
     _is_up: bool = False
     _since_s: float | None = None

@@ -22,6 +22,7 @@ from typing import Final
 from gdp.crypto.certificates import Membership
 from gdp.errors import FrameError
 from gdp.frame.codec import ETHER_BYTES
+from gdp.intervals import CONNECT_S
 from gdp.relay.admission import RelayRefusedError
 from gdp.relay.frame_queue import FrameQueue
 from gdp.relay.framing import KEEPALIVE, PREFIX, ControlMessage, ControlType, Deframer, is_gdp_frame, mtu_of
@@ -29,9 +30,8 @@ from gdp.relay.tls_channel import RECORD_BYTES, TlsChannel, TlsError
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["HANDSHAKE_S", "ConnectionCounters", "ConnectionSettings", "ConnectionState", "Limits", "RelayConnection"]
+__all__ = ["ConnectionCounters", "ConnectionSettings", "ConnectionState", "Limits", "RelayConnection"]
 
-HANDSHAKE_S: Final = 5.0  # from the first byte to OPEN
 _BATCH_RECORDS: Final = 4  # of one call of ``data_to_send``
 _WAITING_MAX_BYTES: Final = 2 * _BATCH_RECORDS * RECORD_BYTES  # frames leave in batches of half of it
 _BURST_S: Final = 0.25
@@ -209,7 +209,7 @@ class RelayConnection:
     def get_timer(self, now_s: float) -> float:
         """Return the monotonic second of the next call of ``handle_timer``."""
         if self.state is not ConnectionState.OPEN:
-            return self._begun_s + HANDSHAKE_S
+            return self._begun_s + CONNECT_S
         times = [self._heard_s + self._settings.dead_s, self._sent_s + self._settings.keepalive_s]
         if self.limits is not None and len(self._queue):
             times.append(now_s + self._owed_s(self.limits[1], now_s))
@@ -218,8 +218,8 @@ class RelayConnection:
     def handle_timer(self, now_s: float) -> None:
         """Send a keepalive or end a dead connection, where it is due."""
         if self.state in (ConnectionState.HANDSHAKE, ConnectionState.OPENING):
-            if now_s >= self._begun_s + HANDSHAKE_S:
-                self._close(f"the handshake took longer than {HANDSHAKE_S:g} s")
+            if now_s >= self._begun_s + CONNECT_S:
+                self._close(f"the handshake took longer than {CONNECT_S:g} s")
         elif self.state is ConnectionState.OPEN:
             if now_s >= self._heard_s + self._settings.dead_s:
                 self._close(f"no sign of life for {self._settings.dead_s:g} s")

@@ -1,7 +1,7 @@
 """Endpoint records at a RIB: where switches can be reached across IP networks, for other switches of their domains.
 
 Sans-I/O; time comes in as ``Timestamps``. A switch publishes its own record over its channel, and renews it. The RIB
-verifies membership, role, signature, sequence and quota, and keeps one record of each switch for ``ENDPOINT_LEASE_S``.
+verifies membership, role, signature, sequence and quota, and keeps one record of each switch for ``ENDPOINT.lease_s``.
 The RIBs of a domain equalise the records of its switches.
 
 Records are sent to switches of the record's own domain only, and kept in memory: after a restart of all RIBs the
@@ -24,20 +24,18 @@ from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage, pages
 from gdp.exchange.sync_set import SyncSet, line_of, rank_in
 from gdp.frame.kinds import Kind
+from gdp.intervals import ENDPOINT, LEASE_MIN_S
 from gdp.limits import (
-    ENDPOINT_LEASE_S,
-    ENDPOINT_QUERIES_BURST,
-    ENDPOINT_QUERIES_PER_S,
-    ENDPOINT_RECORDS_BURST,
+    ENDPOINT_QUERIES_RATE,
     ENDPOINT_RECORDS_MAX,
     ENDPOINT_RECORDS_OF_OTHERS_MAX,
-    ENDPOINT_RECORDS_PER_S,
+    ENDPOINT_RECORDS_RATE,
     RIB_WATCHES_MAX,
 )
 from gdp.names import NAME_BYTES, Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.outbox import OutgoingStatement
-from gdp.rib.watches import Asker, Watches
+from gdp.rib.watches import WATCHED_S, Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
@@ -46,8 +44,6 @@ __all__ = ["RibEndpoints"]
 
 _CHANGES: Final = Backoff(0.3, 0.6)
 _CHANGE_TRIES: Final = 3  # nothing acknowledges a change
-_WATCH_S: Final = 30.0  # a switch that requests a record also gets changes for so long
-_LEASE_LEFT_S: Final = 1.0  # a lease that is about to end is not passed on
 
 
 @dataclass(slots=True)
@@ -84,8 +80,8 @@ class RibEndpoints:
         self.records = SyncSet[int](lambda sequence: sequence)
         self._of_others = 0  # records of other domains
         self._watches = Watches(watches)
-        self._record_paces = TokenBuckets(ENDPOINT_RECORDS_PER_S, ENDPOINT_RECORDS_BURST)
-        self._query_paces = TokenBuckets(ENDPOINT_QUERIES_PER_S, ENDPOINT_QUERIES_BURST)
+        self._record_paces = TokenBuckets(*ENDPOINT_RECORDS_RATE)
+        self._query_paces = TokenBuckets(*ENDPOINT_QUERIES_RATE)
         self._changes = Requests[Name]()  # for watchers, by switch
         self._out: list[OutgoingStatement] = []
 
@@ -96,7 +92,7 @@ class RibEndpoints:
         """Return the item of a kept record, or None."""
         kept = self._kept.get(name)
         left_s = 0.0 if kept is None else kept.expires_s - now_s
-        return None if kept is None or left_s < _LEASE_LEFT_S else item_of(kept.record.wire, left_s)
+        return None if kept is None or left_s < LEASE_MIN_S else item_of(kept.record.wire, left_s)
 
     def receive_record(self, statement: Statement, now: Timestamps) -> None:
         """Keep a record that its switch sent over its channel; the switch receives the result.
@@ -123,12 +119,12 @@ class RibEndpoints:
         """
         wire, left_s = record_in(item)
         try:
-            self._keep(parse(wire), now, min(left_s, ENDPOINT_LEASE_S))
+            self._keep(parse(wire), now, min(left_s, ENDPOINT.lease_s))
         except StatementError as error:
             if error.reason is not DropReason.STALE:
                 raise
 
-    def _keep(self, statement: Statement, now: Timestamps, lease_s: float = ENDPOINT_LEASE_S) -> _Kept:
+    def _keep(self, statement: Statement, now: Timestamps, lease_s: float = ENDPOINT.lease_s) -> _Kept:
         known = self._kept.get(statement.signer)
         if known is not None and known.record.wire == statement.wire:  # renewed
             self._check(known, now)
@@ -192,7 +188,7 @@ class RibEndpoints:
             if kept is not None and kept.record.sequence > rank_in(line) and self._may_tell(kept, asker):
                 lacked += [item_of(kept.record.wire, kept.expires_s - now.mono_s)] if self._is_valid(kept, now) else []
             try:
-                self._watches.add(name, asker, now.mono_s + _WATCH_S)
+                self._watches.add(name, asker, now.mono_s + WATCHED_S)
             except StatementError as error:
                 refused = error  # without a watch it learns changes by its next query
         for page in list(pages(lacked)) or [()]:

@@ -8,23 +8,19 @@ above are (RFC 8767 in spirit). A RIB that is back has half a lease to relay the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEVER_S
 from gdp.names import Name
-from gdp.rib.upstream_advertisements import QUIET_S
+from gdp.rib.upstream_advertisements import PROBE_S
 
 __all__ = ["LowerRibs"]
-
-_NEVER_S: Final = float("-inf")
-_KEEP_S: Final = ADVERTISEMENT_LEASE_S / 2  # at a time, and after a RIB is back: it renews within a third
 
 
 @dataclass(slots=True)
 class _Rib:
-    probed_s: float = _NEVER_S
-    heard_s: float = _NEVER_S
-    returned_s: float = _NEVER_S
+    probed_s: float = -NEVER_S
+    heard_s: float = -NEVER_S
+    returned_s: float = -NEVER_S
     is_silent: bool = False
 
 
@@ -46,19 +42,19 @@ class LowerRibs:
         """Return for how many seconds to keep a route that a RIB did not renew; 0: the RIB is alive, the lease ends."""
         known = self._ribs.setdefault(rib, _Rib())
         since_s = now_s - known.probed_s
-        if known.heard_s < known.probed_s and since_s >= QUIET_S:
+        if known.heard_s < known.probed_s and since_s >= 2 * PROBE_S:
             known.is_silent = True
         if known.is_silent:
-            return _KEEP_S
-        left_s = known.returned_s + _KEEP_S - now_s
+            return ADVERTISEMENT.lease_s / 2  # it renews within a third
+        left_s = known.returned_s + ADVERTISEMENT.lease_s / 2 - now_s
         if left_s > 0.0:
             return left_s
-        return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * QUIET_S else QUIET_S
+        return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * 2 * PROBE_S else 2 * PROBE_S
 
     def is_probe_due(self, rib: Name, now_s: float) -> bool:
         """Return whether to probe a RIB whose routes are kept; that counts as done."""
         known = self._ribs.setdefault(rib, _Rib())
-        is_due = now_s - known.probed_s >= QUIET_S
+        is_due = now_s - known.probed_s >= 2 * PROBE_S
         if is_due:
             known.probed_s = now_s
         return is_due

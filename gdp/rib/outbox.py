@@ -6,7 +6,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Response
@@ -15,17 +15,14 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.intervals import LEASE_MIN_S, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
-from gdp.rib.watches import Asker, Watches
+from gdp.rib.watches import WATCHED_S, Asker, Watches
 from gdp.trust.domain import Policy
 
 __all__ = ["OutgoingStatement", "RibOutbox"]
-
-_ADVISED_S: Final = 30.0  # how long members that received a response also receive moves
-_UNREPORTED_S: Final = 1.0  # ... where there are too many for that
 
 
 class OutgoingStatement(NamedTuple):
@@ -88,11 +85,11 @@ class RibOutbox:
         """Send a route to a member that may receive it, and that holds it for the lease."""
         if not self.may_receive(route, to):
             return
-        lease_s = min(max(route.expires_s - now_s, 0.0), _ADVISED_S)
+        lease_s = min(max(route.expires_s - now_s, 0.0), WATCHED_S)
         try:
             self.holders.add(route.name, to, now_s + lease_s)
         except StatementError:
-            lease_s = min(lease_s, _UNREPORTED_S)
+            lease_s = min(lease_s, LEASE_MIN_S)
         response = Response(
             name=route.name,
             advertiser=route.advertiser,

@@ -14,13 +14,14 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError, StoreError
 from gdp.frame.kinds import Kind
+from gdp.intervals import LEASE_MIN_S
 from gdp.names import Name
 from gdp.rib.replication import is_cold
 from gdp.rib.revocations import send_lacked
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState
 from gdp.rib.upstream_advertisements import PROBE_S
-from gdp.rib.upstream_queries import WATCH_AGAIN_S
+from gdp.rib.upstream_queries import WATCH
 from gdp.rib.watches import Asker
 from gdp.sansio import Timestamps
 
@@ -28,7 +29,6 @@ __all__ = ["handle_query_timer", "keep_of_silent_rib", "receive_query", "receive
 
 _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answered in the negative
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
-_STALE_MARGIN_S: Final = 1.0  # for the notice of a longer lease to arrive before the former one ends
 _DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query
 
 
@@ -120,7 +120,7 @@ def _receive_none(state: RibCoreState, response: Response, now: Timestamps) -> N
     """Handle a response that no node advertises a name, or that the tier above does not know."""
     askers = state.upstream_queries.answered(response.name, now.mono_s, is_unknown=response.is_unknown)
     if response.is_unknown:
-        _keep_stale(state, response.name, now.mono_s + WATCH_AGAIN_S, now)
+        _keep_stale(state, response.name, now.mono_s + WATCH.refresh_s, now)
     if not state.store.routes(response.name):
         for asker in askers:
             _send_none(state, response.name, asker.name, now.mono_s, is_unknown=response.is_unknown)
@@ -165,14 +165,14 @@ def _keep_stale(state: RibCoreState, name: Name, until_s: float, now: Timestamps
         state.refusals[DropReason.UNAVAILABLE] += 1  # a shared store that is away, too, keeps its routes itself
         return
     for route in routes:
-        is_lapsing = route.expires_s < until_s + _STALE_MARGIN_S
+        is_lapsing = route.expires_s < until_s + LEASE_MIN_S
         if route.is_from_upstream and is_lapsing and now.unix_s < route.valid_until_unix_s:
-            _keep(state, route, max(until_s, now.mono_s + WATCH_AGAIN_S), now.mono_s)
+            _keep(state, route, max(until_s, now.mono_s + WATCH.refresh_s), now.mono_s)
 
 
 def _keep(state: RibCoreState, route: Route, until_s: float, now_s: float) -> None:
     """Keep a route beyond its lease, and notify those that it concerns."""
-    stale = replace(route, expires_s=until_s + _STALE_MARGIN_S)
+    stale = replace(route, expires_s=until_s + LEASE_MIN_S)
     state.store.put(stale)
     state.outbox.notify(stale, route, now_s)
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gdp.control.rib_replication import Entry, Key
-from gdp.limits import CLOCK_SKEW_S, LEASE_MAX_S
+from gdp.intervals import LEASE_MAX_S
+from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 

@@ -18,7 +18,8 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
-from gdp.limits import ANSWER_BYTES_BURST, ANSWER_BYTES_PER_S, LEASE_MAX_S, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
+from gdp.intervals import LEASE_MAX_S, Rate
+from gdp.limits import ANSWER_BYTES_RATE, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
@@ -37,8 +38,8 @@ __all__ = ["ROUTES", "RibCoreState", "RibSettings"]
 PEERS_MAX: Final = 16
 ROUTES: Final = b"routes"  # without it, several RIBs share the store itself
 _PACE: Final = SyncPace(total_s=1.0, soon_s=0.2, fetch_s=0.5, reply_s=0.005, reply_bytes=128 << 10, draws=64)
-_PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # revocations forwarded to the tier above, of one sender
-_SENT_PER_S, _SENT_BURST = 64.0, 2_048.0  # revocations to one asker, of what it lacks
+_PASSED_RATE: Final = Rate(8.0, burst=128.0)  # revocations forwarded to the tier above, of one sender
+_SENT_RATE: Final = Rate(64.0, burst=2_048.0)  # revocations to one asker, of what it lacks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,9 +90,9 @@ class RibCoreState:
             self.accept_peer(peer, float("-inf"))
         self.started_s: float | None = None
         self.is_warm = not self.exchange.peers or ROUTES not in self.sets
-        self.answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
-        self.passed_paces = TokenBuckets(_PASSED_PER_S, _PASSED_BURST)
-        self.revocation_paces = TokenBuckets(_SENT_PER_S, _SENT_BURST)
+        self.answer_paces = TokenBuckets(*ANSWER_BYTES_RATE)
+        self.passed_paces = TokenBuckets(*_PASSED_RATE)
+        self.revocation_paces = TokenBuckets(*_SENT_RATE)
         self.identities = IdentityChecks()
         self.former = FormerAdvertisers()
         self.now_s = 0.0

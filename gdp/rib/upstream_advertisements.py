@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from gdp.control.rib_replication import Key
+from gdp.intervals import RETRY_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.route import Route
@@ -17,13 +18,11 @@ from gdp.rib.route import Route
 __all__ = ["Passed", "UpstreamAdvertisements"]
 
 _REPEATS: Final = Backoff(0.3, 5.0)
-SILENT_MIN_S: Final = 0.12  # a RIB above that leaves a probe unanswered for so long, or three round trips more ...
-SILENT_MAX_S: Final = 1.0  # ... but no longer than this, is replaced by the next one
+# without an answer to a probe for this and three round trips, at most PROBE_S, the next RIB above replaces this one
+SILENT_MIN_S: Final = 0.12
 PROBE_S: Final = 1.0  # with several RIBs above, the one in use receives a query or a probe at least this often
-RETURN_S: Final = 5.0  # between probes of the RIBs that are preferred to the one in use
+QUIET_S: Final = 2 * PROBE_S  # a RIB above may wait itself for the tier above it
 SEND_MAX: Final = 256  # at once, so that AdvertiseAcks are received in between
-GONE_S: Final = 1.0  # a tier above that is silent for so long is sent one advertisement at a time
-QUIET_S: Final = 2.0  # a RIB above may wait itself for the tier above it
 WAITING_MAX: Final = 65_536
 
 
@@ -93,7 +92,7 @@ class UpstreamAdvertisements:
         """Return the RIBs to probe now, because they are preferred to the one in use."""
         if now_s < self._return_at_s:
             return ()
-        self._probed_s, self._return_at_s = now_s, now_s + RETURN_S
+        self._probed_s, self._return_at_s = now_s, now_s + RETRY_S
         return self._ribs[: self._at]
 
     def record_alive(self, rib: Name, now_s: float) -> bool:
@@ -161,11 +160,11 @@ class UpstreamAdvertisements:
 
     def _use(self, at: int, now_s: float) -> None:
         self._at, self._asked_s, self._probed_s = at, None, None
-        self._return_at_s = now_s + RETURN_S if at else float("inf")
+        self._return_at_s = now_s + RETRY_S if at else float("inf")
         self._requests.start_all(now_s)
 
     def _silent_s(self) -> float:
-        return min(SILENT_MIN_S + 3 * self._round_trip_s, SILENT_MAX_S)
+        return min(SILENT_MIN_S + 3 * self._round_trip_s, PROBE_S)
 
     def _is_gone(self, now_s: float) -> bool:
-        return self._asked_s is not None and now_s - self._asked_s >= GONE_S
+        return self._asked_s is not None and now_s - self._asked_s >= PROBE_S

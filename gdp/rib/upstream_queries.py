@@ -10,20 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from gdp.intervals import NEVER_S, SoftState, renew_after_s
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.watches import Asker
 
-__all__ = ["RETRY_S", "WATCH_AGAIN_S", "DueQuery", "UpstreamQueries"]
+__all__ = ["RETRY_S", "WATCH", "DueQuery", "UpstreamQueries"]
 
 RETRY_S: Final = 0.3
-GIVE_UP_S: Final = 1.2
-WATCH_AGAIN_S: Final = 6.0
-_QUERIES: Final = Backoff(RETRY_S, RETRY_S)
-_RENEWALS: Final = Backoff(RETRY_S, WATCH_AGAIN_S)
-_SILENT: Final = Backoff(WATCH_AGAIN_S, WATCH_AGAIN_S)
+WATCH: Final = SoftState(6.0, periods=3)  # a query for changes
+_QUERIES: Final = Backoff(RETRY_S, RETRY_S)  # four of them, until no RIB above counts as able to answer
+_RENEWALS: Final = Backoff(RETRY_S, WATCH.refresh_s)
+_SILENT: Final = Backoff(WATCH.refresh_s, WATCH.refresh_s)
 OPEN_MAX: Final = 65_536
-_NEVER_S: Final = float("inf")
 
 
 class DueQuery(NamedTuple):
@@ -91,13 +90,13 @@ class UpstreamQueries:
     def watch_s(self, name: Name) -> float:
         """Return for how long to watch a name above: longer than until its query is repeated."""
         question = self._open.get(name)
-        return 3 * WATCH_AGAIN_S if question is not None and question.watch_until_s else 0.0
+        return WATCH.lease_s if question is not None and question.watch_until_s else 0.0
 
     def is_waiting(self, name: Name) -> bool:
         """Return whether a response from above is still pending."""
         return self._requests.is_open(name)
 
-    def answered(self, name: Name, now_s: float, lease_s: float = _NEVER_S, *, is_unknown: bool = False) -> list[Asker]:
+    def answered(self, name: Name, now_s: float, lease_s: float = NEVER_S, *, is_unknown: bool = False) -> list[Asker]:
         """Record a response; return the askers that waited for it. More responses may come for the same askers.
 
         Args:
@@ -107,7 +106,7 @@ class UpstreamQueries:
         question = self._open.get(name)
         if question is None:
             return []
-        again_s = now_s + max(min(WATCH_AGAIN_S, lease_s / 3), RETRY_S)
+        again_s = now_s + max(min(WATCH.refresh_s, renew_after_s(lease_s)), RETRY_S)
         self._requests.answered(name, again_s)
         self._requests.hasten(name, again_s)  # another update renews no watch, but its lease may be short
         question.is_unknown = is_unknown
@@ -125,7 +124,7 @@ class UpstreamQueries:
             question, is_open = self._open[name], self._requests.is_open(name)
             if not is_open:
                 question.askers = []
-            elif question.askers and now_s - question.asked_s >= GIVE_UP_S:
+            elif question.askers and now_s - question.asked_s >= 4 * RETRY_S:
                 given_up.append((name, question.askers))
                 question.askers = []
             if not question.askers and question.watch_until_s <= now_s:

@@ -5,7 +5,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gdp.crypto.certificates import Membership, Role
 from gdp.due_queue import DueQueue
@@ -14,7 +14,9 @@ from gdp.limits import RIB_WATCHES_MAX
 from gdp.message.shares import Shares
 from gdp.names import Name
 
-__all__ = ["Asker", "Watches"]
+__all__ = ["WATCHED_S", "Asker", "Watches"]
+
+WATCHED_S: Final = 30.0  # for which who received a response receives changes, too
 
 
 class Asker(NamedTuple):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from gdp.due_queue import earliest
+from gdp.intervals import LOOK_S
 from gdp.limits import COST_DEFAULT
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 
 DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not
 _STREAK_MAX = 8
-_DRAIN_PERIOD_S = 0.05  # between checks of the remaining work, if nothing else wakes the loop
 
 
 def now() -> Timestamps:
@@ -91,7 +91,7 @@ class Runtime:
                 return True
             if deadline_s is not None and time.monotonic() >= deadline_s:
                 return False
-            self.step(time.monotonic() + _DRAIN_PERIOD_S if self.is_draining else deadline_s)
+            self.step(time.monotonic() + LOOK_S if self.is_draining else deadline_s)
             self._end_when_drained()
         return until is None
 

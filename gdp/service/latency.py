@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
+from gdp.intervals import REFUSED_S
 from gdp.names import Name
 
 __all__ = ["Latencies"]
 
 RECENT: Final = 512  # responses in the percentiles
 ENOUGH: Final = 32  # of them; fewer give no tail
-LATELY_S: Final = 10.0  # a server without a response for so long is tried again, however slow it was
 _WEIGHT: Final = 0.2  # of the newest response in a server's average
 _SORT_EVERY: Final = 16  # responses
 _UNANSWERED_MAX: Final = 3  # stopped requests in succession, after which a server is asked last
@@ -83,7 +83,7 @@ class Latencies:
     def _expected(self, server: Name, now_s: float) -> tuple[bool, float]:
         """Return whether a server seems not to respond, and after how many seconds it would."""
         entry = self._servers.get(server)
-        if entry is None or now_s - entry.seen_s > LATELY_S:
+        if entry is None or now_s - entry.seen_s > REFUSED_S:
             return False, -1.0
         silent_s = 0.0 if entry.owing_s is None else now_s - entry.owing_s  # it may have died
         seconds = inf if entry.average_s is None else max(entry.average_s, silent_s)

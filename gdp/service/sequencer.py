@@ -39,7 +39,7 @@ from gdp.service.replication_messages import (
     call_of,
     place_of,
 )
-from gdp.service.snapshots import SnapshotRequests
+from gdp.service.snapshots import LOAD_S, SnapshotRequests
 
 __all__ = ["Effect", "Sequencer"]
 
@@ -47,7 +47,6 @@ A = TypeVar("A")
 
 GENERATION_MAX: Final = 1 << 63  # no log gets this far; the next generation must still fit into 64 bits
 AGAIN_S: Final = 0.25  # between probes of a replica that does not follow
-SILENT_S: Final = 10.0  # for a replica that has a snapshot to load
 _UNLIKE: Final = "its state differs from the others', and theirs cannot be sent to it"
 _UNKNOWN: Final = "what state its server is in is not known; restart it"
 
@@ -282,7 +281,7 @@ class Sequencer(Generic[A]):
         self._follow(root, self._replicas[root], AttachReplica(self.log, 0, best.log, best.at, None), now_s)
 
     def _follow(self, server: Name, replica: Replica, word: AttachReplica, now_s: float) -> None:
-        replica.quiet_until_s, replica.is_offered = now_s + SILENT_S, True
+        replica.quiet_until_s, replica.is_offered = now_s + LOAD_S, True
         self._effects.append(ReplicaCommand(server, word))
 
     def _admit(self, server: Name, replica: Replica, position: ReplicaStatus, now_s: float) -> None:

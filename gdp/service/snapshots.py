@@ -13,9 +13,9 @@ from gdp.service.replicas import Replicas
 from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import LogId, ReplicaCommand, Snapshot, SnapshotRequest
 
-__all__ = ["SnapshotRequests"]
+__all__ = ["LOAD_S", "SnapshotRequests"]
 
-_TIMEOUT_S: Final = 10.0
+LOAD_S: Final = 10.0  # until a replica counts as silent that has a snapshot to send, or to load
 
 
 class SnapshotRequests:
@@ -42,7 +42,7 @@ class SnapshotRequests:
         if server is None or (entries.state is not None and tellers[server] <= entries.state.at):
             return False
         self._server = server
-        self._until_s = now_s + _TIMEOUT_S
+        self._until_s = now_s + LOAD_S
         self._effects.append(ReplicaCommand(server, SnapshotRequest(log)))
         return True
 

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Generator, Sequence
 from types import TracebackType
 from typing import TypeVar
 
+from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.loop_driver import LoopDriver
 from gdp.session.node import SessionNode
@@ -21,13 +22,7 @@ from gdp.session.protocol.errors import ClosedError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
 from gdp.session.protocol.wire import message_to_wire
-from gdp.session.session import (
-    ATTACH_TIMEOUT_S,
-    CALL_TIMEOUT_S,
-    GOODBYE_S,
-    LINGER_S,
-    checked_response,
-)
+from gdp.session.session import CALL_TIMEOUT_S, checked_response
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
 
@@ -222,7 +217,7 @@ class AsyncSession(BaseSession[LoopDriver, AsyncPublisher, AsyncSubscription, As
             self.driver.close()
             self._node.close()
 
-    async def wait_until_attached(self, timeout_s: float = ATTACH_TIMEOUT_S) -> None:
+    async def wait_until_attached(self, timeout_s: float = ATTACH_S) -> None:
         """Wait until a switch has accepted the node.
 
         Raises:
@@ -294,7 +289,7 @@ def open_session_async(
     delegations: str | os.PathLike[str] | None = None,
     state: str | os.PathLike[str] | None = None,
     lease_s: float | None = None,
-    timeout_s: float = ATTACH_TIMEOUT_S,
+    timeout_s: float = ATTACH_S,
 ) -> _Opening:
     """Open a session in the running event loop; ``await`` it, or enter it with ``async with``.
 

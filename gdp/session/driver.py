@@ -4,7 +4,7 @@ I/O. One thread at a time leads: it holds the lock, waits for frames, and lets t
 
     a thread that waits for a message   leads until it has one; so a message wakes one thread, not two
     further threads that wait           follow: the leader wakes them when their condition has come true
-    no thread waits                     the background thread leads, once none has for ``_GRACE_S``
+    no thread waits                     the background thread leads, once none has for ``SCHEDULED_S``
     a thread that publishes             does it itself if no thread leads; else it passes the message to the leader
 
 Commands are passed without lost wake-ups: a thread queues its command before it finds the lock taken, and the thread
@@ -25,6 +25,7 @@ from typing import Final, Protocol, TypeVar
 
 from gdp.client.publisher import Publisher
 from gdp.errors import GdpError
+from gdp.intervals import SCHEDULED_S
 from gdp.runtime.runtime import Runtime
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import ClosedError
@@ -35,7 +36,6 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_GRACE_S: Final = 0.02  # from the end of the last leader until the background thread leads
 _QUEUED_MAX: Final = 1_024  # messages queued for the leader; a thread with more waits for the leader
 _COPY_MAX_BYTES: Final = 65_536  # a larger message is passed only if the leader takes it at once
 _SMALL_BYTES: Final = 1_024  # a message of this size leaves with one send
@@ -329,7 +329,7 @@ class ThreadDriver:
     def _park(self, leads: int) -> None:
         """Sleep while threads of the program lead, and for a grace time after."""
         while not self._is_closed:
-            self._unparked.wait(_GRACE_S)
+            self._unparked.wait(SCHEDULED_S)
             if self._leads == leads and not self._is_led and not self._followers:
                 return
             if self._leads == leads and self._is_led:  # the same leader has waited for the whole time

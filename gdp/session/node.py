@@ -16,12 +16,12 @@ from typing import Final
 from gdp.client.participant import Participant
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
+from gdp.intervals import TICK_S
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node import Node
-from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.runtime.runtime import Runtime, now
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import SessionError
@@ -59,7 +59,7 @@ class SessionNode(Node):
             state.local_name = lambda name: labels.get(name, name.short)
             self.drive(state, self.runtime)
             self.begin(self.runtime)
-            self.runtime.every(RECONCILE_PERIOD_S, EpochTimer(self.reload_for_epoch).handle_timer)
+            self.runtime.every(TICK_S, EpochTimer(self.reload_for_epoch).handle_timer)
             self._opened = stack.pop_all()
 
     def waiting_for(self) -> str:

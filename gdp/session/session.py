@@ -15,6 +15,7 @@ from functools import partial
 from types import TracebackType
 from typing import Final, TypeVar
 
+from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
 from gdp.session.node import SessionNode
@@ -29,10 +30,7 @@ __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
 
 log = logging.getLogger(__name__)
 
-ATTACH_TIMEOUT_S: Final = 10.0
 CALL_TIMEOUT_S: Final = 10.0
-LINGER_S: Final = 1.0
-GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 
 _C = TypeVar("_C")
 
@@ -276,7 +274,7 @@ class Session(BaseSession[Driver, Publisher, Subscription, Server, Handler]):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close(0.0 if error is not None else LINGER_S)
 
-    def wait_until_attached(self, timeout_s: float = ATTACH_TIMEOUT_S) -> None:
+    def wait_until_attached(self, timeout_s: float = ATTACH_S) -> None:
         """Wait until a switch has accepted the node.
 
         Raises:
@@ -310,7 +308,7 @@ def open_session(
     state: str | os.PathLike[str] | None = None,
     lease_s: float | None = None,
     busy_poll_us: int | None = None,
-    timeout_s: float = ATTACH_TIMEOUT_S,
+    timeout_s: float = ATTACH_S,
 ) -> Session:
     """Open a session: attach this process to the overlay as a node.
 

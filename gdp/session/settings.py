@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from gdp.config.config import LeaseSeconds
 from gdp.config.schema import Directory, Domain, Ifname, Section, first_fault, load
 from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
 
@@ -37,7 +37,7 @@ class SessionConfig(Section):
     iface: Ifname
     delegations: Directory | None = None
     state: Directory | None = None
-    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
+    lease_s: LeaseSeconds = ADVERTISEMENT.lease_s
     busy_poll_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
     # keys that only proxy.yaml uses
     ros: object = None

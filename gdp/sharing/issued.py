@@ -17,12 +17,13 @@ from pydantic import ValidationError
 from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, first_fault
 from gdp.errors import LocalError
+from gdp.intervals import DAY_S
 from gdp.limits import CLOCK_SKEW_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.sharing.state import links_of
 from gdp.stores.files import private, read_private, write_all
-from gdp.stores.issue import DAY_S, delegate
+from gdp.stores.issue import delegate
 from gdp.stores.keyring import load_owner
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor

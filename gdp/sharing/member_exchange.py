@@ -14,6 +14,7 @@ from typing import Final, TypeVar
 from gdp.enrolment.domain_client import DomainClient, delete_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
 from gdp.errors import GdpError
+from gdp.intervals import CACHE_S
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
 from gdp.sharing.exchange import Mail, MailKind
@@ -23,7 +24,6 @@ from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["MemberExchange"]
 
-_KEPT_S: Final = 30.0  # how long an answer about the nodes, or a failure, holds
 _KINDS: Final = frozenset(each.value for each in MailKind)
 _T = TypeVar("_T")
 
@@ -65,7 +65,7 @@ class MemberExchange:
         if self._nodes_until_s is None or self._clock() >= self._nodes_until_s:
             machines = self._request(lambda client: client.nodes())
             self._nodes = [each.proxy for each in machines if each.proxy is not None]
-            self._nodes_until_s = self._clock() + _KEPT_S
+            self._nodes_until_s = self._clock() + CACHE_S
         return self._nodes
 
     def send(self, to: Name, kind: str, data: bytes) -> None:
@@ -114,5 +114,5 @@ class MemberExchange:
             return ask(self._client)
         except UnreachableError as error:
             self.close()
-            self._failure = self._clock() + _KEPT_S, error
+            self._failure = self._clock() + CACHE_S, error
             raise

@@ -15,6 +15,7 @@ from gdp.config.drop_in import drop_in_directory, read_drop_in, write_drop_in
 from gdp.config.offered_qos import OfferedQos
 from gdp.config.yaml_source import Plain, YamlSource, read_yaml
 from gdp.errors import ConfigError, LocalError
+from gdp.intervals import RELOAD_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
 from gdp.ros_names import is_name, matches
@@ -25,7 +26,6 @@ __all__ = ["LiveNames", "ProxyFiles", "Side", "StatedRule", "Undelegated", "fits
 Side: TypeAlias = Literal["expose", "import"]
 
 DROP_IN: Final = "gdp-share.yaml"
-_ANSWER_S: Final = 10.0
 _OTHER_FORMAT: Final = "the proxy reports its names in another format; restart it with this version"
 
 
@@ -168,7 +168,7 @@ class ProxyFiles:
             LocalError: it keeps the old ones; the text gives its reason.
         """
         try:
-            answer = ask_node(self._socket(), Command.RELOAD, _ANSWER_S)
+            answer = ask_node(self._socket(), Command.RELOAD, RELOAD_S)
         except NotRunningError:
             return False
         if not answer.is_ok:
@@ -182,7 +182,7 @@ class ProxyFiles:
             LocalError: it does not answer, or answers in another format.
         """
         try:
-            answer = ask_node(self._socket(), Command.STATUS, _ANSWER_S)
+            answer = ask_node(self._socket(), Command.STATUS, RELOAD_S)
         except NotRunningError:
             return LiveNames()
         listed, qos = (answer.result.get(key, []) for key in ("undelegated", "qos"))

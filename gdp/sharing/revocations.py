@@ -8,17 +8,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
+from gdp.intervals import RELOAD_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
 
 __all__ = ["publish_revocations"]
-
-_ANSWER_S: Final = 10.0
 
 
 def publish_revocations(path: Path, statements: Sequence[bytes]) -> bool:
@@ -34,7 +32,7 @@ def publish_revocations(path: Path, statements: Sequence[bytes]) -> bool:
     files = {f"{hashlib.sha256(wire).hexdigest()[:32]}.revoke": public(wire) for wire in statements}
     write_all(config.revocations, files, force=True)
     try:
-        answer = ask_node(config.control_socket or find_control_socket(config.identity), Command.RELOAD, _ANSWER_S)
+        answer = ask_node(config.control_socket or find_control_socket(config.identity), Command.RELOAD, RELOAD_S)
     except NotRunningError:
         return False
     if not answer.is_ok:

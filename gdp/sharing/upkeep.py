@@ -10,9 +10,9 @@ import logging
 import threading
 import time
 from pathlib import Path
-from typing import Final
 
 from gdp.errors import GdpError
+from gdp.intervals import STOP_S, UPKEEP_S
 from gdp.sharing.exchange import Exchange
 from gdp.sharing.sharing import Sharing
 from gdp.stores.keyring import OWNER_KEY
@@ -20,9 +20,6 @@ from gdp.stores.keyring import OWNER_KEY
 __all__ = ["ShareUpkeep"]
 
 log = logging.getLogger(__name__)
-
-_EACH_S: Final = 1.0
-_STOP_S: Final = 3.0  # a pass may wait for a server that does not answer
 
 
 class ShareUpkeep:
@@ -33,7 +30,7 @@ class ShareUpkeep:
         each_s: seconds between two passes.
     """
 
-    def __init__(self, directory: Path, exchange: Exchange, *, each_s: float = _EACH_S) -> None:
+    def __init__(self, directory: Path, exchange: Exchange, *, each_s: float = UPKEEP_S) -> None:
         self._directory = directory
         self._exchange = exchange
         self._each_s = each_s
@@ -48,7 +45,7 @@ class ShareUpkeep:
     def stop(self) -> None:
         """End the upkeep; return when the present pass is over, or after a few seconds."""
         self._ended.set()
-        self._thread.join(_STOP_S)
+        self._thread.join(STOP_S)
 
     def work(self) -> None:
         """Do one pass; problems are logged."""

@@ -12,6 +12,7 @@ from typing import Final
 
 from gdp.control.diagnostics import Reply
 from gdp.errors import LocalError
+from gdp.intervals import MINUTE_S, PROMPT_S
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
@@ -23,8 +24,6 @@ __all__ = ["DiagnosticCommands", "Row", "TableSource", "as_json"]
 Row = Mapping[str, object]
 TableSource = Callable[[Timestamps], Sequence[Row]]
 
-_TIMEOUT_S: Final = 0.5
-_TIMEOUT_MAX_S: Final = 60.0
 _PAGE_ROWS: Final = 200  # each below 500 bytes: the socket's buffer holds a page, which is sent in one piece
 
 
@@ -62,7 +61,7 @@ class DiagnosticCommands:
             on_reply=answer,
             name=_name(arguments, "name") or ZERO,
             body={key: _from_json(value) for key, value in body.items()},
-            timeout_s=_number(arguments, "timeout_s", _TIMEOUT_S, 0.001, _TIMEOUT_MAX_S),
+            timeout_s=_number(arguments, "timeout_s", PROMPT_S, 0.001, MINUTE_S),
             reply_bytes=int(_number(arguments, "reply_bytes", 0, 0, DIAGNOSTIC_REPLY_MAX_BYTES)),
             hops=int(_number(arguments, "hops", HOPS_MAX, 1, HOPS_MAX)),
         )

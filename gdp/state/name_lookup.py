@@ -19,6 +19,7 @@ from contextlib import suppress
 from typing import Final
 
 from gdp.errors import LocalError, StatementError
+from gdp.intervals import IDLE_S
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
@@ -29,7 +30,6 @@ __all__ = ["ADVERTISERS_MAX", "SwitchLookups", "rib_lookup"]
 
 ADVERTISERS_MAX: Final = 64  # in one answer
 _SETTLE_S: Final = 0.2  # further advertisers may follow the first response
-_FORGET_S: Final = 10.0  # a client that asks no more
 _LOOKUPS_MAX: Final = 64  # at once
 
 
@@ -47,12 +47,12 @@ class SwitchLookups:
             LocalError: too many names are being looked up.
         """
         now_s, resolver, rib = now.mono_s, self._switch.resolver, self._switch.rib
-        self._since_s = {each: since_s for each, since_s in self._since_s.items() if now_s < since_s + _FORGET_S}
+        self._since_s = {each: since_s for each, since_s in self._since_s.items() if now_s < since_s + IDLE_S}
         since_s = self._since_s.get(name)
         state = "no-rib"
         if rib is not None and since_s is None:
             if len(self._since_s) >= _LOOKUPS_MAX:
-                raise LocalError(f"{_LOOKUPS_MAX} names are being looked up; try again in {_FORGET_S:g} s")
+                raise LocalError(f"{_LOOKUPS_MAX} names are being looked up; try again in {IDLE_S:g} s")
             self._since_s[name] = now_s
             self._switch.query_name(name, now_s)
             state = "asked"

@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Generic, TypeVar
 
+from gdp.intervals import TICK_S
+
 __all__ = ["BackgroundDatabase"]
 
 log = logging.getLogger(__name__)
 
-RETRY_S: Final = 0.5  # between two attempts to write a slice
 _SLICES_WAITING_MAX: Final = 4
 
 _S = TypeVar("_S")
@@ -128,7 +129,7 @@ class BackgroundDatabase(ABC, Generic[_S]):
                         self._write(database, slice_, is_first=is_first)
                 except sqlite3.Error as error:
                     self._write_failed(error)
-                    if self._is_closing.wait(RETRY_S):
+                    if self._is_closing.wait(TICK_S):
                         break
                 else:
                     self._written(slice_)

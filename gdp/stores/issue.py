@@ -19,6 +19,7 @@ from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError, StatementError
+from gdp.intervals import DAY_S
 from gdp.limits import CHAIN_MAX
 from gdp.metadata import Metadata
 from gdp.names import Name
@@ -59,7 +60,6 @@ from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
 __all__ = [
-    "DAY_S",
     "admit",
     "admit_node",
     "delegate",
@@ -77,7 +77,6 @@ __all__ = [
     "widened",
 ]
 
-DAY_S: Final = 86_400
 ROOT_DAYS: Final = 3_650.0
 MEMBER_DAYS: Final = 365.0
 DELEGATION_DAYS: Final = 365.0

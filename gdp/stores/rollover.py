@@ -18,9 +18,9 @@ from gdp.crypto.certificates import Root
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
+from gdp.intervals import DAY_S
 from gdp.stores.audit_log import note_once
 from gdp.stores.files import private, public, read_private, read_public, refuse_existing, write_all
-from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import ROOT_CERTIFICATE, ROOT_KEY, load_domain, load_root, save_domain
 from gdp.trust.audit import Action
 

@@ -18,7 +18,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, ADVERTISEMENTS_WINDOW
+from gdp.limits import ADVERTISEMENTS_RATE, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
@@ -71,7 +71,7 @@ class AdvertisementHandler:
         self._rib_client = rib_client
         self._locations = locations
         self._relocations = relocations
-        self._paces = TokenBuckets(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
+        self._paces = TokenBuckets(*ADVERTISEMENTS_RATE)
         self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the node's nonce
 
     def receive_advertisement(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:

@@ -32,6 +32,8 @@ from itertools import product
 from typing import Final, NamedTuple
 
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.tunnel_plan import DIAL_S
+from gdp.intervals import Rate
 from gdp.limits import DIRECT_TUNNELS_MAX
 from gdp.names import Name
 from gdp.requests import Backoff
@@ -39,19 +41,15 @@ from gdp.token_bucket import TokenBuckets
 
 __all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Silence", "Slot", "slots_between"]
 
-SLOT_S: Final = 1.0  # each pair is tried for this time
 _PAIRS_MAX: Final = 4  # of one type
 _ROUNDS_AT_ONCE: Final = 3  # before the first pause: the first packet of one end opens its NAT for the other's second
 _PAUSES: Final = Backoff(2.0, 60.0)  # by rounds
 _JITTER: Final = 0.25  # of a pause, up or down
 _SILENT_FROM: Final = 3  # the fourth pause, and later ones, are silent
 _SILENCE_S: Final = 32.0  # longer than nf_conntrack_udp_timeout, 30 s
-_STAGGER_S: Final = 0.5  # between the two ends after a silence, at most; in half of the rounds there is none
-_RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
-_MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
+_MOVED_S: Final = 5.0  # after a change of a record: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
-_OPENS_PER_S: Final = 0.1  # of one peer's tunnel: each makes devices
-_OPENS_BURST: Final = 8.0
+_OPENS_RATE: Final = Rate(0.1, burst=8.0)  # of one peer's tunnel: each makes devices
 _REDUNDANT_S: Final = 30.0  # a tunnel next to a local link is closed after this time
 _IPV4_PRIVATE_BITS: Final = 16  # two private addresses with this prefix may be in one network
 
@@ -219,7 +217,7 @@ class DirectTunnels:
         self._attempts: dict[Name, _Attempt] = {}
         self._own: EndpointRecord | None = None
         self._ranks: dict[Name, bytes] = {}  # of the members at the last call of ``peers``
-        self._opens = TokenBuckets(_OPENS_PER_S, _OPENS_BURST)
+        self._opens = TokenBuckets(*_OPENS_RATE)
 
     def peers(self, members: Iterable[Name], linked: Collection[Name]) -> list[Name]:
         """Return the switches whose records are of use, the most preferred first.
@@ -316,7 +314,8 @@ class DirectTunnels:
     @staticmethod
     def _watch(attempt: _Attempt, now_s: float, *, is_up: bool, is_linked: bool) -> None:
         if attempt.is_up and not is_up:
-            wait_s = 0.0 if now_s - attempt.changed_s <= _MOVED_S else _RECOVER_S
+            # it may recover by itself, for WireGuard follows a peer that moves, but not if an end has just moved
+            wait_s = 0.0 if now_s - attempt.changed_s <= _MOVED_S else DIAL_S
             attempt.due_s, attempt.at, attempt.round, attempt.stagger_s = now_s + wait_s, 0, 0, 0.0
         attempt.is_up = is_up and bool(attempt.configured)
         if attempt.is_up:
@@ -346,7 +345,7 @@ class DirectTunnels:
         slot = attempt.slots[attempt.at]
         while attempt.due_s <= now_s:
             slot = attempt.slots[attempt.at]
-            attempt.due_s += SLOT_S
+            attempt.due_s += DIAL_S
             attempt.at += 1
             if attempt.at == len(attempt.slots):
                 pause_s = self._pause_s(attempt.record.name, attempt.round)
@@ -380,7 +379,7 @@ class DirectTunnels:
         if pause_s < _SILENCE_S:
             return 0.0
         draw = hashlib.sha256(self._me + self._hash(peer, str(pause_s).encode())).digest()[0] / 256
-        return max(0.0, 2 * draw - 1) * _STAGGER_S
+        return max(0.0, 2 * draw - 1) * DIAL_S / 2  # in half of the rounds there is none
 
     def _rank(self, peer: Name) -> bytes:
         return self._ranks.get(peer) or self._hash(peer, b"rank")

@@ -18,7 +18,7 @@ from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of, rank_in
-from gdp.limits import ENDPOINT_LEASE_S
+from gdp.intervals import ENDPOINT, RETRY_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
@@ -26,10 +26,8 @@ from gdp.trust.domain import Policy
 
 __all__ = ["EndpointExchange", "Refusal"]
 
-_RENEW_S: Final = ENDPOINT_LEASE_S / 3
 _REPEATS: Final = Backoff(0.3, 4.8)
 _RECORD, _QUERY = StatementType.ENDPOINTS, StatementType.SYNC  # what is sent
-_QUERY_S: Final = 5.0
 
 
 class Refusal(NamedTuple):
@@ -113,14 +111,14 @@ class EndpointExchange:
             kept_sequence = next((rank_in(line) for name, line in response.lacking if name == own.name), 0)
             if response.refused is not None:
                 self.refusal = Refusal(response.refused, kept_sequence)
-                self._requests.answered(_RECORD, now.mono_s + _QUERY_S)
+                self._requests.answered(_RECORD, now.mono_s + RETRY_S)
             elif kept_sequence == own.sequence:
                 self.refusal = None
-                self._requests.answered(_RECORD, now.mono_s + _RENEW_S)
+                self._requests.answered(_RECORD, now.mono_s + ENDPOINT.refresh_s)
             elif not self._requests.tries(_RECORD):
                 self._requests.start(_RECORD, now.mono_s)  # the RIB has lost it
         if self._requests.tries(_QUERY):
-            self._requests.answered(_QUERY, now.mono_s + _QUERY_S)
+            self._requests.answered(_QUERY, now.mono_s + RETRY_S)
         refused: StatementError | None = None
         for item in response.items:
             try:

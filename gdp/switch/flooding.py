@@ -22,7 +22,8 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
+from gdp.intervals import LINK_STATE
+from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATES_RATE
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.damping import Damping
@@ -71,7 +72,7 @@ class Flooding:
         self.link_states = state.paths.link_states
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
-        self._paces = TokenBuckets(LINK_STATES_PER_S, LINK_STATES_BURST)
+        self._paces = TokenBuckets(*LINK_STATES_RATE)
         self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are rejected
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope does not renew the other
@@ -197,7 +198,7 @@ class Flooding:
 
     def _originate(self, now_s: float) -> None:
         if self.is_displaced:
-            self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE_REFRESH_S)
+            self._refresh_at_s = dict.fromkeys(self._refresh_at_s, now_s + LINK_STATE.refresh_s)
             return
         up = [each for each in self._state.neighbours.all_up() if not self._is_leaf or each.domain == self._domain]
         switches = [each for each in up if each.role.is_switch]
@@ -261,7 +262,7 @@ class Flooding:
         ).fitted(self._state.identity.membership)
         wire = self._state.signed_wire(state)
         self.link_states.put(state, wire, now_s)
-        self._refresh_at_s[scope] = now_s + LINK_STATE_REFRESH_S
+        self._refresh_at_s[scope] = now_s + LINK_STATE.refresh_s
         self._flood(scope, wire)
 
     def _outdo(self, state: LinkState, now_s: float) -> None:

@@ -14,7 +14,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
-from gdp.limits import JOINS_BURST, JOINS_PER_S
+from gdp.limits import JOINS_RATE
 from gdp.sansio import Timestamps
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
@@ -33,7 +33,7 @@ class JoinHandler:
         self._state = state
         self._multicast = multicast
         self._relocations = relocations
-        self._paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)
+        self._paces = TokenBuckets(*JOINS_RATE)
 
     def handle_join(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Handle a join, or a leave, which has no lease.

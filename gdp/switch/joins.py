@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from gdp.control.join import Join, Route
 from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
 from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S
+from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.switch.forwarding_state import ForwardingState
@@ -78,7 +78,7 @@ class JoinSender:
         if terms is None:
             tree.sent.pop(at, None)  # it is gone, and so is its state of our joins
             return
-        wire = self._wire(tree, terms, JOIN_LEASE_S, evidence)
+        wire = self._wire(tree, terms, JOIN.lease_s, evidence)
         tree.sent[at] = SentJoin(self._sequence, name, terms)
         if not tree.unknown:
             self._state.outbox.say_at(*at, Kind.JOIN, wire)

@@ -19,8 +19,8 @@ from gdp.trust.right import Right
 
 __all__ = ["LocalAdvertisement", "LocalAdvertisements"]
 
-RELAY_AGAIN_S: Final = 0.4  # many attempts in a lease: a relay over a lossy path often fails
-_RELAY_MAX_S: Final = 3.2  # over a slow link
+# many attempts in a lease, for a relay over a lossy path often fails; fewer over a slow link
+_RELAYS: Final = Backoff(0.4, 3.2)
 _ROUND_TRIPS: Final = 2.0
 RELAY_TRIES: Final = 20
 _Key: TypeAlias = tuple[Name, Name]  # name, advertiser
@@ -137,13 +137,13 @@ class LocalAdvertisements:
         Args:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
-        interval_s = min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
+        interval_s = _RELAYS.bounded_s(_ROUND_TRIPS * trip_s)
         # behind a slow link the relays of all names are a queue of their own, for which the next ones must not count
-        repeats, due = Backoff(interval_s, _RELAY_MAX_S if interval_s > RELAY_AGAIN_S else interval_s), []
+        repeats, due = Backoff(interval_s, interval_s if interval_s == _RELAYS.first_s else _RELAYS.most_s), []
         for key in self._relays.poll_due(now_s):
             name, advertiser = key
             each = self._by_name[name][advertiser]
-            each.is_slow = interval_s > RELAY_AGAIN_S
+            each.is_slow = interval_s > _RELAYS.first_s
             self._relays.sent(key, now_s, repeats)
             if self._relays.tries(key) == RELAY_TRIES:
                 self._relays.cancel(key)

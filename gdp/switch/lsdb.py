@@ -17,7 +17,8 @@ from gdp.control.hello import DIGEST_BYTES
 from gdp.control.hello_port import HelloPort
 from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S
+from gdp.intervals import LINK_STATE
+from gdp.limits import LINK_STATE_AGE_MAX_S
 from gdp.names import Name
 
 __all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStateDatabase"]
@@ -97,7 +98,7 @@ class LinkStateDatabase:
             raise StatementError(DropReason.QUOTA, "link states")
         if known is not None and known.state.incarnation_id != state.incarnation_id:
             self._bury(known.state, now_s)
-        self._entries[key] = _Entry(state, wire, now_s + LINK_STATE_LEASE_S)
+        self._entries[key] = _Entry(state, wire, now_s + LINK_STATE.lease_s)
         self._digests.clear()
         if known is None or _ways(known.state) != _ways(state):
             self.version += 1

@@ -27,7 +27,8 @@ from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, StatementError
-from gdp.limits import JOIN_LEASE_S, JOIN_PROOF_LEASE_S, TREES_MAX
+from gdp.intervals import JOIN, JOIN_PROOF
+from gdp.limits import TREES_MAX
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.switch.forwarding_state import ForwardingState
@@ -186,7 +187,7 @@ class MulticastTrees:
             self.upstream.place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
         branch = Branch(
-            expires_s=now_s + min(join.lease_s, JOIN_LEASE_S),
+            expires_s=now_s + min(join.lease_s, JOIN.lease_s),
             mtu=join.mtu,
             evidence=join.evidence,
             said_mtu=join.mtu,
@@ -194,7 +195,7 @@ class MulticastTrees:
             session=join.sender_session,
             route=join.route,
             place=(join.switch, join.domain),
-            proven_until_s=now_s + JOIN_PROOF_LEASE_S,
+            proven_until_s=now_s + JOIN_PROOF.lease_s,
         )
         branch.fit(self._state.outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
@@ -227,7 +228,7 @@ class MulticastTrees:
             ):
                 unknown.append(number)
                 continue
-            branch.expires_s = min(now_s + JOIN_LEASE_S, branch.proven_until_s)
+            branch.expires_s = min(now_s + JOIN.lease_s, branch.proven_until_s)
             self._entries.install(tree)
         if unknown:
             self._joins.send_unknown(at, neighbour.name, tuple(unknown))

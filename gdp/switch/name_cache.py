@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import Right
@@ -49,7 +49,7 @@ class NameCache:
         serves_stale: no RIB responds, so entries outlive their leases.
     """
 
-    def __init__(self, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
+    def __init__(self, lease_s: float = ADVERTISEMENT.lease_s) -> None:
         self._lease_s = lease_s
         self._confirm_s = lease_s / 2
         self._locations: dict[Name, dict[Name, Location]] = {}

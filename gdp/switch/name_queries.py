@@ -18,7 +18,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
+from gdp.intervals import ADVERTISEMENT, NEVER_S
+from gdp.limits import PENDING_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.switch.query_window import QueryWindow
@@ -32,14 +33,13 @@ _RENEWALS: Final = 3  # repeated soon; on a link whose queue is full, more would
 QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
 BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
 USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
-_NEVER_S: Final = float("inf")
 
 
 @dataclass(slots=True, kw_only=True)
 class _Query:
     since_s: float
     owner: bytes = b""  # the neighbour whose share it uses
-    sent_s: float = -_NEVER_S
+    sent_s: float = -NEVER_S
     is_watch: bool = False  # an attached reader needs all advertisers of the name
     used_until_s: float = 0.0  # frames are sent to the name
     passed_over: set[Name] = field(default_factory=set)  # RIBs that do not know the name
@@ -53,7 +53,7 @@ class NameQueries:
             frames are sent to is watched for twice as long after the last use.
     """
 
-    def __init__(self, watch_s: float = ADVERTISEMENT_LEASE_S) -> None:
+    def __init__(self, watch_s: float = ADVERTISEMENT.lease_s) -> None:
         self.watch_s = watch_s
         self._use_watch_s = 2 * watch_s
         self._watch_renewals = Backoff(RETRY_S, watch_s / 4, growing=_RENEWALS)
@@ -80,7 +80,7 @@ class NameQueries:
         query = self._queries.get(name)
         if query is None:
             if len(self._queries) - self._watches < QUERIES_MAX:
-                self._add(name, _Query(since_s=now_s, owner=owner), _NEVER_S)
+                self._add(name, _Query(since_s=now_s, owner=owner), NEVER_S)
                 self._window.put(owner, name)
         elif not self._requests.is_open(name):
             self._requests.start(name, max(now_s, query.sent_s + RETRY_S))

@@ -22,13 +22,8 @@ from typing import Final, NamedTuple
 from gdp.control.neighbour import Neighbour
 from gdp.due_queue import earliest
 from gdp.errors import DropReason
-from gdp.limits import (
-    ADVERTISEMENT_LEASE_S,
-    QUESTIONS_BURST,
-    QUESTIONS_PER_S,
-    SWITCH_QUESTIONS_BURST,
-    SWITCH_QUESTIONS_PER_S,
-)
+from gdp.intervals import ADVERTISEMENT
+from gdp.limits import QUESTIONS_RATE, SWITCH_QUESTIONS_RATE
 from gdp.names import Name
 from gdp.switch.name_cache import Location, NameCache
 from gdp.switch.name_queries import NameQueries
@@ -68,14 +63,14 @@ class NameResolver:
         pending: frames that wait for a response.
     """
 
-    def __init__(self, me: Name, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
+    def __init__(self, me: Name, lease_s: float = ADVERTISEMENT.lease_s) -> None:
         self._me = me
         self.cache = NameCache(lease_s)
         self.queries = NameQueries(lease_s)
         self.pending = PendingFrames()
         self._rates = {
-            _FROM_NODE: TokenBuckets(QUESTIONS_PER_S, QUESTIONS_BURST),
-            _FROM_SWITCH: TokenBuckets(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
+            _FROM_NODE: TokenBuckets(*QUESTIONS_RATE),
+            _FROM_SWITCH: TokenBuckets(*SWITCH_QUESTIONS_RATE),
         }
         self._refused: Counter[DropReason] = Counter()
 

@@ -11,6 +11,7 @@ from typing import Final
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.due_queue import earliest
+from gdp.intervals import UPKEEP_S
 from gdp.switch.flooding import Flooding
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
@@ -21,7 +22,6 @@ from gdp.switch.unicast import Unicast
 __all__ = ["PathUpdates"]
 
 _PROTECT_S: Final = 0.1  # from new paths to their alternates
-_CONFLICTS_S: Final = 1.0  # between two checks of identities that other switches refuse
 
 
 class PathUpdates:
@@ -88,7 +88,7 @@ class PathUpdates:
             self._unicast.refresh(now_s)
         if self._unicast.is_refreshing:
             self._unicast.refresh_more(now_s)
-        if now_s >= self._conflicts_sought_s + _CONFLICTS_S:
+        if now_s >= self._conflicts_sought_s + UPKEEP_S:
             self._find_conflicts(now_s)
 
     def get_timer(self) -> float | None:
@@ -97,7 +97,7 @@ class PathUpdates:
         if self._unicast.is_refreshing:
             times.append(self._followed_s)  # in the past: due at once
         if self._state.paths.refused_elsewhere():
-            times.append(self._conflicts_sought_s + _CONFLICTS_S)
+            times.append(self._conflicts_sought_s + UPKEEP_S)
         return earliest(*times)
 
     def _find_conflicts(self, now_s: float) -> None:

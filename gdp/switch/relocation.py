@@ -25,6 +25,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
 from gdp.control.relayed_statement import relayed
 from gdp.frame.kinds import Kind
+from gdp.intervals import PACE_S
 from gdp.names import ZERO, Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
@@ -34,12 +35,10 @@ from gdp.trust.advertisement import Advertisement
 
 __all__ = ["GRACE_S", "Relocations"]
 
-GRACE_S: Final = 4.0  # how long the former switch handles frames for a moved node itself, and redirects senders
+GRACE_S: Final = 4.0  # for which the former switch handles frames for a moved node, redirects senders, and responds
 _DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
 _REMEMBERED_MAX: Final = 4_096
 _NOTICE_AT_S: Final = (0.0, 0.1, 0.4, 1.2)  # one datagram may be lost
-_FORMER_S: Final = 3.0  # how long responses of a former switch are accepted
-_SAY_EVERY_S: Final = 0.1  # between two messages to one neighbour about one node
 
 _Key = tuple[Name, Name]  # name and advertiser
 
@@ -87,7 +86,7 @@ class Relocations:
             (advertisement.name, advertisement.node),
             _Notice(advertisement.previous, statement, advertisement.sequence, now_s),
         )
-        _remember(self._former, advertisement.previous, now_s + _FORMER_S)
+        _remember(self._former, advertisement.previous, now_s + GRACE_S)
         self.handle_timer(now_s)
 
     def acknowledged(self, name: Name, advertiser: Name, sequence: int) -> None:
@@ -167,7 +166,7 @@ class Relocations:
     def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
         """Return whether a message to a neighbour about a name is allowed now, and record it as sent."""
         key = (name, neighbour.port, neighbour.mac)
-        if now_s - self._said.get(key, float("-inf")) < _SAY_EVERY_S:
+        if now_s - self._said.get(key, float("-inf")) < PACE_S:
             return False
         _remember(self._said, key, now_s)
         return True

@@ -22,6 +22,7 @@ from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import StatementError
 from gdp.frame.kinds import Kind
+from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
@@ -37,7 +38,6 @@ __all__ = ["RevocationHandler"]
 
 GRACE_S: Final = 0.5
 _SUBMITTED: Final = Backoff(0.3, 60.0)  # of a revocation that the operator submitted
-_TICK_S: Final = 0.1
 _PER_TICK: Final = 4
 
 
@@ -120,7 +120,7 @@ class RevocationHandler:
             return []
         wires = []
         for fingerprint in self._requests.poll_due(now_s, _PER_TICK):
-            self._next_send_s = now_s + _TICK_S
+            self._next_send_s = now_s + PACE_S
             revocation, wire = self._handed_in[fingerprint]
             if self._revoked.has(revocation.fingerprint, revocation.issuer.owner_key):
                 self._requests.sent(fingerprint, now_s, _SUBMITTED)

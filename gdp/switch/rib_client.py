@@ -32,6 +32,7 @@ from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.frame.kinds import Kind
+from gdp.intervals import REFUSED_S
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.endpoint_exchange import EndpointExchange
@@ -44,7 +45,6 @@ from gdp.switch.unicast import Unicast
 __all__ = ["SILENT_S", "RibClient"]
 
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
-_AVOID_S: Final = 10.0  # a RIB that owed a response for too long is avoided for so long, if there is another
 _REFILL_S: Final = 10.0  # how long negative responses of a RIB that is new here do not override known locations
 
 
@@ -153,7 +153,7 @@ class RibClient:
     def _leave_silent_rib(self, silent: Name, now_s: float) -> None:
         """Avoid a RIB; if it is the one in use, switch to another, and where there is none, serve known locations."""
         self._avoided = {rib: until_s for rib, until_s in self._avoided.items() if until_s > now_s}
-        self._avoided[silent] = self._review_s = now_s + _AVOID_S
+        self._avoided[silent] = self._review_s = now_s + REFUSED_S
         self._owed.pop(silent, None)
         if silent == self.rib:
             self._state.resolver.cache.serve_stale(True, now_s)

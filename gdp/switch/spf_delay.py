@@ -14,9 +14,6 @@ from typing import Final
 
 __all__ = ["TRANSITIONS", "SpfDelay", "SpfEvent", "SpfState"]
 
-INITIAL_S: Final = 0.005
-SHORT_S: Final = 0.05
-LONG_S: Final = 0.3
 TIME_TO_LEARN_S: Final = 0.5
 HOLD_DOWN_S: Final = 2.0
 
@@ -49,7 +46,8 @@ TRANSITIONS: Final[dict[tuple[SpfState, SpfEvent], SpfState]] = {
     (_S.LONG_WAIT, _E.LEARNED): _S.LONG_WAIT,
     (_S.LONG_WAIT, _E.HELD_DOWN): _S.QUIET,
 }
-_DELAYS_S: Final = {_S.QUIET: INITIAL_S, _S.SHORT_WAIT: SHORT_S, _S.LONG_WAIT: LONG_S}
+# INITIAL_SPF_DELAY, SHORT_SPF_DELAY and LONG_SPF_DELAY
+_DELAYS_S: Final = {_S.QUIET: 0.005, _S.SHORT_WAIT: 0.05, _S.LONG_WAIT: 0.3}
 
 
 class SpfDelay:

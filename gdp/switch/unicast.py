@@ -17,6 +17,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
 from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
+from gdp.intervals import LINK_STATE, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
@@ -25,9 +26,7 @@ from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
 __all__ = ["Unicast"]
 
-NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link states renew
 STALE_S: Final = 5.0  # an entry for a location whose lease has ended, while no RIB responds
-NEGATIVE_S: Final = 0.5
 _REFRESH_AT_ONCE: Final = 4_096  # paths; about 50 ms
 
 
@@ -183,17 +182,17 @@ class Unicast:
         neighbour = self._state.neighbours.cheapest(destination)
         # a proxy is where its advertisement was accepted
         if neighbour is not None and neighbour.role is not Role.PROXY:
-            self._install(destination, b"", self._state.outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
+            self._install(destination, b"", self._state.outbox.hop(neighbour), source, now_s + LINK_STATE.refresh_s)
             return None
         if self._state.paths.is_switch(destination):
             domain = self._state.paths.domain_of(destination) or self._own_domain
             way = self._state.paths.to_switch(destination, domain, self._transit | {domain})
             otherwise = self._why(destination, domain)
-            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s, otherwise)
+            self._install_way(destination, b"", way, source, now_s + LINK_STATE.refresh_s, now_s, otherwise)
             return None
         if self._state.paths.is_rib(destination):
             way, _ = self._state.paths.to_rib(destination, self._transit)
-            self._install_way(destination, b"", way, source, now_s + NODE_LEASE_S, now_s)
+            self._install_way(destination, b"", way, source, now_s + LINK_STATE.refresh_s, now_s)
             return None
         return self._resolve_by_rib(destination, source, owner, now_s)
 
@@ -286,5 +285,5 @@ class Unicast:
     def _install_negative(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
         """Make the data plane drop such frames briefly, unless a tree stands there."""
         key = destination + source
-        if not self._state.table.entries.get(key) and self._state.table.install(key, NOWHERE, now_s + NEGATIVE_S):
+        if not self._state.table.entries.get(key) and self._state.table.install(key, NOWHERE, now_s + NEGATIVE_LEASE_S):
             self._note(key, _Installed(destination, source, reason))

@@ -25,7 +25,8 @@ from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
-from gdp.limits import JOIN_PROOF_S, JOIN_REFRESH_LOSSY_S, JOIN_REFRESH_S, JOINS_AGAIN_MAX, JOINS_LOST_FROM
+from gdp.intervals import JOIN, JOIN_PROOF
+from gdp.limits import JOINS_AGAIN_MAX, JOINS_LOST_FROM
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.switch.forwarding_state import ForwardingState
@@ -37,8 +38,8 @@ __all__ = ["OVERLAP_S", "UpstreamJoins"]
 
 OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
 
-_NEW_JOINS: Final = Backoff(0.1, JOIN_REFRESH_S)
-_NEW_JOINS_MAX: Final = 4  # renewals of a new join, then one every JOIN_REFRESH_S
+_NEW_JOINS: Final = Backoff(0.1, JOIN.refresh_s)
+_NEW_JOINS_MAX: Final = 4  # renewals of a new join, then one every JOIN.refresh_s
 _SETTLED_JOINS: Final = 2  # renewals after which a tree has settled
 _TICK_EARLY: Final = 0.25  # of an interval: the first renewal at a tick comes at least 0.75 intervals after the last
 
@@ -85,7 +86,7 @@ class UpstreamJoins:
     def ask(self, tree: Tree, now_s: float, *, renews: bool = False) -> None:
         """Send a join upstream; ``renews``: its number suffices if nothing in it has changed."""
         upstream = self._next_hop(tree)
-        tree.renew_at_s = self._tick_s(JOIN_REFRESH_S, now_s)
+        tree.renew_at_s = self._tick_s(JOIN.refresh_s, now_s)
         if (None if upstream is None else upstream[0]) != tree.upstream:
             self._part_from_above(tree, now_s, keep=upstream is not None)
             if upstream is not None:
@@ -103,10 +104,10 @@ class UpstreamJoins:
             tree.joins += 1
             tree.renew_at_s = now_s + _NEW_JOINS.pause_s(tree.joins)
         elif self._state.neighbours.loss_between(upstream[0][0], upstream[1]) >= JOINS_LOST_FROM:
-            tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
+            tree.renew_at_s = self._tick_s(JOIN.refresh_s / 4, now_s)
         is_proof_due = not renews or now_s >= tree.prove_at_s
         if is_proof_due:  # spread, so that the whole joins of many trees do not leave together
-            tree.prove_at_s = now_s + JOIN_PROOF_S * (1 + tree.topic[0] / 255) / 2
+            tree.prove_at_s = now_s + JOIN_PROOF.refresh_s * (1 + tree.topic[0] / 255) / 2
         self._show(tree, renews=not is_proof_due)
         if has_settled and self._state.paths.has_alternates:
             self._ask_for_backup(tree, renews=not is_proof_due)

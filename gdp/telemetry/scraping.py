@@ -11,15 +11,15 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.http_server import Answer, HttpServer
+from gdp.intervals import CONNECT_S, Rate
 from gdp.telemetry.health import PROBES, Health, probe
 from gdp.token_bucket import TokenBucket
 
 __all__ = ["scrape_server"]
 
 _CONNECTIONS_MAX: Final = 4
-_CONNECTION_S: Final = 5.0  # even if the client reads slowly
 _BACKLOG: Final = 128
-_ANSWERS_PER_S: Final = 20.0  # a few ms each; a scraper polls every few seconds
+_ANSWERS_RATE: Final = Rate(20.0, burst=20.0)  # a few ms each; a scraper polls every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _JSON: Final = "application/json"
 
@@ -35,7 +35,7 @@ def scrape_server(port: int, text: Callable[[], bytes], health: Callable[[], Hea
     Raises:
         OSError: the port is in use.
     """
-    answers = TokenBucket(_ANSWERS_PER_S, _ANSWERS_PER_S)
+    answers = TokenBucket(*_ANSWERS_RATE)
 
     def answer(path: str) -> Answer:
         """Return the response for a path."""
@@ -49,4 +49,4 @@ def scrape_server(port: int, text: Callable[[], bytes], health: Callable[[], Hea
         return Answer("200 OK" if is_good else "503 Service Unavailable", state, _JSON)
 
     listener = socket.create_server(("127.0.0.1", port), backlog=_BACKLOG)
-    return HttpServer(listener, answer, name="metrics", connections=_CONNECTIONS_MAX, timeout_s=_CONNECTION_S)
+    return HttpServer(listener, answer, name="metrics", connections=_CONNECTIONS_MAX, timeout_s=CONNECT_S)

@@ -21,7 +21,8 @@ from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, Body, Keyed, octets, 
 from gdp.crypto.statements import StatementType
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_MAX_BYTES, LEASE_MAX_S, LEASE_MIN_S, SPREAD
+from gdp.intervals import LEASE_MAX_S, LEASE_MIN_S
+from gdp.limits import ADVERTISEMENT_MAX_BYTES, SPREAD
 from gdp.names import ZERO, Name
 from gdp.trust.adcert import CHAIN, Chain
 from gdp.trust.right import RIGHT, Right

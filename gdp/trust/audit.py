@@ -5,7 +5,7 @@ changed, removed or inserted line is found. Lines cut off at the end are detecte
 elsewhere.
 
 Single lines are written within the trail's allowance, which grows by one line each ``_LINE_EACH_S``. Excess events are
-counted by kind (action, what, reason), and written each ``_COUNT_EACH_S`` in one line for each kind.
+counted by kind (action, what, reason), and written each minute in one line for each kind.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from enum import Enum
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import MINUTE_S
 
 __all__ = ["BEGIN", "Action", "AuditLine", "AuditTrail"]
 
 BEGIN: Final = "0" * 64  # replaces the hash in the first line
 _LINES_MAX: Final = 200
 _LINE_EACH_S: Final = 10.0
-_COUNT_EACH_S: Final = 60.0
 _KINDS_MAX: Final = 256
 _OTHERS: Final = "others"
 
@@ -141,7 +141,7 @@ class AuditTrail:
         if not self.is_due(mono_s):
             return []
         events, self._lines = self._lines, []
-        if self._counts and mono_s >= self._counted_s + _COUNT_EACH_S:
+        if self._counts and mono_s >= self._counted_s + MINUTE_S:
             events += self._counts.values()
             self._counts, self._counted_s = {}, mono_s
         since_s = 0.0 if self._taken_s is None else mono_s - self._taken_s
@@ -167,4 +167,4 @@ class AuditTrail:
 
     def is_due(self, mono_s: float) -> bool:
         """Return whether ``poll_lines`` would return a line."""
-        return bool(self._lines) or (bool(self._counts) and mono_s >= self._counted_s + _COUNT_EACH_S)
+        return bool(self._lines) or (bool(self._counts) and mono_s >= self._counted_s + MINUTE_S)

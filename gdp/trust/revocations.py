@@ -22,6 +22,7 @@ from gdp.crypto.statements import Statement, assemble
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_set import SyncSet
+from gdp.intervals import Rate
 from gdp.limits import (
     CERTIFICATE_LIFE_MAX_S,
     CLOCK_SKEW_S,
@@ -39,9 +40,9 @@ __all__ = ["ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
 
 ID_BYTES: Final = 8
 OPERATOR: Final = b""  # the origin of this node's own operator: without a rate, never displaced
-_ROOTS_PER_S, _ROOTS_BURST = 1_500.0, 4_096.0  # of one origin; a verification costs about 80 us
-_OWNERS_PER_S, _OWNERS_BURST = 16.0, 512.0  # of one origin
-_ISSUER_PER_S, _ISSUER_BURST = 4.0, 256.0  # of one owner
+_ROOTS_RATE: Final = Rate(1_500.0, burst=4_096.0)  # of one origin; a verification costs about 80 us
+_OWNERS_RATE: Final = Rate(16.0, burst=512.0)  # of one origin
+_ISSUER_RATE: Final = Rate(4.0, burst=256.0)  # of one owner
 _FORGED_COST: Final = 64.0  # tokens for an invalid signature
 _UNTIL_BYTES: Final = 8
 _SIGNATURE_BYTES: Final = 64
@@ -112,9 +113,9 @@ class Revocations:
         self._of_owners = of_owners
         self._per_issuer = per_issuer
         self._per_origin = per_origin
-        self._root_rates = TokenBuckets(_ROOTS_PER_S, _ROOTS_BURST)
-        self._owner_rates = TokenBuckets(_OWNERS_PER_S, _OWNERS_BURST)
-        self._issuer_rates = TokenBuckets(_ISSUER_PER_S, _ISSUER_BURST)
+        self._root_rates = TokenBuckets(*_ROOTS_RATE)
+        self._owner_rates = TokenBuckets(*_OWNERS_RATE)
+        self._issuer_rates = TokenBuckets(*_ISSUER_RATE)
         self._next_end_s = float("inf")  # no revocation ends before, unix seconds
         self.changes: set[KeptKey] | None = None
 

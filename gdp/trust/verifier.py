@@ -15,7 +15,7 @@ from gdp.crypto.certificates import Membership
 from gdp.crypto.statements import Statement, check_sequence, parse
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LEASE_MAX_S, LEASE_MIN_S
+from gdp.intervals import LEASE_MAX_S, LEASE_MIN_S
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.advertisement import MS, Advertisement, UnverifiedAdvertisement
 from gdp.trust.domain import Policy

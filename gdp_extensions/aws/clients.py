@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import boto3
 
 from gdp.errors import LocalError
+from gdp.intervals import CONNECT_S, SERVER_S
 from gdp_extensions.aws.errors import asking
 
 if TYPE_CHECKING:
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Clients", "filters"]
 
-_CONNECT_S = 5.0
-_ANSWER_S = 30.0
 _ATTEMPTS = 4
 _FIRST_REGION = "us-east-1"  # enabled in every account
 
@@ -49,8 +48,8 @@ class Clients:
         with self._lock:
             if region not in self._clients:
                 retries = Config(
-                    connect_timeout=_CONNECT_S,
-                    read_timeout=_ANSWER_S,
+                    connect_timeout=CONNECT_S,
+                    read_timeout=SERVER_S,
                     retries={"mode": "standard", "max_attempts": _ATTEMPTS},
                 )
                 with asking(region):

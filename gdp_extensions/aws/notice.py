@@ -27,17 +27,14 @@ import typer
 
 from fog.host.preemption_notice import write_notice
 from gdp.cli.version import HELP
+from gdp.intervals import ANSWER_S, DRAIN_S, HOUR_S, POLL_S
 from gdp.terminal import echo
 from gdp_extensions.aws.core.instances import DRAIN
 
 __all__ = ["Metadata", "Watch", "main"]
 
 METADATA_URL: Final = "http://169.254.169.254"
-POLL_S: Final = 5.0
-DRAIN_BEFORE_S: Final = 60.0
 _TOKEN_HEADER: Final = "X-aws-ec2-metadata-token"
-_TOKEN_S: Final = 21_600  # the longest allowed lifetime
-_ANSWER_S: Final = 2.0
 _NONE: Final = 404
 _TOKEN_EXPIRED: Final = 401
 
@@ -69,7 +66,9 @@ class Metadata:
 
     def _get(self, path: str) -> str | None:
         for _ in range(2):
-            self._token = self._token or self._ask("PUT", "api/token", {f"{_TOKEN_HEADER}-ttl-seconds": str(_TOKEN_S)})
+            self._token = self._token or self._ask(
+                "PUT", "api/token", {f"{_TOKEN_HEADER}-ttl-seconds": str(6 * HOUR_S)}
+            )
             try:
                 return self._ask("GET", f"meta-data/{path}", {_TOKEN_HEADER: self._token})
             except HTTPError as error:
@@ -83,7 +82,7 @@ class Metadata:
     def _ask(self, method: str, path: str, headers: dict[str, str]) -> str:
         request = Request(f"{self._url}/latest/{path}", headers=headers, method=method)
         try:
-            with self._open(request, timeout=_ANSWER_S) as document:
+            with self._open(request, timeout=ANSWER_S) as document:
                 return str(document.read().decode())
         except HTTPError as error:
             error.close()
@@ -112,7 +111,7 @@ class Watch:
             if leaves_at is not None:
                 self._notice(leaves_at)
                 self._leaves_at = leaves_at
-        is_time = self._leaves_at is not None and now_unix_s >= self._leaves_at - DRAIN_BEFORE_S
+        is_time = self._leaves_at is not None and now_unix_s >= self._leaves_at - DRAIN_S
         if is_time or self._metadata.is_to_drain():
             self._drain()
             return True

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog.providers.aws_config import AwsConfig
 from gdp.errors import LocalError, StoreError
+from gdp.intervals import POLL_S
 from gdp_extensions.aws.clients import filters
 from gdp_extensions.aws.core.run_request import Ground
 from gdp_extensions.aws.errors import is_code
@@ -29,7 +30,6 @@ log = logging.getLogger(__name__)
 _DESCRIPTION: Final = "machines of fog clusters"
 _ENDED: Final = ("terminated",)
 _ENDING: Final = ("shutting-down", "terminated")
-_STEP_S: Final = 2.0
 
 
 def ground_of(client: EC2Client, region: str, config: AwsConfig) -> Ground:
@@ -105,7 +105,7 @@ def remove_groups(client: EC2Client, region: str, patience_s: float) -> None:
                 break
             if time.monotonic() >= end_s:
                 raise StoreError(f"{region}: security group {group} is in use by machines that end: try again")
-            time.sleep(_STEP_S)  # EC2 reports no event when a machine has ended
+            time.sleep(POLL_S)  # EC2 reports no event when a machine has ended
 
 
 def _states_of_users(client: EC2Client, group: str) -> list[str]:

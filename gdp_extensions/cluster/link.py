@@ -31,17 +31,14 @@ from redis.retry import Retry
 from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError, StoreError
 from gdp.host_port import split_host_port
+from gdp.intervals import PACE_S, PROMPT_S, UPKEEP_S
 from gdp.names import Name
 
 __all__ = ["CHANNELS", "ClusterLink", "Command", "tag_of"]
 
 _ALPHABET: Final = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 CHANNELS: Final = tuple(b"{%c}" % char for char in _ALPHABET)  # hash tags: names share 64 slots, and one channel each
-_TIMEOUT_S: Final = 0.5  # a primary that does not respond within this time has failed
-_REFRESH_S: Final = 0.1  # between two readings of the map of slots while something fails
 _REPLICA_MS: Final = 100  # a replica confirms within about a millisecond
-_ALONE_S: Final = 1.0
-_PING_S: Final = 1.0  # between two pings on a connection that only listens
 _ELSEWHERE: Final = (AskError, ClusterDownError, MasterDownError, MovedError, ReadOnlyError, TryAgainError)
 _NO_REPLICAS: Final = "NOREPLICAS"
 
@@ -160,7 +157,7 @@ class ClusterLink:
 
     def keep_alive(self, now_s: float) -> None:
         """Send a ping, if it is due, on the connections that only listen."""
-        if now_s - self._pinged_s < _PING_S:
+        if now_s - self._pinged_s < UPKEEP_S:
             return
         self._pinged_s = now_s
         try:
@@ -196,7 +193,7 @@ class ClusterLink:
             return self._batch(at, commands)
         *replies, replicas = self._batch(at, [*commands, (b"WAIT", 1, _REPLICA_MS)])
         if replicas == 0:
-            self._alone_until_s[at] = time.monotonic() + _ALONE_S  # do not wait for a missing replica
+            self._alone_until_s[at] = time.monotonic() + UPKEEP_S  # do not wait for a missing replica
             self.unreplicated += len(commands)
         return replies
 
@@ -209,8 +206,8 @@ class ClusterLink:
                 port=at[1],
                 username=its.username or None,
                 password=self._password or None,
-                socket_timeout=_TIMEOUT_S,
-                socket_connect_timeout=_TIMEOUT_S,
+                socket_timeout=PROMPT_S,
+                socket_connect_timeout=PROMPT_S,
                 retry=Retry(NoBackoff(), 0),
                 ssl=its.ca is not None,
                 ssl_ca_certs=None if its.ca is None else str(its.ca),
@@ -228,7 +225,7 @@ class ClusterLink:
 
     def _refresh(self) -> None:
         """Read the map of slots from the first server that has one. Raises ``StoreError``: no server has one."""
-        if time.monotonic() - self._refreshed_s < _REFRESH_S:
+        if time.monotonic() - self._refreshed_s < PACE_S:
             raise StoreError("read the map of slots a moment ago")
         reason = "no server is configured"
         for at in dict.fromkeys([*self._primaries.values(), *self._nodes]):

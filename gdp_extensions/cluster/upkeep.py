@@ -10,6 +10,7 @@ from typing import Final
 
 from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError
+from gdp.intervals import UPKEEP_S
 from gdp.nodes.rib_upkeep import Upkeep
 from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
@@ -23,7 +24,6 @@ __all__ = ["ClusterUpkeep"]
 log = logging.getLogger(__name__)
 
 KEEP_ALIVE_S: Final = 0.25
-LOAD_S: Final = 1.0  # between two attempts to load functions into a primary
 
 
 class ClusterUpkeep(Upkeep):
@@ -74,7 +74,7 @@ class ClusterUpkeep(Upkeep):
 
     def _complete(self, now_s: float) -> None:
         """Load the functions into the primaries that did not respond at the start."""
-        self._load_at_s = now_s + LOAD_S
+        self._load_at_s = now_s + UPKEEP_S
         try:
             self.is_complete = load_functions(self._link)
         except LocalError as error:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError
+from gdp.intervals import POLL_S, RETRY_S
 from gdp.management.control_client import (
     NodeConnection,
     NodeEndedError,
@@ -32,9 +33,7 @@ __all__ = ["Poller", "found_sockets", "supervisor_state"]
 log = logging.getLogger(__name__)
 
 _TIMEOUT_S: Final = 1.0  # a node that hangs delays one poll
-_FIND_S: Final = 2.0
 _TOPOLOGY_S: Final = 5.0
-_RETRY_S: Final = 5.0  # a node that refused, did not answer, or is of an older version
 _SWITCHES: Final = ("switch", "leaf")
 
 
@@ -99,7 +98,7 @@ class Poller:
     async def read_nodes(self) -> list[Reading]:
         """Ask every node at once, and return what came within a second."""
         now_s = time.monotonic()
-        if now_s - self._found_at_s >= _FIND_S:
+        if now_s - self._found_at_s >= POLL_S:
             self._found_at_s = now_s
             self._follow(found_sockets() if self._fixed is None else self._fixed)
         due = [each for each in self._sockets.values() if each.retry_at_s <= now_s]
@@ -131,7 +130,7 @@ class Poller:
             log.info("node gone path=%s reason=%s", each.path, error)
         except GdpError as error:
             log.info("node not read path=%s reason=%s", each.path, error)
-            each.retry_at_s = time.monotonic() + _RETRY_S
+            each.retry_at_s = time.monotonic() + RETRY_S
         each.close()
         return {}
 

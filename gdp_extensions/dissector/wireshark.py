@@ -17,6 +17,7 @@ from gdp.cli.output import show
 from gdp.cli.program import Program
 from gdp.errors import LocalError
 from gdp.extras import require_extra
+from gdp.intervals import SERVER_S
 from gdp.stores.files import public, read_public, write_all
 
 __all__ = ["app"]
@@ -26,7 +27,6 @@ app = Program("gdp wireshark")
 _FILE: Final = "gdp.lua"
 _DEFAULT_FOLDER: Final = Path("~/.local/lib/wireshark/plugins")  # Wireshark User's Guide, appendix B.4
 _FOLDER_LABEL: Final = "Personal Lua Plugins:"
-_PATIENCE_S: Final = 10.0
 
 Install = Annotated[bool, typer.Option("--install", help="write it to Wireshark's folder for your own plugins")]
 
@@ -72,7 +72,7 @@ def _plugin_folder() -> Path:
     if program is not None:
         try:
             result = subprocess.run(
-                [program, "-G", "folders"], capture_output=True, text=True, timeout=_PATIENCE_S, check=True
+                [program, "-G", "folders"], capture_output=True, text=True, timeout=SERVER_S, check=True
             ).stdout
         except (OSError, subprocess.SubprocessError) as error:
             raise LocalError(f"{program} -G folders fails, so the folder of plugins is unknown: {error}") from error

@@ -26,6 +26,7 @@ from gdp.access_token import is_access_token, query_token
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
+from gdp.intervals import FORGET_S
 from gdp.ports.listening import listen_tcp
 from gdp.ports.socket_owners import SocketOwners
 from gdp_extensions.doors.core.arrivals import Arrivals
@@ -56,7 +57,6 @@ MESSAGE_MAX_BYTES: Final = 32 << 20  # of one message of a client
 ARRIVING_MAX_BYTES: Final = 64 << 20  # of the messages of all clients that have not come whole yet
 WAITING_MAX_BYTES: Final = 256 << 20  # of what waits for all clients
 _REPORT_S: Final = 1.0  # at most one report of dropped messages a second
-_SILENT_S: Final = 60.0  # a client that answers no ping for so long is disconnected
 _TRY_AGAIN: Final = 1013  # close code of the IANA registry
 
 
@@ -349,7 +349,7 @@ class DoorEndpoint(InProcessEndpoint):
             subprotocols=[Subprotocol(each) for each in self._settings.subprotocols] or None,
             compression=None,
             max_size=MESSAGE_MAX_BYTES,
-            ping_timeout=_SILENT_S,
+            ping_timeout=FORGET_S,
             logger=wire_log,
         )
         started.set()

@@ -8,9 +8,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
-from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
+from gdp.intervals import TICK_S, TURN_S
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from gdp_extensions.doors.endpoint import DoorEndpoint
@@ -25,9 +25,6 @@ log = logging.getLogger(__name__)
 
 OpenDoor = Callable[[Callable[[], DelegatedRules]], DoorEndpoint]
 
-_TICK_S: Final = 0.5
-_TURN_S: Final = 0.0002  # longest wait of the server's thread for the interpreter; Python's default is 5 ms
-
 
 def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
     """Serve clients until stopped; SIGHUP or ``gdp reload`` reads the delegations again.
@@ -35,7 +32,7 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
     Raises:
         LocalError: keys, delegations, the device or the address are not as stated.
     """
-    sys.setswitchinterval(_TURN_S)
+    sys.setswitchinterval(TURN_S)
     with run_node(config, emit_wait if json else None) as node:
         held = DelegationStore(config.delegations, node.identity)
         state = [rules_of(list(held))]
@@ -71,7 +68,7 @@ def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[Deleg
     while not node.runtime.is_stopped:
         now_s = node.step(bridge, tick_at_s)
         if now_s >= tick_at_s:
-            tick_at_s = now_s + _TICK_S
+            tick_at_s = now_s + TICK_S
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
             is_ready = True
             node.tell_refusals()

@@ -36,9 +36,8 @@ _DECREASE: Final = 0.8
 _INCREASE_PER_S: Final = 0.08
 _PROBE_PER_S: Final = 0.01  # increase near the estimate that was too much
 _NEAR: Final = 0.85  # share of it from which on the increase is slow
-_QUIET_S: Final = 2.0  # after a decrease until the estimate rises
 _USE: Final = 0.9  # share of the estimate that is used
-_RECENT_S: Final = 2.0  # for which departures are kept
+_RECENT_S: Final = 2.0  # for which departures are kept, and after a decrease until the estimate rises
 _BASE_S: Final = 30.0  # over which the shortest wait is kept: the path may change
 _QUALITY_PER_S: Final = 10.0  # most points of quality that are regained in a second
 _SIZE_WEIGHT: Final = 0.25  # of the newest message in the mean size
@@ -207,7 +206,7 @@ class AdaptiveQuality:
         """Raise the estimate while nothing is late."""
         elapsed_s = 0.0 if self._updated_s is None else now_s - self._updated_s
         self._updated_s = now_s
-        if now_s - self._lowered_s < _QUIET_S or self._estimate == float("inf"):
+        if now_s - self._lowered_s < _RECENT_S or self._estimate == float("inf"):
             return
         is_near = _NEAR * self._ceiling < self._estimate < self._ceiling
         self._estimate *= 1 + (_PROBE_PER_S if is_near else _INCREASE_PER_S) * min(elapsed_s, 1.0)

@@ -24,6 +24,7 @@ from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import Site
 from gdp.errors import LocalError, StoreError
 from gdp.extras import install_command
+from gdp.intervals import HOUR_S
 from gdp_extensions.skypilot.record import being_made, cluster_name, labels_of, machine_of
 
 __all__ = ["SkyPilotProvider", "open_skypilot"]
@@ -39,7 +40,6 @@ _WRONG: Final = (  # names in sky.exceptions of permanent errors
     "PermissionDeniedError",
     "ClusterDoesNotExist",
 )
-HOUR_S: Final = 3600
 
 
 class SkyPilotProvider:

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 from gdp.client.participant import Message, Topic
 from gdp.due_queue import earliest
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
@@ -47,7 +48,6 @@ log = logging.getLogger(__name__)
 _ENDED_MAX: Final = 256
 _FINISH_S: Final = 10.0  # in which readers may confirm the last messages of a publisher or server that has gone
 _CHANGES_MAX: Final = 512  # of unread flow changes; a bridge of a recording never reads them
-TICK_S: Final = 0.05  # interval at which services check their peers, and pending flows are checked
 
 Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService
 
@@ -303,7 +303,7 @@ class Bridge:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
         if is_tick:
-            self._tick_at_s = now_s + TICK_S
+            self._tick_at_s = now_s + LOOK_S
             self._context.traffic.dropped = sum(dispatcher.endpoint.dropped for dispatcher in self._dispatchers)
 
     def poll_changes(self) -> list[FlowChange]:

@@ -18,6 +18,8 @@ from typing import Final
 
 from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
+from gdp.intervals import DAY_S, LINGER_S
+from gdp.limits import CALL_GRACE_S
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.frames import Answer, Request, Stop
@@ -38,7 +40,7 @@ from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.undescribed_requests import UndescribedRequests
-from proxy.config.rule import CALL_MAX_S
+from proxy.config.rule import CALL_S
 from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
@@ -56,10 +58,6 @@ __all__ = ["ExposedService"]
 # requests that a ROS 2 server has at one time: its queue holds ten by default (rmw_qos_profile_services_default), and
 # clients on its own machine use it, too
 _QUEUE: Final = 8
-_GRACE_S: Final = 0.5  # the client's side ends a call; this side only forgets it
-_CANCEL_S: Final = 5.0
-# a leaving server accepts requests for this long, of clients that have not received its notice yet
-_NOTICE_S: Final = 1.0
 _GONE: Final = "the server is gone"
 
 
@@ -186,7 +184,7 @@ class ExposedService(ServiceFlow):
     def drain(self, now_s: float) -> None:
         """Redirect clients to other servers, and answer calls under way."""
         if self._refuses_from_s is None:
-            self._refuses_from_s = now_s + _NOTICE_S
+            self._refuses_from_s = now_s + LINGER_S  # of clients that have not received its notice yet
             self._publisher.describe(replace(self._exchange, is_leaving=True).to_cbor())
 
     def is_drained(self, now_s: float) -> bool:
@@ -277,8 +275,8 @@ class ExposedService(ServiceFlow):
         """Return the seconds that a call may take; None: as long as its goal."""
         if self.flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
             return None
-        asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
-        return min(asked_s, CALL_MAX_S)
+        asked_s = request.patience_ms / 1e3 + CALL_GRACE_S if request.patience_ms else DAY_S
+        return min(asked_s, DAY_S)  # the most that a rule may state
 
     def _keep(self, number: int) -> OrderedServer:
         return OrderedServer(
@@ -333,7 +331,7 @@ class ExposedService(ServiceFlow):
         self._cancels += 1
         cancel = Asked(self.context.member.name, CANCEL, self._cancels)
         try:
-            self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
+            self._begin(now_s, CALL_S, cancel, cancel_of(goal))
         except LocalError as error:
             self.report(Fault.TOO_FAST, str(error))
 

@@ -12,7 +12,7 @@ from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
@@ -191,7 +191,7 @@ class ExposedTopic:
             return  # the description always comes first: an earlier message belongs to a subscription that was replaced
         self.taken += 1
         if self.last_s is None and self._dispatcher.endpoint.is_live:
-            publisher.await_readers(now_s + READER_LEASE_S)  # the path to readers that wait may come later
+            publisher.await_readers(now_s + READER.lease_s)  # the path to readers that wait may come later
         self.last_s = now_s
         if self.qos.asks_depth:
             if self._depth_probe is None:

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from gdp.intervals import Rate
 from gdp.token_bucket import TokenBucket
 from proxy.endpoints.core.endpoint import RosEndpoint
 
 __all__ = ["LocalResponses"]
 
-_BURST: Final = 5
-_PER_S: Final = 200.0  # a busy node may not run for 25 ms
+_LEAST_RATE: Final = Rate(200.0, burst=5)  # a busy node may not run for 25 ms
 _MEASURED_S: Final = 1.0  # time over which the rate of requests is measured
 _ROUNDING: Final = 1e-6  # of a token, at the very time that the timer gave
 _HEADROOM: Final = 2.0  # responses leave at least so many times as fast as the requests came
@@ -38,7 +38,7 @@ class LocalResponses:
         self._endpoint = endpoint
         self._is_paced = is_paced
         self._waiting: deque[Callable[[], None]] = deque()
-        self._bucket = TokenBucket(_PER_S, _BURST)
+        self._bucket = TokenBucket(*_LEAST_RATE)
         self._requests, self._since_s = 0, float("-inf")
         self.last_s = float("-inf")
 
@@ -49,8 +49,8 @@ class LocalResponses:
         """Count a client's request: clients that make many take many responses."""
         took_s = now_s - self._since_s
         if took_s >= _MEASURED_S:
-            per_s = max(_PER_S, _HEADROOM * self._requests / took_s)
-            self._bucket.change(now_s, per_s, _BURST)
+            per_s = max(_LEAST_RATE.per_s, _HEADROOM * self._requests / took_s)
+            self._bucket.change(now_s, per_s, _LEAST_RATE.burst)
             self._requests, self._since_s = 0, now_s
         self._requests += 1
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason, LocalError, RemoteError
+from gdp.limits import CALLER_AWAY_S
 from gdp.names import Name
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.serial.channel import RosVersion
@@ -19,7 +20,6 @@ from proxy.wire.service import Exchange
 __all__ = ["ClientLiveness", "RemoteClients"]
 
 REMOTE_CLIENTS_MAX: Final = 1_024  # clients whose decoders are kept; the oldest are dropped
-_AWAY_S: Final = 30.0  # a client that sends nothing for this long no longer waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,5 +93,5 @@ class ClientLiveness:
         return [
             client
             for client, heard_s in self._heard_s.items()
-            if client not in present and (bytes(client) not in known or now_s - heard_s >= _AWAY_S)
+            if client not in present and (bytes(client) not in known or now_s - heard_s >= CALLER_AWAY_S)
         ]

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import WATCH_S
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.liveliness import LivelinessTracker, NameLiveliness
 from proxy.config.status_topic import StatusTopicConfig
@@ -24,7 +25,6 @@ __all__ = ["StatusTopic", "open_status_topics", "string_message"]
 
 log = logging.getLogger(__name__)
 
-PAUSE_S: Final = 0.2  # between two observations
 _STRING: Final = "std_msgs/msg/String"
 _CDR: Final = b"\0\1\0\0"
 _LENGTH: Final = struct.Struct("<I")
@@ -52,7 +52,7 @@ class StatusTopic:
 
     def update(self, names: Sequence[NameLiveliness], now_s: float) -> None:
         """Take an observation, and publish it if it differs from the last one."""
-        self._due_s = now_s + PAUSE_S
+        self._due_s = now_s + WATCH_S
         self._tracker.update(names, now_s)
         text = json.dumps({"names": [self._fields(each) for each in names]}, ensure_ascii=False)
         if text != self._published:

@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 
 from gdp.cli.console import Columns
-from gdp.cli.node import AWAIT_IFACE_S, AwaitIface, Check, Config, Json, Logs, MemberPlane, running, with_plane
+from gdp.cli.node import AwaitIface, Check, Config, Json, Logs, MemberPlane, running, with_plane
 from gdp.cli.program import Program
+from gdp.intervals import ATTACH_S
 from gdp.links.uplink import wait_for_device
 from proxy.config.config import ProxyConfig
 
@@ -47,7 +48,7 @@ Schema = Annotated[
 @app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
 def proxy(
     config: Config,
-    await_iface: AwaitIface = AWAIT_IFACE_S,
+    await_iface: AwaitIface = ATTACH_S,
     data_plane: MemberPlane = None,
     check: Check = False,
     columns: Columns = None,

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -19,6 +19,7 @@ from gdp.cli.console import Columns
 from gdp.cli.node import Check, Config, Json, Logs, MemberPlane, emit, emit_wait, running, with_plane
 from gdp.cli.program import Program
 from gdp.errors import LocalError
+from gdp.intervals import ATTACH_S, REPORT_S
 from gdp.terminal import echo
 from proxy.check.command import check_proxy
 from proxy.config.config import ProxyConfig
@@ -35,8 +36,6 @@ __all__ = ["main"]
 
 log = logging.getLogger(__name__)
 
-ATTACH_PATIENCE_S: Final = 30.0
-PROGRESS_S: Final = 5.0  # between log lines of a replay
 
 app = Program("gdp-replay")
 main = app.run
@@ -116,7 +115,7 @@ def _replay(
             nonlocal said_s
             if json:
                 _report_progress(replay, total)
-            elif (now_s := time.monotonic()) >= said_s + PROGRESS_S:
+            elif (now_s := time.monotonic()) >= said_s + REPORT_S:
                 said_s = now_s
                 log.info("progress sent=%d of=%s confirmed=%d", replay.sent, total or "?", replay.confirmed)
 
@@ -124,8 +123,8 @@ def _replay(
         total = _exposed_total(reader, endpoint)
         if not replay.topics:
             raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")
-        if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_PATIENCE_S):
-            raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
+        if not node.runtime.run(lambda: node.member.attachment.is_attached, time.monotonic() + ATTACH_S):
+            raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_S:g} s")
         refused = [each for each in node.member.attachment.advertisements if each.refused is not None]
         for each in refused:
             log.warning("advertisement refused name=%s reason=%s", each.subject.name.short, each.refused)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gdp.cli.program import Program
+from gdp.intervals import TICK_S
 from gdp.names import Name
 from gdp.trust.right import Right
 from proxy.cli.tool_options import Node, ToolOptions, complete_callable, print_json, print_text, running_tool
@@ -23,7 +24,6 @@ __all__ = ["app"]
 
 app = Program("gdp service", no_args_is_help=True)
 
-_LOOK_S = 0.5
 
 ServiceName = Annotated[
     str,
@@ -134,4 +134,4 @@ class _Call:
             seen = "no server is reachable" if self._sent_s is None else "no answer"
             self.reason = f"{seen} within {self._timeout_s:g} s"
             return None
-        return min(now_s + _LOOK_S, end_s)
+        return min(now_s + TICK_S, end_s)

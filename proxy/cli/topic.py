@@ -16,16 +16,9 @@ import typer
 from gdp import terminal
 from gdp.cli.program import Program
 from gdp.errors import RemoteError
+from gdp.intervals import REPORT_S
 from gdp.trust.right import Right
-from proxy.cli.tool_options import (
-    Node,
-    ToolOptions,
-    TypeName,
-    complete_readable,
-    print_json,
-    print_text,
-    running_tool,
-)
+from proxy.cli.tool_options import Node, ToolOptions, TypeName, complete_readable, print_json, print_text, running_tool
 
 if TYPE_CHECKING:
     from proxy.bridge.bridge import Bridge
@@ -39,7 +32,6 @@ __all__ = ["app"]
 app = Program("gdp topic", no_args_is_help=True)
 
 _REPORT_S: Final = 1.0
-_SILENT_S: Final = 5.0  # after this time without a message, why is said once
 
 Name = Annotated[
     str,
@@ -204,12 +196,12 @@ class _Hint:
     def tick(self, bridge: Bridge, now_s: float) -> None:
         """Look at the publishers after a while without a message."""
         self.begun_s = min(self.begun_s, now_s)
-        if self._is_said or now_s < self.begun_s + _SILENT_S:
+        if self._is_said or now_s < self.begun_s + REPORT_S:
             return
         self._is_said = True
         publishers = len(bridge.publishers_of(self._access.name))
         seen = f"{publishers} publishers, none of them sends" if publishers else "no publisher is known"
-        text = f"{self._access.rule.name}: no message within {_SILENT_S:g} s; {seen}; still waiting"
+        text = f"{self._access.rule.name}: no message within {REPORT_S:g} s; {seen}; still waiting"
         terminal.echo(text, err=True)
 
 

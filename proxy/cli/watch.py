@@ -19,6 +19,7 @@ import typer
 from gdp.cli import options
 from gdp.cli.program import Program
 from gdp.errors import LocalError
+from gdp.intervals import ANSWER_S, WATCH_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.ros_names import covers, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles
@@ -30,8 +31,6 @@ __all__ = ["app"]
 
 app = Program("gdp watch")
 
-_PERIOD_S: Final = 0.25  # the control socket has no events
-_ANSWER_S: Final = 5.0
 _NOT_RUNNING: Final = 3
 _NODE_CHARS: Final = 12
 DEFAULT_CONFIG: Final = Path("proxy.yaml")
@@ -111,12 +110,12 @@ def _follow(
         now_s = time.monotonic()
         if end_s is not None and now_s >= end_s:
             return
-        time.sleep(_PERIOD_S if end_s is None else min(_PERIOD_S, max(end_s - now_s, 0.0)))
+        time.sleep(WATCH_S if end_s is None else min(WATCH_S, max(end_s - now_s, 0.0)))
 
 
 def _names(socket: Path) -> tuple[list[NameLiveliness], int]:
     """Return the names that the proxy lists, and how many it left out."""
-    answer = ask_node(socket, Command.STATUS, _ANSWER_S)
+    answer = ask_node(socket, Command.STATUS, ANSWER_S)
     if not answer.is_ok:
         raise LocalError(f"{socket}: {answer.error}")
     names = list(names_from_fields(answer.result.get("liveliness")))

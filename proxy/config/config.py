@@ -36,7 +36,7 @@ from gdp.config.schema import (
     load,
 )
 from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_patterns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
@@ -142,7 +142,7 @@ class ProxyConfig(Section):
     traces: Traces | None = Field(default=None, description="Spans of service calls; needs the extra `otel`.")
     data_plane: UplinkPlane = Field(default="raw", description="`scapy` is slow, for learning.")
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S, description="Lease of its advertisements, seconds; renewed after a third."
+        default=ADVERTISEMENT.lease_s, description="Lease of its advertisements, seconds; renewed after a third."
     )
     busy_poll_us: int = Field(
         default=SPIN_US,

@@ -5,17 +5,16 @@ Section of a configuration file.
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 from pydantic.config import JsonDict
 
 from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
 from gdp.config.schema import Section
+from gdp.intervals import DAY_S
 
 __all__ = ["History", "SomeHistory"]
-
-AGE_MAX_S: Final = 86_400.0
 
 
 class History(Section):
@@ -25,7 +24,7 @@ class History(Section):
     max_bytes: int = Field(
         default=8 << 20, alias="bytes", ge=1, le=HISTORY_BYTES_MAX, description="Most bytes, as they travel."
     )
-    age_s: float | None = Field(default=None, gt=0, le=AGE_MAX_S, description="Longest time in seconds. `null`: any.")
+    age_s: float | None = Field(default=None, gt=0, le=DAY_S, description="Longest time in seconds. `null`: any.")
 
 
 def _history(value: object) -> object:

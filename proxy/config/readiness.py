@@ -11,11 +11,11 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field, model_validator
 
 from gdp.config.schema import Section
+from gdp.intervals import HOUR_S
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, TYPE_FORMS, fits_kind, is_name
 
 __all__ = ["Readiness"]
 
-PERIOD_MAX_S: Final = 3_600.0
 THRESHOLD_MAX: Final = 1_000
 
 
@@ -38,10 +38,10 @@ class Readiness(Section):
     service: LocalName = Field(default=None, description="Local std_srvs/srv/Trigger that must answer `success: true`.")
     topic: LocalName = Field(default=None, description="Or a local topic with a message in each period; needs `type`.")
     type_name: str = Field(default="", alias="type", description="Type of that topic.")
-    period_s: float = Field(default=1.0, ge=0.05, le=PERIOD_MAX_S, description="Seconds between two probes.")
-    timeout_s: float = Field(default=1.0, gt=0, le=PERIOD_MAX_S, description="Seconds that the service may take.")
+    period_s: float = Field(default=1.0, ge=0.05, le=HOUR_S, description="Seconds between two probes.")
+    timeout_s: float = Field(default=1.0, gt=0, le=HOUR_S, description="Seconds that the service may take.")
     initial_delay_s: float = Field(
-        default=0.0, ge=0, le=PERIOD_MAX_S, description="Seconds from the server's appearance to the first probe."
+        default=0.0, ge=0, le=HOUR_S, description="Seconds from the server's appearance to the first probe."
     )
     failure_threshold: int = Field(
         default=3, ge=1, le=THRESHOLD_MAX, description="Failures in a row after which it is not ready."

@@ -23,11 +23,12 @@ from pydantic import (
 from pydantic.config import JsonDict, JsonValue
 from pydantic_core import PydanticCustomError
 
-from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
+from gdp.client.send_options import RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
 from gdp.config.offered_qos import OfferedQos
 from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import DAY_S, HOUR_S
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
@@ -57,7 +58,6 @@ __all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "R
 
 _OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
-CALL_MAX_S: Final = 86_400.0
 COPIES_MAX: Final = 1_024
 AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
@@ -170,7 +170,7 @@ NamePrefix = Annotated[
 Owner = Annotated[PublicKey, BeforeValidator(_owner_key), WithJsonSchema({"type": "string", "minLength": 1})]
 Salt = Annotated[str | None, BeforeValidator(_salt), Field(max_length=4_096, repr=False)]
 ExtraMetadata = Annotated[dict[str, str | int], AfterValidator(_extra_metadata)]
-CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
+CallSeconds = Annotated[float, Field(gt=0, le=DAY_S)]
 
 
 def _by_kind(kind: Kind) -> JsonValue:
@@ -247,7 +247,7 @@ class Rule(Section):
     deadline_ms: float | None = Field(
         default=None,
         gt=0,
-        le=1_000 * DEADLINE_MAX_S,
+        le=1_000 * HOUR_S,
         description="Exposed best-effort topics: time to leave whole. `null`: by QoS.",
     )
     repair: Literal["never", "in-time"] = Field(

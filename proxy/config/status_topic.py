@@ -5,16 +5,13 @@ Section of a configuration file.
 
 from __future__ import annotations
 
-from typing import Final
-
 from pydantic import Field, field_validator
 
 from gdp.config.schema import Section
+from gdp.intervals import DAY_S
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, is_name
 
 __all__ = ["StatusTopicConfig"]
-
-DEADLINE_MAX_S: Final = 86_400.0
 
 
 class StatusTopicConfig(Section):
@@ -28,7 +25,7 @@ class StatusTopicConfig(Section):
     deadline_s: float | None = Field(
         default=None,
         gt=0,
-        le=DEADLINE_MAX_S,
+        le=DAY_S,
         description="Seconds without a message after which a publisher is silent.",
     )
 

@@ -15,6 +15,7 @@ from typing import Final
 from gdp.cli.node import emit, emit_wait, report
 from gdp.errors import LocalError
 from gdp.extras import Seam
+from gdp.intervals import TICK_S, TURN_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
@@ -33,10 +34,8 @@ __all__ = ["open_tracer", "run"]
 
 log = logging.getLogger(__name__)
 
-TICK_S: Final = 0.5
 _LOOK_S: Final = 2.0  # with less, a new proxy may not detect yet that another proxy of its graph carries the same
 DRAIN_MAX_S: Final = 10.0  # after this time a leaving server abandons unanswered requests
-_TURN_S: Final = 0.0002  # longest wait of an endpoint's thread for the interpreter; Python's default is 5 ms
 _TRACERS: Final[Seam[Callable[[Traces, Name, str], CallTracer]]] = Seam("gdp.tracer")
 
 
@@ -49,7 +48,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
     Raises:
         LocalError: keys, delegations or the device are not as configured, or an endpoint is unavailable.
     """
-    sys.setswitchinterval(_TURN_S)
+    sys.setswitchinterval(TURN_S)
     with run_node(settings, emit_wait if json else None) as node:
         state, name = node.state, proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:

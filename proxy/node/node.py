@@ -12,17 +12,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import FrameType
-from typing import Final
 
 from gdp.client.participant import Participant, Topic
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import GOODBYE_S, LINGER_S, TICK_S
 from gdp.links.uplink import open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
 from gdp.nodes.node import Node, common_sources
-from gdp.nodes.node_log import RECONCILE_PERIOD_S, OnWait
+from gdp.nodes.node_log import OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.runtime.runtime import Runtime, now
 from proxy.bridge.bridge import Bridge
@@ -32,9 +32,6 @@ from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 __all__ = ["ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
-
-_CONFIRM_S: Final = 1.0  # in which readers may confirm the last messages; what is not confirmed then is reported
-_GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
 
 class ProxyNode(Node):
@@ -93,12 +90,12 @@ class ProxyNode(Node):
     def leave(self) -> None:
         """Leave the overlay, stopped or not, and run until the goodbye is sent."""
         self.member.leave()
-        self.runtime.linger(time.monotonic() + _GOODBYE_S)
+        self.runtime.linger(time.monotonic() + GOODBYE_S)
 
     def say_goodbye(self, bridge: Bridge) -> None:
         """End all flows, and leave the overlay, also after a signal; a second signal ends each wait."""
         bridge.finish()
-        self.runtime.linger(time.monotonic() + _CONFIRM_S, lambda: bridge.is_finished)
+        self.runtime.linger(time.monotonic() + LINGER_S, lambda: bridge.is_finished)
         bridge.close()
         self.leave()
 
@@ -140,7 +137,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         node = ProxyNode(config, stack, on_wait)
         runtime = node.runtime
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
-        runtime.every(RECONCILE_PERIOD_S, EpochTimer(node.reload_on_signal).handle_timer)
+        runtime.every(TICK_S, EpochTimer(node.reload_on_signal).handle_timer)
         sources = common_sources(node.node_log, proxy_sources(node.state))
         handlers = replace(
             proxy_handlers(node.state, sources),

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import Final
 
 from gdp.cli.node import emit, emit_wait, report
 from gdp.errors import LocalError
+from gdp.intervals import TICK_S
 from gdp.terminal import echo
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.topic_stats import TopicStats
@@ -23,8 +23,6 @@ from proxy.recordings.split import SplitWriter, first_part
 from proxy.serial.channel import RosVersion
 
 __all__ = ["record", "refuse_existing_file"]
-
-TICK_S: Final = 0.5
 
 
 def record(settings: ProxyConfig, *, json: bool) -> bool:

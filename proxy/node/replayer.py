@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.client.publisher import Publisher
+from gdp.intervals import REPORT_S, TICK_S
 from gdp.message.loss import LossReason
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.exposed_topic import ExposedTopic
@@ -24,8 +25,6 @@ __all__ = ["Pace", "Replay", "ReplayedTopic", "Unconfirmed"]
 log = logging.getLogger(__name__)
 
 STALL_S: Final = 20.0  # after this time without any acknowledgement, readers are given up
-REPORT_S: Final = 5.0  # after this time, what readers of best-effort topics have not reported is unknown
-TICK_S: Final = 0.5
 
 _WHY: Final = {
     LossReason.NO_READER: "published without a reader",

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 from gdp.client.participant import Topic
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
+from gdp.intervals import ATTACH_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
@@ -28,9 +29,8 @@ from proxy.endpoints.probe import Probe
 from proxy.node.member_config import member_config
 from proxy.node.node import run_node
 
-__all__ = ["ATTACH_S", "Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
+__all__ = ["Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
 
-ATTACH_S: Final = 10.0
 _ELLIPSIS: Final = ("…", "...")
 _HEX: Final = set("0123456789abcdef")
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S, STOP_S
 
 __all__ = ["BagProcess", "Cost", "RecordingError", "StoppedError"]
 
@@ -33,8 +34,6 @@ main(sys.argv[1:])
 """
 _PASSED: Final = ("PATH", "LD_LIBRARY_PATH", "PYTHONHOME", "LANG", "LC_ALL", "LC_CTYPE")
 _PIPE_BYTES: Final = 1 << 20
-_LOOK_S: Final = 0.05  # interval of the calls to ``waiting``
-_END_S: Final = 5.0
 
 
 class RecordingError(LocalError):
@@ -143,7 +142,7 @@ class BagProcess:
         with contextlib.suppress(PermissionError):  # raised in a process that was confined after it started this one
             self._process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
+            self._process.wait(STOP_S)
 
     def lacks(self, what: str) -> RecordingError:
         """Return the error for a decoder that met the limit of ``memory`` or ``cpu``."""
@@ -157,7 +156,7 @@ class BagProcess:
 
     def _wait(self, waiting: Callable[[], bool] | None) -> None:
         until_s = time.monotonic() + self._cost.wait_s
-        while not self._poll.poll(1e3 * (self._cost.wait_s if waiting is None else _LOOK_S)):
+        while not self._poll.poll(1e3 * (self._cost.wait_s if waiting is None else LOOK_S)):
             if waiting is not None and not waiting():
                 raise StoppedError
             if time.monotonic() >= until_s:
@@ -166,7 +165,7 @@ class BagProcess:
     def _ending(self) -> RecordingError:
         """Return why the process has ended."""
         try:
-            code = self._process.wait(_END_S)
+            code = self._process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             return RecordingError(self._path, "its decoder closed its pipe")
         if code == -signal.SIGXCPU:

@@ -18,7 +18,7 @@ from typing import Final, Literal, TypeAlias
 import yaml
 
 from gdp.crypto.certificates import Role
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
@@ -81,7 +81,7 @@ class OverlayCredentials:
         *,
         metrics: bool = False,
         roamers: Collection[Attachment] = (),
-        lease_s: float = ADVERTISEMENT_LEASE_S,
+        lease_s: float = ADVERTISEMENT.lease_s,
         uplink: Mapping[str, object] | None = None,
     ) -> None:
         self.folder, self.owner = folder, folder / "owner"

@@ -21,9 +21,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.validity import Validity
+from gdp.intervals import ADVERTISEMENT, NEIGHBOUR, SCAPY_KEEPALIVE_MS
 from gdp.journal.incident import Incident
 from gdp.journal.journal import Journal
-from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, HELLO_S, SCAPY_KEEPALIVE_MS
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore
@@ -67,9 +67,9 @@ class Simulation:
     seed: int = 1
     delay_s: float = 0.0005
     lead_mtu: int = 1_500
-    hello_s: float = HELLO_S
-    dead_s: float = DEAD_S
-    lease_s: float = ADVERTISEMENT_LEASE_S
+    hello_s: float = NEIGHBOUR.refresh_s
+    dead_s: float = NEIGHBOUR.lease_s
+    lease_s: float = ADVERTISEMENT.lease_s
     keepalive_ms: int | None = SCAPY_KEEPALIVE_MS
     trusts: dict[str, tuple[str, ...]] | None = None
     transits: Mapping[str, tuple[str, ...]] | None = None

@@ -21,7 +21,7 @@ from rich.markup import escape
 from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
 from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
@@ -146,7 +146,7 @@ def ring(
     ] = None,
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
-    ] = ADVERTISEMENT_LEASE_S,
+    ] = ADVERTISEMENT.lease_s,
     cores: Annotated[bool, typer.Option("--cores", help=CORES_HELP)] = False,
     wide: Annotated[bool, typer.Option("--wide", help="All columns of the table, 200 characters.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,

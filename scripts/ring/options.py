@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
+from gdp.intervals import ADVERTISEMENT, LEASE_MAX_S, LEASE_MIN_S
 from lab.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
@@ -59,7 +59,7 @@ class Options:
     live: Live | None = None
     seconds: float | None = None
     camera_hz: float = CAMERA_HZ
-    lease_s: float = ADVERTISEMENT_LEASE_S
+    lease_s: float = ADVERTISEMENT.lease_s
 
     def __post_init__(self) -> None:
         if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):

@@ -13,7 +13,8 @@ from gdp.control.link_state import Scope
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
+from gdp.intervals import LINK_STATE
+from gdp.limits import LINK_STATE_AGE_MAX_S
 from gdp.rib.core import RibCore
 from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
@@ -119,7 +120,7 @@ def buried(world: Simulation, label: str) -> list[bytes]:
     ]
     assert wires
     world.network.stop(label)
-    world.network.run(LINK_STATE_LEASE_S + LINK_STATE_REFRESH_S + 1)
+    world.network.run(LINK_STATE.lease_s + LINK_STATE.refresh_s + 1)
     return wires
 
 
@@ -165,13 +166,13 @@ def test_a38_numbers_of_the_dead_are_known_for_as_long_as_their_time_could_be_be
     states, incarnation_id = known(), b"1" * 16
     first = replace(state("a", link("b"), sequence=5), incarnation_id=incarnation_id)
     states.put(first, b"wire", 0.0)
-    states.expire(LINK_STATE_LEASE_S)
-    for now_s in (LINK_STATE_LEASE_S, LINK_STATE_LEASE_S + PAST_S - 1):
+    states.expire(LINK_STATE.lease_s)
+    for now_s in (LINK_STATE.lease_s, LINK_STATE.lease_s + PAST_S - 1):
         states.expire(now_s)
         assert states.put(first, b"wire", now_s) is False
-    assert states.put(replace(first, sequence=6), b"wire", LINK_STATE_LEASE_S + PAST_S - 1) is True
-    states.expire(2 * LINK_STATE_LEASE_S + PAST_S)
-    states.expire(2 * (LINK_STATE_LEASE_S + PAST_S))
+    assert states.put(replace(first, sequence=6), b"wire", LINK_STATE.lease_s + PAST_S - 1) is True
+    states.expire(2 * LINK_STATE.lease_s + PAST_S)
+    states.expire(2 * (LINK_STATE.lease_s + PAST_S))
     assert states._past == {}
 
 
@@ -179,11 +180,11 @@ def test_a38_a30_a_new_life_is_heard_below_the_numbers_of_the_last_and_that_stay
     states = known()
     old = replace(state("a", link("b"), sequence=500), incarnation_id=b"1" * 16)
     states.put(old, b"wire", 0.0)
-    states.expire(LINK_STATE_LEASE_S)
+    states.expire(LINK_STATE.lease_s)
     assert states.put(replace(old, sequence=3, incarnation_id=b"2" * 16), b"wire", 200.0) is True
     assert states.put(old, b"wire", 201.0) is False
     for number in range(3, 20):  # an origin that draws incarnations to have its own forgotten
         states.put(replace(old, sequence=500 + number, incarnation_id=bytes([number]) * 16), b"wire", 202.0)
-    states.expire(202.0 + LINK_STATE_LEASE_S)
+    states.expire(202.0 + LINK_STATE.lease_s)
     assert states.put(old, b"wire", 400.0) is False
     assert states.put(replace(old, incarnation_id=b"n" * 16, sequence=501), b"wire", 400.0) is False

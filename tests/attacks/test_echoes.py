@@ -8,7 +8,7 @@ from gdp.control.join import Join
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.statements import parse
 from gdp.errors import StatementError
-from gdp.limits import DEAD_S, HELLO_S
+from gdp.intervals import NEIGHBOUR
 from gdp.names import ZERO
 from tests.gdp.control.members import hello_protocol, node
 from tests.gdp.control.test_neighbour_discovery import A, B, forged, greet, hear, hellos
@@ -21,8 +21,8 @@ def test_x01_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_
     hellos(one, 0.0)  # two never receives these
     nonce = one.ports[0].nonce
     hear(two, forged(MALLORY, nonce=nonce), 0.0, mac=b"\x02mall\x00")
-    for hello in hellos(two, HELLO_S):
-        hear(one, hello, HELLO_S)
+    for hello in hellos(two, NEIGHBOUR.refresh_s):
+        hear(one, hello, NEIGHBOUR.refresh_s)
     assert B.name in one.ports[0].neighbours, "its hello is a good one"
     assert one.ports[0].neighbours[B.name].state is not NeighbourState.UP
 
@@ -61,6 +61,6 @@ def test_x02_a_member_that_said_anothers_nonce_with_a_high_number_does_not_shut_
     (hello,) = hellos(two, 0.0)
     proof = (one.ports[0].echo,)  # a member on the link can be a neighbour
     hear(one, forged(MALLORY, sequence=2**63, heard=proof, nonce=two.ports[0].nonce), 0.0, mac=b"\x02mall\x00")
-    one.drop_silent(2 * DEAD_S)  # the member falls silent, and its session is remembered
-    hear(one, hello, 2 * DEAD_S)
+    one.drop_silent(2 * NEIGHBOUR.lease_s)  # the member falls silent, and its session is remembered
+    hear(one, hello, 2 * NEIGHBOUR.lease_s)
     assert B.name in one.ports[0].neighbours

@@ -25,6 +25,7 @@ from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.errors import StoreError
+from gdp.intervals import Rate
 from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
@@ -256,9 +257,8 @@ def test_a_machine_that_died_while_it_joined_is_removed_and_joins_again(server: 
 def test_a83_the_connections_of_one_address_leave_handshakes_for_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_module, "_ACCEPTS_PER_S", 2.0)
-    monkeypatch.setattr(server_module, "_EACH_PER_S", 1.0, raising=False)
-    monkeypatch.setattr(server_module, "_EACH_BURST", 4.0, raising=False)
+    monkeypatch.setattr(server_module, "CONNECTIONS_RATE", Rate(2.0, burst=2.0))
+    monkeypatch.setattr(server_module, "ADDRESS_CONNECTIONS_RATE", Rate(1.0, burst=4.0))
     with running_lab(tmp_path) as lab, contextlib.ExitStack() as strangers:
         for _ in range(100):
             made = socket.create_connection(("127.0.0.1", lab.port), source_address=("127.0.0.2", 0))

@@ -18,7 +18,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import DropReason, RemoteError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import HELLO_S
+from gdp.intervals import NEIGHBOUR
 from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import at, hello_in, node
 from tests.gdp.control.members import hello_protocol as new_hello_protocol
@@ -247,7 +247,7 @@ def test_a22_a_newcomer_is_accepted_while_recorded_hellos_are_played() -> None:
     other = new_hello_protocol(node("new", Role.PROXY), 77)
     for number in range(64):
         link.inject(said(MEMBERS[number % 40], number.to_bytes(8, "big")), mac_of(number))
-    link.run(HELLO_S)
+    link.run(NEIGHBOUR.refresh_s)
     other.ports[0].hello_at_s = link.now_s
     link.ends.append(other)
     for number in range(64, 192):

@@ -19,7 +19,8 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
-from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_BURST
+from gdp.intervals import Rate
+from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_RATE
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore
@@ -71,8 +72,7 @@ def test_a14_a_proxy_watches_nothing_at_a_rib() -> None:
 
 
 def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.rib.state.ANSWER_BYTES_PER_S", 1_000.0)
-    monkeypatch.setattr("gdp.rib.state.ANSWER_BYTES_BURST", 30_000.0)
+    monkeypatch.setattr("gdp.rib.state.ANSWER_BYTES_RATE", Rate(1_000.0, burst=30_000.0))
     at = rib()
     for number in range(3):
         tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
@@ -90,8 +90,7 @@ def test_a12_what_a_members_questions_draw_from_a_rib_is_paced_in_bytes(monkeypa
 
 
 def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_PER_S", 10.0)
-    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_BURST", 20.0)
+    monkeypatch.setattr("gdp.switch.flooding.LINK_STATES_RATE", Rate(10.0, burst=20.0))
     world = ring()
     flow = flowing(world)
     liar, sequence = world.identities["nuc2"], int(world.network.now.unix_s * 1_000) + 100_000
@@ -137,8 +136,7 @@ def test_a15_a_nodes_advertisements_are_bounded_and_cost_the_same_however_many_t
 def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gdp.switch.advertisements.ADVERTISEMENTS_PER_S", 10.0)
-    monkeypatch.setattr("gdp.switch.advertisements.ADVERTISEMENTS_BURST", 20.0)
+    monkeypatch.setattr("gdp.switch.advertisements.ADVERTISEMENTS_RATE", Rate(10.0, burst=20.0))
     world = ring()
     other = world.add_member("nuc1/other", "nuc1")
     assert world.network.run(5, lambda: other.attachment.is_attached)
@@ -226,7 +224,7 @@ def test_a17_a18_frames_to_invented_names_cause_queries_within_a_budget_and_dela
             world.network.run(0.05)
     switch = world.switches["nuc1"]
     world.network.run(0.5)
-    asked = QUESTIONS_BURST + 2 * 16 * 2
+    asked = QUESTIONS_RATE.burst + 2 * 16 * 2
     assert switch.drops()[DropReason.PENDING_FULL] >= 5_000 - asked
     late = advertise(world, "/late", "nuc1/other")
     late.read_by(SERVER)

@@ -14,6 +14,7 @@ import yaml
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
+from gdp.intervals import Rate
 from gdp.links import relay_server as relay_server_module
 from gdp.links.relay_context import RelayContext
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
@@ -176,9 +177,8 @@ def tap_read(tap: Device) -> bytes:
 def test_a83_the_connections_of_one_address_leave_handshakes_for_others(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(relay_server_module, "_ACCEPTS_PER_S", 2.0)
-    monkeypatch.setattr(relay_server_module, "_EACH_PER_S", 1.0, raising=False)
-    monkeypatch.setattr(relay_server_module, "_EACH_BURST", 1.0, raising=False)
+    monkeypatch.setattr(relay_server_module, "CONNECTIONS_RATE", Rate(2.0, burst=2.0))
+    monkeypatch.setattr(relay_server_module, "ADDRESS_CONNECTIONS_RATE", Rate(1.0, burst=1.0))
     border = start()
     member = border.member("member")
     strangers = [border.connect("127.0.0.2") for _ in range(100)]

@@ -33,7 +33,8 @@ from gdp.exchange.sync_message import ASKED_MAX, ITEMS_MAX, LACKING_MAX, SETS_MA
 from gdp.exchange.sync_set import LINE_BYTES, line_of
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT, SEQUENCE_AHEAD_S
+from gdp.intervals import DAY_S
+from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT
 from gdp.message import bundle
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
@@ -275,7 +276,7 @@ class Forge:
 
     def _far_numbers(self) -> tuple[int, ...]:
         now_ms = int(self._stage.world.network.now.unix_s * 1_000)
-        limit = now_ms + int(SEQUENCE_AHEAD_S * 1_000)
+        limit = now_ms + int(366 * DAY_S * 1_000)
         return now_ms, now_ms - 3_600_000, limit - 1, limit, limit + 1
 
     def _name(self, rng: random.Random) -> Name:

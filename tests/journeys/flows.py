@@ -11,7 +11,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode
-from gdp.limits import SCAPY_KEEPALIVE_MS
+from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.trust.right import Right
 from lab.simulation import Simulation

@@ -18,7 +18,7 @@ from unittest import mock
 import networkx as nx
 from hypothesis import strategies as st
 
-from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
+from gdp.intervals import JOIN, NEIGHBOUR, SoftState
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
@@ -26,7 +26,8 @@ from tests.journeys.flows import Flow, advertise
 SWITCHES_MAX: Final = 40
 DOMAINS_MAX: Final = 6
 TIERS_MAX: Final = 3
-LEASE_S: Final = JOIN_LEASE_S + 1.0  # of names and of link states, so that none is longer
+LEASE_S: Final = JOIN.lease_s + 1.0  # of names and of link states, so that none is longer
+_SHORT: Final = SoftState(LEASE_S / 3, periods=3)
 PERIOD_S: Final = 0.5  # between messages of each publisher
 SETTLE_S: Final = 40.0
 _FAST_SWITCHES: Final = 8  # timers of larger networks are slower in proportion, to save time
@@ -167,8 +168,8 @@ def plans(draw: st.DrawFn, faults_max: int = 2) -> Plan:
 def short_leases() -> Iterator[None]:
     """Make no lease longer than ``LEASE_S``."""
     with (
-        mock.patch("gdp.switch.lsdb.LINK_STATE_LEASE_S", LEASE_S),
-        mock.patch("gdp.switch.flooding.LINK_STATE_REFRESH_S", LEASE_S / 3),
+        mock.patch("gdp.switch.lsdb.LINK_STATE", _SHORT),
+        mock.patch("gdp.switch.flooding.LINK_STATE", _SHORT),
     ):
         yield
 
@@ -189,8 +190,8 @@ class Trial:
         self.world = Simulation(
             topology=self.topology,
             seed=self.plan.seed,
-            hello_s=HELLO_S * slower,
-            dead_s=DEAD_S * slower,
+            hello_s=NEIGHBOUR.refresh_s * slower,
+            dead_s=NEIGHBOUR.lease_s * slower,
             lease_s=LEASE_S,
             transits=self.plan.transits(self.topology),
         )

@@ -9,7 +9,7 @@ from gdp.client.participant import Participant
 from gdp.client.rib_host import RibHost
 from gdp.control.waiting import WaitReason
 from gdp.errors import DropReason
-from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S
+from gdp.intervals import ADVERTISEMENT, NEIGHBOUR
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.right import Right
@@ -77,7 +77,7 @@ def test_the_older_of_two_nodes_keeps_serving_past_three_leases_and_both_are_inf
     assert world.network.run(3, lambda: own_refusal(converter) is DropReason.IN_USE)
     older = world.members[ROBOT].attachment
     assert world.network.run(3, lambda: older.conflict_at == world.switches[ELSEWHERE].name)
-    for _ in range(int(3 * ADVERTISEMENT_LEASE_S)):
+    for _ in range(int(3 * ADVERTISEMENT.lease_s)):
         world.network.run(1)
         assert place_of(world) == "nuc1"
     flow.read_by(SERVER)
@@ -95,7 +95,7 @@ def test_when_the_older_node_dies_the_younger_is_taken() -> None:
     converter = add_converter(world, ELSEWHERE)
     world.network.run(3)
     world.network.stop(ROBOT)
-    assert world.network.run(DEAD_S + 4, lambda: converter.attachment.is_attached)
+    assert world.network.run(NEIGHBOUR.lease_s + 4, lambda: converter.attachment.is_attached)
     assert place_of(world) != "nuc1"
     keeps_its_place(world, converter)
 
@@ -104,7 +104,7 @@ def test_a_node_that_is_killed_and_started_at_another_switch_is_taken_when_its_n
     world = ring(keepalive_ms=None)
     world.network.stop(ROBOT)
     converter = add_converter(world, ELSEWHERE)
-    assert world.network.run(DEAD_S + 0.6, lambda: converter.attachment.is_attached)
+    assert world.network.run(NEIGHBOUR.lease_s + 0.6, lambda: converter.attachment.is_attached)
     keeps_its_place(world, converter)
 
 
@@ -127,7 +127,7 @@ def test_at_one_switch_the_older_of_two_nodes_keeps_its_location_and_both_are_in
     assert older.hello_protocol.conflicts.clash_reporter == world.switches["nuc1"].name
     assert converter.attachment.hello_protocol.conflicts.clashes > 0
     world.network.stop(ROBOT)
-    assert world.network.run(DEAD_S + 2, lambda: converter.attachment.is_attached)
+    assert world.network.run(NEIGHBOUR.lease_s + 2, lambda: converter.attachment.is_attached)
 
 
 def test_the_older_of_two_ribs_serves_and_both_are_informed() -> None:
@@ -142,7 +142,7 @@ def test_the_older_of_two_ribs_serves_and_both_are_informed() -> None:
     assert older.attachment.switch is not None
     assert converter.rib.names == 0
     world.network.stop(world.rib_node("school"))
-    assert world.network.run(DEAD_S + 4, lambda: converter.attachment.switch is not None)
+    assert world.network.run(NEIGHBOUR.lease_s + 4, lambda: converter.attachment.switch is not None)
     assert world.network.run(20, lambda: converter.rib.names > 0)
 
 

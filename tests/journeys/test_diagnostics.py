@@ -13,7 +13,7 @@ from gdp.control.diagnostics import Question, Reply
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import DIAGNOSTICS_BURST, HOPS_MAX
+from gdp.limits import DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
@@ -236,11 +236,11 @@ def test_nothing_comes_back_from_a_member_that_is_gone(flow: Flow) -> None:
 
 def test_one_member_gets_no_more_replies_than_its_rate(flow: Flow) -> None:
     asker = Asker(flow.world)
-    for _ in range(2 * int(DIAGNOSTICS_BURST)):
+    for _ in range(2 * int(DIAGNOSTICS_RATE.burst)):
         asker.send(flow.world.switches["nuc1"].name, "ping")
     flow.world.network.run(1)
     answered = [reply for reply in asker.replies if reply is not None]
-    assert int(DIAGNOSTICS_BURST) <= len(answered) <= int(DIAGNOSTICS_BURST) + 2
+    assert int(DIAGNOSTICS_RATE.burst) <= len(answered) <= int(DIAGNOSTICS_RATE.burst) + 2
     assert flow.world.switches["nuc1"].drops()[DropReason.RATE_LIMITED]
 
 

@@ -9,7 +9,7 @@ import pytest
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.limits import ENDPOINT_LEASE_S, KEEPALIVE_MS
+from gdp.intervals import ENDPOINT, KEEPALIVE_MS
 from gdp.names import Name
 from gdp.switch.direct_tunnels import Action, Close, Open, Retry
 from gdp.trust.revocation import Revocation
@@ -132,7 +132,7 @@ def test_a_moved_endpoint_arrives_despite_loss() -> None:
 def test_records_outlive_their_leases() -> None:
     internet = Internet(lease_s=24.0, keepalive_ms=1_000)
     internet.begin()
-    internet.network.run(3 * ENDPOINT_LEASE_S)
+    internet.network.run(3 * ENDPOINT.lease_s)
     assert len(internet.world.ribs["lab"].rib.state.endpoints) == 2
     assert not internet.closes("home", "cloud")
 

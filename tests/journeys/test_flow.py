@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.limits import DEAD_S, JOIN_LEASE_S
+from gdp.intervals import JOIN, NEIGHBOUR
 from gdp.trust.right import Right
 from lab.simulation import Simulation
 from lab.topology import ring5
@@ -151,7 +151,7 @@ def test_a_tree_without_readers_is_taken_down() -> None:
     assert any(switch.multicast.trees.all() for switch in world.switches.values())
     world.members[SERVER].leave()
     world.network.send_pending(SERVER)
-    world.network.run(JOIN_LEASE_S + 1)
+    world.network.run(JOIN.lease_s + 1)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(negative=True)
 
@@ -191,7 +191,7 @@ def test_the_network_settles_with_loss_from_the_beginning() -> None:
 def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
     world = ring(keepalive_ms=None)
     world.network.stop("nuc3")
-    world.network.run(DEAD_S + 0.5)
+    world.network.run(NEIGHBOUR.lease_s + 0.5)
     assert all(
         n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].hello_protocol.neighbours.all_up()
     )

@@ -12,7 +12,8 @@ from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S, JOIN_PROOF_S, JOIN_REFRESH_S, JOINS_AGAIN_MAX
+from gdp.intervals import JOIN, JOIN_PROOF, SoftState
+from gdp.limits import JOINS_AGAIN_MAX
 from gdp.switch import multicast, upstream_joins
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology, chain
@@ -66,23 +67,23 @@ def inject(world: Simulation, at: str, sender: Neighbour, wire: bytes) -> None:
 
 def test_forty_trees_are_renewed_in_one_frame() -> None:
     world, flows = two_switches(TOPICS)
-    world.network.run(2 * JOIN_REFRESH_S)  # all have settled
-    joins, seconds = Joins(world), 4 * JOIN_REFRESH_S
+    world.network.run(2 * JOIN.refresh_s)  # all have settled
+    joins, seconds = Joins(world), 4 * JOIN.refresh_s
     world.network.run(seconds)
     assert len(joins.refreshes) == len(joins.frames) <= 5
     assert not joins.whole
     assert all(len(world.switches["s1"].multicast.trees.of_topic(flow.topic.name)) == 1 for flow in flows)
     joins.bytes = 0
-    world.network.run(2 * JOIN_PROOF_S)
+    world.network.run(2 * JOIN_PROOF.refresh_s)
     assert 2 * TOPICS <= len(joins.whole) <= 4 * TOPICS  # proofs, each tree at a time of its own
-    whole = 2 * JOIN_PROOF_S / JOIN_REFRESH_S * TOPICS * 3_400  # what the same costs with whole joins
+    whole = 2 * JOIN_PROOF.refresh_s / JOIN.refresh_s * TOPICS * 3_400  # what the same costs with whole joins
     assert joins.bytes < whole / 10
     flows[0].outlive()
 
 
 def test_a_join_that_was_lost_is_sent_again_when_its_number_is_unknown() -> None:
     world, (flow,) = two_switches()
-    world.network.run(2 * JOIN_REFRESH_S)
+    world.network.run(2 * JOIN.refresh_s)
     cable = world.cables[frozenset(("s1", "s2"))]
     other, joins = advertise(world, "/other", ROBOT), Joins(world)
 
@@ -100,15 +101,15 @@ def test_a_join_that_was_lost_is_sent_again_when_its_number_is_unknown() -> None
 
 def test_of_many_unknown_joins_some_are_sent_at_a_time() -> None:
     world, flows = two_switches(TOPICS)
-    world.network.run(2 * JOIN_REFRESH_S)
+    world.network.run(2 * JOIN.refresh_s)
     upper, joins = world.switches["s1"].multicast, Joins(world)
     upper._received._trees.clear()
-    assert world.network.run(2 * JOIN_REFRESH_S, lambda: bool(joins.whole))
+    assert world.network.run(2 * JOIN.refresh_s, lambda: bool(joins.whole))
     tree = next(iter(world.switches["s2"].multicast.trees.all()))
     ((at, _),) = tree.sent.items()
     waiting = {each.number for each in world.switches["s2"].multicast._joins._spaced[at]}
     assert len(waiting) == JOINS_AGAIN_MAX
-    world.network.run(JOIN_REFRESH_S)
+    world.network.run(JOIN.refresh_s)
     assert len(joins.whole) == TOPICS
     flows[-1].outlive()
 
@@ -128,17 +129,18 @@ def test_joins_pass_a_queue_that_is_shorter_than_one_of_them(topics: int) -> Non
 
 
 def test_numbers_alone_keep_no_branch_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(upstream_joins, "JOIN_PROOF_S", 1e9)  # the lower switch never shows its proofs unasked
-    monkeypatch.setattr(multicast, "JOIN_PROOF_LEASE_S", 3 * JOIN_REFRESH_S)
+    unasked = SoftState(1e9, periods=3e-9 * JOIN.refresh_s)  # the lower switch never shows its proofs of its own accord
+    monkeypatch.setattr(upstream_joins, "JOIN_PROOF", unasked)
+    monkeypatch.setattr(multicast, "JOIN_PROOF", unasked)
     world, (flow,) = two_switches()
     upper, joins = world.switches["s1"].multicast, Joins(world)
-    world.network.run(12 * JOIN_REFRESH_S)
+    world.network.run(12 * JOIN.refresh_s)
     assert 3 <= len(joins.whole) <= 4  # it had to
     monkeypatch.setattr(upstream_joins, "JOINS_AGAIN_MAX", 0)  # and now it never does
-    world.network.run(3 * JOIN_REFRESH_S + JOIN_LEASE_S)
+    world.network.run(3 * JOIN.refresh_s + JOIN.lease_s)
     assert not upper.trees.of_topic(flow.topic.name)
     monkeypatch.setattr(upstream_joins, "JOINS_AGAIN_MAX", JOINS_AGAIN_MAX)
-    world.network.run(JOIN_REFRESH_S + 0.1)
+    world.network.run(JOIN.refresh_s + 0.1)
     flow.outlive()
 
 
@@ -164,12 +166,12 @@ def test_the_evidence_of_a_reader_that_leaves_is_replaced_at_each_switch() -> No
     world = Simulation(topology=topology)
     assert world.run_until_attached()
     flow = flowing(world, "/t", ROBOT, ("s3/right", "s3/other"))
-    world.network.run(JOIN_REFRESH_S)
+    world.network.run(JOIN.refresh_s)
     trees = [world.switches[label].multicast.trees.of_topic(flow.topic.name)[0] for label in ("s1", "s2")]
     left, stays = readers_by_evidence(world, [next(iter(tree.branches.values())).evidence for tree in trees])
     world.members[left].unsubscribe(flow.topic.name)
     world.network.send_pending(left)
-    world.network.run(3 * JOIN_REFRESH_S)
+    world.network.run(3 * JOIN.refresh_s)
     for tree in trees:
         ((_, branch),) = tree.branches.items()
         assert bytes(world.members[stays].name) in branch.evidence
@@ -180,7 +182,7 @@ def test_x03_a_neighbour_prolongs_no_branch_of_another_and_repeats_no_refresh() 
     world = Simulation(topology=chain(3))
     assert world.run_until_attached()
     flow = flowing(world, "/t", ROBOT, ("s3/right",))
-    world.network.run(2 * JOIN_REFRESH_S)
+    world.network.run(2 * JOIN.refresh_s)
     middle = world.switches["s2"]
     (tree,) = middle.multicast.trees.of_topic(flow.topic.name)
     ((at, branch),) = tree.branches.items()
@@ -201,7 +203,7 @@ def test_x03_a_neighbour_prolongs_no_branch_of_another_and_repeats_no_refresh() 
 
 def test_x03_a_reply_about_unknown_joins_works_once_for_each_refresh() -> None:
     world, (flow,) = two_switches()
-    world.network.run(2 * JOIN_REFRESH_S)
+    world.network.run(2 * JOIN.refresh_s)
     lower, joins = world.switches["s2"], Joins(world)
     (tree,) = lower.multicast.trees.of_topic(flow.topic.name)
     (sent,) = tree.sent.values()

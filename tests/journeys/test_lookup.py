@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.names import Name
 from gdp.state.name_lookup import SwitchLookups, rib_lookup
 from lab.simulation import Simulation
@@ -54,7 +54,7 @@ def test_a_switch_of_another_domain_learns_who_publishes_a_name() -> None:
     answer = lookup(world, flow.topic.name)
     (row,) = advertisers(answer)
     assert (answer["state"], row["right"], row["advertiser"]) == ("answered", "publish", flow.member.name.to_text())
-    assert 0 < row["left_s"] <= ADVERTISEMENT_LEASE_S
+    assert 0 < row["left_s"] <= ADVERTISEMENT.lease_s
     assert row["delegated_by"] == [flow.topic.name.to_text()]  # the name stands for its owner
     assert answer["rib"] == world.switches[SWITCH].rib.to_text()  # type: ignore[union-attr]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.limits import ADVERTISEMENT_LEASE_S, READER_GRACE_S, READER_LEASE_S
+from gdp.intervals import ADVERTISEMENT, FORGET_S
+from gdp.intervals import READER as REPORTS
 from gdp.message.loss import LossReason
 from lab.simulation import Simulation
 from lab.topology import chain
@@ -25,7 +26,7 @@ def flow_of(*, reliable: bool = True) -> Flow:
 def away(flow: Flow, label: str, away_s: float) -> None:
     """Stream for three advertisement leases, while a member is unplugged for some of the time."""
     network, lead = flow.world.network, flow.world.leads[label]
-    count = round(max(3 * ADVERTISEMENT_LEASE_S, away_s + 20) / EVERY_S)
+    count = round(max(3 * ADVERTISEMENT.lease_s, away_s + 20) / EVERY_S)
     flow.stream(count, EVERY_S, 100)
     network.call(2.0, lambda: network.set_link(lead, up=False))
     network.call(2.0 + away_s, lambda: network.set_link(lead, up=True))
@@ -42,7 +43,7 @@ def assert_complete(flow: Flow) -> None:
 
 
 @pytest.mark.parametrize("label", [SOURCE, READER])
-@pytest.mark.parametrize("away_s", [3.0, ADVERTISEMENT_LEASE_S + 6.0])
+@pytest.mark.parametrize("away_s", [3.0, ADVERTISEMENT.lease_s + 6.0])
 def test_who_is_away_within_the_grace_time_costs_a_reliable_topic_nothing(label: str, away_s: float) -> None:
     flow = flow_of()
     away(flow, label, away_s)
@@ -53,13 +54,13 @@ def test_who_is_away_within_the_grace_time_costs_a_reliable_topic_nothing(label:
 
 def test_a_publisher_that_was_alone_for_longer_still_has_what_its_reader_lacks() -> None:
     flow = flow_of()
-    away(flow, SOURCE, READER_LEASE_S + READER_GRACE_S + 5.0)
+    away(flow, SOURCE, REPORTS.lease_s + FORGET_S + 5.0)
     assert flow.numbers(READER) == list(range(flow.publisher.messages))
 
 
 def test_a_reader_that_was_away_for_longer_costs_what_both_ends_count() -> None:
     flow = flow_of()
-    away(flow, READER, READER_LEASE_S + READER_GRACE_S + 5.0)
+    away(flow, READER, REPORTS.lease_s + FORGET_S + 5.0)
     assert_complete(flow)
     lost = flow.world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert lost.total == flow.publisher.messages - flow.publisher.acknowledgements.acknowledged > 0
@@ -83,9 +84,9 @@ def test_what_a_publisher_says_in_a_new_life_before_its_reader_is_back_is_lost()
     world.network.run(2)
     member = world.restart_member(SOURCE)
     again = Flow(world, flow.name, SOURCE, flow.topic, member.advertise(flow.topic, b"", reliable=True), flow.got)
-    again.stream(round(3 * ADVERTISEMENT_LEASE_S), 1.0, 100)
+    again.stream(round(3 * ADVERTISEMENT.lease_s), 1.0, 100)
     again.publish(b"\xff" * 4)
-    world.network.run(3 * ADVERTISEMENT_LEASE_S + 5)
+    world.network.run(3 * ADVERTISEMENT.lease_s + 5)
     losses = world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.PUBLISHER_RESTARTED}
     assert losses.ranges[0].first == 1
@@ -103,7 +104,7 @@ def test_a_reader_that_starts_again_counts_what_came_between() -> None:
     first = len(flow.numbers(READER))
     world.restart_member(READER)
     flow.read_by(READER)
-    world.network.run(3 * ADVERTISEMENT_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT.lease_s)
     losses = world.members[READER].subscriptions.losses_of(flow.topic.name)
     assert losses.counts.keys() == {LossReason.READER_RESTARTED}
     assert first + losses.total + len(flow.numbers(READER)) == flow.publisher.messages
@@ -118,7 +119,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     world.network.send_pending(READER)
     world.network.run(3)
     flow.read_by(READER)
-    world.network.run(3 * ADVERTISEMENT_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT.lease_s)
     assert world.members[READER].subscriptions.losses_of(flow.topic.name).total == 0
     assert 10 < len(flow.numbers(READER)) < 40
 
@@ -130,6 +131,6 @@ def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_
     for number in range(5):
         flow.publish(number.to_bytes(4, "big"))
     flow.read_by(READER)
-    world.network.run(3 * ADVERTISEMENT_LEASE_S + 1)
+    world.network.run(3 * ADVERTISEMENT.lease_s + 1)
     assert flow.numbers(READER) == [3, 4]
     assert world.members[READER].subscriptions.losses_of(flow.topic.name).total == 0

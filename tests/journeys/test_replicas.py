@@ -10,7 +10,8 @@ from gdp.client.unicast_stream import private_name
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENT_LEASE_S, CALL_LAG_S, CALL_QUIET_S, PRIVATE_WAIT_BYTES
+from gdp.intervals import ADVERTISEMENT, READER, SERVER
+from gdp.limits import PRIVATE_WAIT_BYTES
 from gdp.names import Name
 from gdp.trust.right import Right
 from lab.simulation import Simulation
@@ -197,13 +198,13 @@ def test_a_frozen_or_dead_server_holds_up_no_other_and_is_no_peer_after_a_second
     load = Load(client, servers, size=100)
     world.network.call(1.0, partial(world.network.stop if kill else world.network.freeze, victim.label))
     listed: list[int] = []
-    for late_s in (-0.1, CALL_LAG_S + 0.1):
+    for late_s in (-0.1, READER.refresh_s + 0.1):
         world.network.call(1.0 + late_s, lambda: listed.append(len(client.member.services.peers(client.service))))
     load.run(5, per_s=2_000)
     assert listed == [3, 2]
     for server in healthy:
         assert len(load.waits_s[server.label]) == 10_000
-        assert load.worst_s(server.label) <= CALL_LAG_S
+        assert load.worst_s(server.label) <= READER.refresh_s
     outlive(world, client, *healthy)
 
 
@@ -214,7 +215,7 @@ def test_large_requests_wait_for_a_frozen_server_no_longer_than_its_lag() -> Non
     load.run(2, per_s=500, every_s=0.02)
     for label in SERVERS[:2]:
         assert len(load.waits_s[label]) == 1_000
-        assert load.worst_s(label) <= CALL_LAG_S + 0.1
+        assert load.worst_s(label) <= READER.refresh_s + 0.1
     outlive(world, client, *servers[:2])
 
 
@@ -225,7 +226,7 @@ def test_two_of_three_servers_may_freeze_at_once() -> None:
         world.network.call(0.5, partial(world.network.freeze, label))
     load.run(3, per_s=1_000)
     assert len(load.waits_s[SERVERS[0]]) == 3_000
-    assert load.worst_s(SERVERS[0]) <= CALL_LAG_S
+    assert load.worst_s(SERVERS[0]) <= READER.refresh_s
     assert client.member.services.peers(client.service) == [servers[0].member.name]
     outlive(world, client, servers[0])
 
@@ -240,7 +241,7 @@ def test_a_server_that_thaws_continues_with_new_requests_and_delays_no_other() -
     assert len(client.member.services.peers(client.service)) == 3
     for label in SERVERS[:2]:
         assert len(load.waits_s[label]) == 2_500
-        assert load.worst_s(label) <= CALL_LAG_S
+        assert load.worst_s(label) <= READER.refresh_s
     after = [number for number in load.waits_s[frozen.label] if number >= 2_000]  # from a second and a half after it
     assert after == list(range(2_000, 2_500))
     outlive(world, client, *servers)
@@ -251,7 +252,7 @@ def test_a_silent_server_is_no_peer_even_without_requests() -> None:
     world.network.run(3)
     assert len(client.member.services.peers(client.service)) == 2
     world.network.stop(silent.label)
-    assert world.network.run(CALL_QUIET_S + 0.3, lambda: len(client.member.services.peers(client.service)) == 1)
+    assert world.network.run(SERVER.lease_s + 0.3, lambda: len(client.member.services.peers(client.service)) == 1)
     outlive(world, client, heard)
 
 
@@ -259,7 +260,7 @@ def test_a_silent_server_is_no_peer_even_without_requests() -> None:
 def test_a_client_that_had_no_time_does_not_take_its_servers_for_silent() -> None:
     world, client, _ = cluster(*SERVERS[:2])
     world.network.freeze(client.label)
-    world.network.run(CALL_QUIET_S + 1)
+    world.network.run(SERVER.lease_s + 1)
     client.member.handle_timer(world.network.now)  # before it has read the messages of that time
     assert len(client.member.services.peers(client.service)) == 2
 
@@ -275,7 +276,7 @@ def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
 
 
 def test_a_restarted_server_is_a_peer_again_as_soon_as_it_is_there() -> None:
-    world, client, servers = cluster(*SERVERS, lease_s=ADVERTISEMENT_LEASE_S)
+    world, client, servers = cluster(*SERVERS, lease_s=ADVERTISEMENT.lease_s)
     load = Load(client, servers, size=100)
     again = servers[2]
     world.network.call(0.5, partial(world.network.stop, again.label))

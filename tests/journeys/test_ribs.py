@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import partial
 
 from gdp.control.query import Query
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from lab.simulation import Simulation
 from lab.topology import Attachment, ring5
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
 
-LEASES_S = 3 * ADVERTISEMENT_LEASE_S
+LEASES_S = 3 * ADVERTISEMENT.lease_s
 RIBS = ["school", "school#2", "backbone", "backbone#2", "cloud", "cloud#2"]
 
 

@@ -6,11 +6,10 @@ from functools import partial
 
 import pytest
 
-from gdp.client.unicast_stream import IDLE_S
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENT_LEASE_S, READER_LEASE_S
+from gdp.intervals import ADVERTISEMENT, FORGET_S, READER
 from gdp.sansio import ReceivedFrame
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
@@ -101,7 +100,7 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     world = ring()
     _, client = pair(world)
     world.network.stop(SERVER)
-    assert world.network.run(READER_LEASE_S + 2, lambda: not client.member.services.peers(client.service))
+    assert world.network.run(READER.lease_s + 2, lambda: not client.member.services.peers(client.service))
     assert world.network.run(40, lambda: not list(client.member.subscriptions.writer_proxies()))
     world.network.run(3.25 * world.lease_s)
     assert list(client.member.subscriptions.writer_proxies()) == []
@@ -255,13 +254,13 @@ def test_two_hundred_calls_at_once_are_all_answered_once() -> None:
 
 @pytest.mark.momentary("the lease of a reader ends, that of its claim does not")
 def test_a_client_that_was_cut_off_for_longer_than_its_lease_goes_on_and_loses_nothing() -> None:
-    world = ring(lease_s=ADVERTISEMENT_LEASE_S)
+    world = ring(lease_s=ADVERTISEMENT.lease_s)
     server, client = pair(world)
     server.answer(client.member.name, b"before")
     assert work(world, client, until_s=2, have=1)
     world.leads[ROBOT].loss = 1.0
     server.answer(client.member.name, b"meanwhile")
-    world.network.run(READER_LEASE_S + 3)
+    world.network.run(READER.lease_s + 3)
     world.leads[ROBOT].loss = 0.0
     assert meet(world, server, client)
     server.answer(client.member.name, b"after")
@@ -277,7 +276,7 @@ def test_a_client_whose_advertisement_ended_meanwhile_goes_on_and_counts_what_it
     assert work(world, client, until_s=2, have=1)
     world.leads[ROBOT].loss = 1.0
     server.answer(client.member.name, b"meanwhile")
-    world.network.run(READER_LEASE_S + 3)
+    world.network.run(READER.lease_s + 3)
     world.leads[ROBOT].loss = 0.0
     assert meet(world, server, client)
     server.answer(client.member.name, b"after")
@@ -311,7 +310,7 @@ def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -
         if writer_proxy not in client.member.subscriptions.writer_proxies_of(client.service)
     ]
     writer_proxy.schedule.due_s = float("inf")  # it sends nothing any more
-    world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
+    world.network.run(READER.lease_s + 1.5 * FORGET_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")
     assert work(world, client, until_s=2, have=2)

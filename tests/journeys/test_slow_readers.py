@@ -12,7 +12,8 @@ from gdp.client.participant import Participant
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM
-from gdp.limits import READER_LEASE_S, WINDOW_BYTES
+from gdp.intervals import READER
+from gdp.limits import WINDOW_BYTES
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from lab.simulation import Simulation
 from lab.topology import chain
@@ -133,7 +134,7 @@ def test_reliable_a_slow_reader_slows_its_own_publisher_and_no_other_topic_of_th
     assert len(held.numbers(NEAR)) < 200  # it waits for the slow one
     world.network.run(1)
     assert late == []
-    assert world.network.run(2 * READER_LEASE_S, lambda: held.has(NEAR, 200))
+    assert world.network.run(2 * READER.lease_s, lambda: held.has(NEAR, 200))
     assert held.numbers(NEAR) == list(range(200))
     other.outlive()
 
@@ -145,7 +146,7 @@ def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_learns_what_it_
     world.network.run(SOON_S)  # the slow one knows where to begin
     slow.frames_s = frames_s
     flow.stream(200, 0.001, size=50_000)
-    assert world.network.run(4 * READER_LEASE_S, lambda: flow.has(NEAR, 200) and flow.has(FAR, 200))
+    assert world.network.run(4 * READER.lease_s, lambda: flow.has(NEAR, 200) and flow.has(FAR, 200))
     assert world.network.run(5, flow.publisher.is_acknowledged)
     assert len(flow.numbers(SLOW)) < 200
     slow.frames_s = 1e6
@@ -163,7 +164,7 @@ def test_reliable_a_reader_that_lagged_holds_its_publisher_again_only_after_a_su
     flow = flowing(world, source=SOURCE, readers=(NEAR, SLOW))
     slow.frames_s = 0
     flow.stream(200, 0.001, size=50_000)
-    assert world.network.run(4 * READER_LEASE_S, lambda: flow.has(NEAR, 200))
+    assert world.network.run(4 * READER.lease_s, lambda: flow.has(NEAR, 200))
     slow.frames_s = 1e6
     world.network.run(0.5)  # it reports again
     slow.frames_s = 0
@@ -178,7 +179,7 @@ def test_a_reader_that_dies_holds_its_publisher_for_no_longer_than_its_lease() -
     flow = flowing(world, source=SOURCE, readers=(NEAR, SLOW))
     world.network.stop(SLOW)
     flow.stream(200, 0.001, size=50_000)
-    assert world.network.run(READER_LEASE_S + 1, lambda: flow.has(NEAR, 200))
+    assert world.network.run(READER.lease_s + 1, lambda: flow.has(NEAR, 200))
     assert flow.numbers(NEAR) == list(range(200))
     assert flow.is_read_by(1)
     flow.outlive(NEAR)

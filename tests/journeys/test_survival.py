@@ -9,13 +9,12 @@ import pytest
 
 from gdp.control.waiting import WaitReason
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.rib.upstream_advertisements import RETURN_S
+from gdp.intervals import ADVERTISEMENT, RETRY_S
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
-LONG_S = 3 * ADVERTISEMENT_LEASE_S + 8
+LONG_S = 3 * ADVERTISEMENT.lease_s + 8
 LEASE_S = 6.0  # of names, where the real one would only cost time: that of readers is as long
 SHORT_S = 3 * LEASE_S + 8
 KEEPALIVE_MS = 1_000  # where no link fails in silence, the real ones would only cost time, too
@@ -118,7 +117,7 @@ NIGHTLY = pytest.mark.nightly  # the mirror image of another case: messages go b
     ("who", "to"), [(A, "a2"), (C, "b2"), pytest.param(A, "b2", marks=NIGHTLY), pytest.param(C, "a2", marks=NIGHTLY)]
 )
 def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
-    world = sites(ADVERTISEMENT_LEASE_S)
+    world = sites(ADVERTISEMENT.lease_s)
     there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
     count = int(LONG_S / PERIOD_S)
     there.stream(count, PERIOD_S, size=100)
@@ -132,7 +131,7 @@ def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
 
 @pytest.mark.parametrize("minutes", [5, pytest.param(10, marks=pytest.mark.nightly)])  # link states live for 100 s
 def test_established_flows_go_on_while_all_ribs_are_dead_for_minutes(minutes: int) -> None:
-    world = sites(ADVERTISEMENT_LEASE_S, keepalive_ms=1_500)
+    world = sites(ADVERTISEMENT.lease_s, keepalive_ms=1_500)
     flow = flowing(world, source=A, readers=(C,))
     for label in world.ribs:
         world.kill_rib(label)
@@ -141,7 +140,7 @@ def test_established_flows_go_on_while_all_ribs_are_dead_for_minutes(minutes: in
 
 
 def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> None:
-    world = sites(ADVERTISEMENT_LEASE_S)
+    world = sites(ADVERTISEMENT.lease_s)
     flow = flowing(world, source=A, readers=(C,))
     flow.stream(500, 0.2, size=100)
     for label in world.ribs:
@@ -177,7 +176,7 @@ def test_flows_outlive_the_death_and_the_return_of_any_ribs(dead: tuple[str, ...
 
 
 def test_the_death_of_the_top_rib_ends_no_flow_with_real_leases() -> None:
-    world = ring(lease_s=ADVERTISEMENT_LEASE_S)
+    world = ring(lease_s=ADVERTISEMENT.lease_s)
     flow = flowing(world)
     world.kill_rib("backbone")
     flow.stream(int(LONG_S), 1.0, size=100)
@@ -232,7 +231,7 @@ def test_the_tier_above_the_dead_one_takes_its_place_until_it_returns(reader: st
     assert upstream.rib == world.identities["rib:top"].name
     restart_rib(world, "m")
     # The first probe tells that its channel ended with the RIB, and the second one comes through the next channel.
-    assert world.network.run(2 * RETURN_S + 1, lambda: upstream.rib == world.identities["rib:m"].name)
+    assert world.network.run(2 * RETRY_S + 1, lambda: upstream.rib == world.identities["rib:m"].name)
     complete(there, reader, count, 40)
     complete(back, "a1/member", count, 1)
 

@@ -17,7 +17,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import StatementError
 from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S
+from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.switch.trees import Tree
 from gdp.trust.right import Right
@@ -220,7 +220,7 @@ def test_the_trees_of_a_dead_reader_end_with_their_leases() -> None:
     at = site(TWO_UPLINKS, ("s2",))
     flow = flow_of(at, ("s2",))
     at.world.network.stop("s2")
-    at.world.network.run(JOIN_LEASE_S + 1.0)
+    at.world.network.run(JOIN.lease_s + 1.0)
     assert second_path_key(flow.member.name) not in at.world.switches["s1"].table.entries
     assert not any(label != "s2" for path in (1, 2) for label in at.trees(flow.topic.name, path))
     keys = [key for label in ("s0", "s1") for key in at.world.switches[label].table.entries if len(key) == 64]

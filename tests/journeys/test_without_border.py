@@ -15,7 +15,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gdp.limits import DETECT_MULTIPLIER, SCAPY_KEEPALIVE_MS
+from gdp.intervals import DETECT_MULTIPLIER, SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.trust.right import Right
 from tests.draws import draws

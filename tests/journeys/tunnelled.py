@@ -23,8 +23,9 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.preshared_key import NO_KEY
 from gdp.control.tunnel_plan import TunnelId, tunnel_ifname
 from gdp.crypto.tunnel_key import TunnelKey
+from gdp.intervals import PACE_S
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
-from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
+from gdp.links.links import TunnelLinks
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from lab.network import SimLink
@@ -207,7 +208,7 @@ class Tunnelled:
         links.handle_timer(self.network.now)
         links._tunnels._closed.clear()  # a link of the simulation keeps its port
         self.network.send_pending(machine.label)
-        self.network.call(LINKS_PERIOD_S, partial(self._look, machine, links))
+        self.network.call(PACE_S, partial(self._look, machine, links))
 
     def link(self, one: str, other: str) -> TunnelLink:
         """Return the link between two machines, made at the first call."""

@@ -36,6 +36,7 @@ from gdp.errors import LocalError, StoreError
 from gdp.host.netns_files import reach
 from gdp.host.processes import end_all
 from gdp.host.run_registry import Run, RunRegistry
+from gdp.intervals import STOP_S
 
 __all__ = ["UPLINK", "LocalProvider"]
 
@@ -44,7 +45,6 @@ log = logging.getLogger(__name__)
 UPLINK: Final = "fog0"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
 _GONE_S: Final = 600.0  # its logs remain readable for this time
-_END_PATIENCE_S: Final = 6.0
 _GIB: Final = 1 << 30
 
 
@@ -160,7 +160,7 @@ class LocalProvider:
             raise StoreError(f"just being made: {', '.join(new)}")
         for each in machines:
             hold(each, held=False)
-        end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
+        end_all([each.host for each in machines if each.host is not None], STOP_S)
         for each in machines:
             for device in (each.gateway_device, each.uplink_plug, each.relay_out):
                 delete(each.gateway, device)  # otherwise the kernel removes it some time after its namespace

@@ -17,6 +17,7 @@ from contextlib import ExitStack, closing
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
+from gdp.intervals import SoftState
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
 from gdp.ports.kernel.device import TxDrops, peer_is_bare
@@ -29,9 +30,8 @@ from gdp.switch.table import Table
 
 __all__ = ["KernelPlane"]
 
-_LEASE_S: Final = 3.0  # how long the filter of a dead process continues to forward
-_UPKEEP_S: Final = 1.0
 _COUNTED_MAX: Final = 100
+_FILTER: Final = SoftState(1.0, periods=3)  # the filter of a process that died forwards no longer than this
 
 
 class KernelPlane(RawPlane):
@@ -113,7 +113,7 @@ class KernelPlane(RawPlane):
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """Renew the lease of the program and read its counts when due; then as ``Plane.poll``."""
         if self._loaded.is_leased:
-            timeout_s = _UPKEEP_S if timeout_s is None else min(timeout_s, _UPKEEP_S)
+            timeout_s = _FILTER.refresh_s if timeout_s is None else min(timeout_s, _FILTER.refresh_s)
         if time.monotonic() >= self._next_upkeep_s:
             self._keep_up()
         return super().poll(timeout_s)
@@ -189,10 +189,10 @@ class KernelPlane(RawPlane):
 
     def _keep_up(self) -> None:
         """Do what no notification triggers: renew the lease, check each port's egress, and read refusals."""
-        self._loaded.renew(_LEASE_S)
+        self._loaded.renew(_FILTER.lease_s)
         self._review_queues()
         self._look_at_devices()
-        self._next_upkeep_s = time.monotonic() + _UPKEEP_S / 2
+        self._next_upkeep_s = time.monotonic() + _FILTER.refresh_s / 2
 
 
 def _ifindex(ifname: str) -> int:

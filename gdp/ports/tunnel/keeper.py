@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import ATTACH_S, LOOK_S, STEADY_S, UPKEEP_S
 from gdp.ports.confine.system import prctl
 from gdp.ports.netlink import LINK_GROUP, Notifications, RefusedError
 from gdp.ports.readiness import readable
@@ -62,13 +63,9 @@ _IFF_TUN, _IFF_NO_PI, _IFF_VNET_HDR = 0x1, 0x1000, 0x4000
 _TUN_PI, _TUN_VNET_HDR = 4, 5  # IFLA_TUN_PI, IFLA_TUN_VNET_HDR
 _DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG
 _NO_NEW_PRIVS: Final = 38
-_START_S: Final = 5.0
 _END_S: Final = 0.3
-_LOOK_S: Final = 0.005
-_SOCKETS_S: Final = 1.0  # between looks for sockets that wireguard-go opened; no event says so
 _QUEUE_PACKETS: Final = 1_000  # as Ethernet devices; the 500 of TUN devices overflow in a burst of one window
 _RESTART_MIN_S, _RESTART_MAX_S = 0.1, 5.0
-_STABLE_S: Final = 10.0  # a process that lived this long is restarted at once
 _SAID_MAX_BYTES: Final = 4096
 _INSTALL: Final = "modprobe wireguard, or apt-get install --no-install-recommends wireguard-go"
 
@@ -296,7 +293,7 @@ class _Keeper:
         with contextlib.closing(Notifications(LINK_GROUP)) as news:
             child = self._spawn(program, {})
             try:
-                end_s = time.monotonic() + _START_S
+                end_s = time.monotonic() + ATTACH_S
                 while (device := find_device(self._ifname)) is None or device.kind != "tun":
                     if child.process.poll() is not None or time.monotonic() > end_s:
                         child.read()
@@ -340,12 +337,12 @@ class _Keeper:
         mtu = self._found().mtu
         socket_path(self._ifname).unlink(missing_ok=True)
         child = self._spawn(program, {"WG_TUN_FD": str(self._tun)})
-        end_s = time.monotonic() + _START_S
+        end_s = time.monotonic() + ATTACH_S
         while not self._serves():
             if child.process.poll() is not None or time.monotonic() > end_s:
                 child.end()
                 raise LocalError(f"{_PROGRAM} does not start: {child.reason}")
-            if not self.owner.wait(child.pidfd, timeout_s=_LOOK_S):  # no event says that it serves
+            if not self.owner.wait(child.pidfd, timeout_s=LOOK_S):  # no event says that it serves
                 child.end()
                 raise SystemExit
         self._child = child
@@ -367,14 +364,14 @@ class _Keeper:
             child = self._child
             if child is not None:
                 self._enlarge_buffers(child)
-                if not self.owner.wait(child.pidfd, *child.output, timeout_s=_SOCKETS_S):
+                if not self.owner.wait(child.pidfd, *child.output, timeout_s=UPKEEP_S):
                     return
                 child.read()
                 if child.process.poll() is None:
                     continue
                 child.close()
                 self._child = None
-                delay_s = 0.0 if time.monotonic() - child.begun_s > _STABLE_S else max(delay_s, _RESTART_MIN_S)
+                delay_s = 0.0 if time.monotonic() - child.begun_s > STEADY_S else max(delay_s, _RESTART_MIN_S)
                 self.owner.report(event="died", text=child.reason)
             if not self.owner.wait(timeout_s=delay_s):
                 return
@@ -449,7 +446,7 @@ def _wait_until(is_true: Callable[[], bool]) -> None:
     """Return when this is true, at the latest after a second; the next step reports what is wrong then."""
     end_s = time.monotonic() + 1.0
     while not is_true() and time.monotonic() < end_s:
-        time.sleep(_LOOK_S)
+        time.sleep(LOOK_S)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.intervals import STOP_S
 
 __all__ = ["KeeperProcess", "Report"]
 
@@ -26,7 +27,6 @@ log = logging.getLogger(__name__)
 _MODULE: Final = "gdp.ports.tunnel.keeper"
 _ROOT: Final = Path(__file__).resolve().parents[3]
 _START_S: Final = 20.0
-_END_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class KeeperProcess:
         """End the keeper, and return when the device is gone."""
         self._socket.close()
         try:
-            self._process.wait(_END_S)
+            self._process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             log.error("the keeper of a tunnel device does not end pid=%d", self._process.pid)
 

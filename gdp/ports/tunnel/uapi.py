@@ -21,15 +21,13 @@ from typing import Final
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
+from gdp.intervals import ANSWER_S, LOOK_S, RETRY_S
 from gdp.ports.tunnel.control import Change, ControlLostError, DeviceState, PeerChange, PeerState
 
 __all__ = ["SOCKET_FOLDER", "UserspaceControl", "parse_state", "request_text", "socket_path"]
 
 SOCKET_FOLDER: Final = Path("/var/run/wireguard")  # wireguard-go allows no other
-_TIMEOUT_S: Final = 1.0  # it replies within milliseconds; the limit keeps a stopped process from blocking a node
-_PAUSE_S: Final = 5.0
 _BIND_TRIES: Final = 10  # a keeper that enlarges the buffers of a socket holds its port open for a moment
-_BIND_PAUSE_S: Final = 0.02
 _REPLY_MAX_BYTES: Final = 4 << 20
 _NANO: Final = 1e-9
 
@@ -62,7 +60,7 @@ class UserspaceControl:
             except _PortTakenError:
                 if not left:
                     raise
-                time.sleep(_BIND_PAUSE_S)  # no event says that a port is free
+                time.sleep(LOOK_S)  # no event says that a port is free
             else:
                 return
 
@@ -80,13 +78,13 @@ class UserspaceControl:
             raise ControlLostError(f"tunnel {self._ifname}: wireguard-go did not respond")
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-                connection.settimeout(_TIMEOUT_S)
+                connection.settimeout(ANSWER_S)
                 connection.connect(str(socket_path(self._ifname)))
                 connection.sendall(request.encode())
                 reply = _read(connection)
         except OSError as error:
             if isinstance(error, TimeoutError):
-                self._silent_until_s = time.monotonic() + _PAUSE_S
+                self._silent_until_s = time.monotonic() + RETRY_S
             raise ControlLostError(f"tunnel {self._ifname}: wireguard-go does not respond: {error}") from error
         lines = [(key, value) for key, _, value in (line.partition("=") for line in reply.splitlines()) if key]
         if not lines or lines[-1][0] != "errno":

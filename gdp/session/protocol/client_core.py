@@ -14,6 +14,7 @@ from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
 from gdp.due_queue import earliest
 from gdp.errors import LocalError
+from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
 from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Call", "ClientCore"]
 
-_FOLLOW_S: Final = 0.05  # between two checks of the present servers, while calls are active
 _GONE: Final = "the server has gone"
 
 
@@ -158,7 +158,7 @@ class ClientCore:
 
     def _follow(self, now_s: float) -> None:
         """Update the set of servers."""
-        self._follow_at_s = now_s + _FOLLOW_S
+        self._follow_at_s = now_s + LOOK_S
         name, services = self._name, self._member.services
         peers = set(services.peers(name) or services.connected_peers(name))  # a slow server is better than none
         if not peers:  # and a silent one may return: its calls go on

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.due_queue import earliest
 from gdp.errors import LocalError
+from gdp.intervals import HOUR_S, TICK_S
+from gdp.limits import CALL_GRACE_S, CALLER_AWAY_S
 from gdp.names import Name
 from gdp.service.frames import Answer, Outcome, Request
 from gdp.service.serving import Asked, Serving, Turn
@@ -22,10 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ServerCore"]
 
-_GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
-_CALL_MAX_S: Final = 3_600.0
-_CHECK_CLIENTS_S: Final = 0.5
-_CLIENT_AWAY_S: Final = 30.0  # a client that is silent for so long has ended its wait
 _PART: Final = 0
 
 
@@ -121,7 +119,7 @@ class ServerCore:
                 )
         if self._check_at_s is not None and now_s >= self._check_at_s:
             self._check_clients(now_s)
-            self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
+            self._check_at_s = now_s + TICK_S if self._serving else None
         self._give(now_s)
 
     def get_timer(self) -> float | None:
@@ -138,14 +136,14 @@ class ServerCore:
         if self._is_leaving:
             self._respond(asked, Answer.failed(RESPONSE, frame.call, "the server is leaving"))
             return
-        patience_s = min(frame.patience_ms / 1e3 + _GRACE_S, _CALL_MAX_S) if frame.patience_ms else _CALL_MAX_S
+        patience_s = min(frame.patience_ms / 1e3 + CALL_GRACE_S, HOUR_S) if frame.patience_ms else HOUR_S
         try:
             self._serving.begin(now_s, patience_s, asked, frame.body)
         except LocalError as error:
             self._respond(asked, Answer.failed(RESPONSE, frame.call, str(error)))
             return
         if self._check_at_s is None:
-            self._check_at_s = now_s + _CHECK_CLIENTS_S
+            self._check_at_s = now_s + TICK_S
 
     def _give(self, now_s: float) -> None:
         self.turns.extend(self._serving.poll_turns(now_s))
@@ -168,5 +166,5 @@ class ServerCore:
         clients = self._serving.clients
         self._seen_s = {each: now_s if each in here else self._seen_s.get(each, now_s) for each in clients}
         for client, seen_s in self._seen_s.items():
-            if client not in here and (client not in known or now_s - seen_s >= _CLIENT_AWAY_S):
+            if client not in here and (client not in known or now_s - seen_s >= CALLER_AWAY_S):
                 self._serving.remove_client(client)

@@ -26,9 +26,9 @@ __all__ = [
 ]
 
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
+INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
 _OFFERED_MAX: Final = 1_000  # of the proxy's own publishers, whatever a remote one states
-_INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _READER_DEPTH: Final = 1_000  # of the proxy's own subscriptions: a burst waits here, not at its publisher
 
 
@@ -120,7 +120,7 @@ def offer(
 
 def _seconds(duration: tuple[int, int]) -> float | None:
     """Return a duration in seconds; None: infinite, or not stated."""
-    if duration == (0, 0) or duration[0] >= _INFINITE_FROM_S:
+    if duration == (0, 0) or duration[0] >= INFINITE_FROM_S:
         return None
     return duration[0] + duration[1] / 1e9
 

@@ -22,12 +22,10 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
+from gdp.intervals import ANSWER_S, POLL_S, PROMPT_S, TICK_S
+
 __all__ = ["GraphSnapshot", "LocalEnd", "Master", "MasterError", "MasterWatch"]
 
-PERIOD_S: Final = 0.4
-_PATIENCE_S: Final = 2.0
-_CONNECT_S: Final = 0.5
-_LIVENESS_PERIOD_S: Final = 2.0
 _LENGTH: Final = struct.Struct("<I")
 _HEADER_MAX: Final = 1 << 20
 _ANSWER_MAX_BYTES: Final = 16 << 20
@@ -86,7 +84,7 @@ class _Transport(xmlrpc.client.Transport):
 
     def make_connection(self, host: tuple[str, dict[str, str]] | str) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
-        connection.timeout = _PATIENCE_S
+        connection.timeout = ANSWER_S
         return connection
 
     def parse_response(self, response: http.client.HTTPResponse) -> tuple[Any, ...]:
@@ -186,7 +184,7 @@ class MasterWatch:
             else:
                 is_silent = False
                 seen(look)
-            stopped.wait(PERIOD_S)
+            stopped.wait(TICK_S)
 
     def _is_seen(self, node: str) -> bool:
         return node != self._node and node not in self._dead
@@ -196,7 +194,7 @@ class MasterWatch:
         dead = self._dead & nodes
         doubtful = dead
         if time.monotonic() >= self._next_liveness_s:
-            self._next_liveness_s = time.monotonic() + _LIVENESS_PERIOD_S
+            self._next_liveness_s = time.monotonic() + POLL_S
             doubtful = frozenset(nodes)
         if doubtful:
             order = sorted(doubtful)
@@ -251,7 +249,7 @@ def _connected(uri: object) -> socket.socket:
         parts = urlsplit(str(uri))
         if uri is None or parts.hostname is None or parts.port is None:
             raise MasterError("no address")
-        return socket.create_connection((parts.hostname, parts.port), timeout=_CONNECT_S)
+        return socket.create_connection((parts.hostname, parts.port), timeout=PROMPT_S)
     except ValueError as error:
         raise MasterError("no address") from error
 

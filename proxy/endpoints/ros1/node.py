@@ -25,6 +25,7 @@ from rospy.impl import masterslave, tcpros_base
 from rospy.impl.registration import RegManager, get_registration_listeners, get_service_manager, get_topic_manager
 
 from gdp.errors import LocalError, RemoteError
+from gdp.intervals import ANSWER_S, TICK_S
 from proxy.endpoints.core.reconnect import MissingConnections
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 from proxy.endpoints.ros1.master import GraphSnapshot, LocalEnd, Master, MasterError, MasterWatch
@@ -45,8 +46,6 @@ __all__ = ["Node"]
 
 _Connected: TypeAlias = tuple[int, str, int]
 
-_RETRY_S: Final = 0.4
-_FAREWELL_S: Final = 1.0
 _BACKLOG: Final = 128
 
 
@@ -202,7 +201,7 @@ class Node:
                 if not is_reported:
                     self._silent(str(error))
                 is_reported = True
-            self._stopped.wait(_RETRY_S)
+            self._stopped.wait(TICK_S)
 
     def _join(self, handle: int) -> None:
         """Add a publisher or server to the graph, unless an entity there contradicts it."""
@@ -312,7 +311,7 @@ class Node:
         self._stopped.set()
         farewell = threading.Thread(target=rospy.signal_shutdown, args=("the proxy has ended",), daemon=True)
         farewell.start()
-        farewell.join(_FAREWELL_S)
+        farewell.join(ANSWER_S)
         os._exit(0)
 
 

@@ -14,16 +14,14 @@ import time
 from pathlib import Path
 from typing import Final
 
+from gdp.intervals import ANSWER_S, STEADY_S
 from gdp.requests import Backoff
 from proxy.endpoints.ros1.ipc import Frame, IpcLink
 
 __all__ = ["RospyProcess"]
 
-_ANSWER_S: Final = 1.0
 _START_S: Final = 4.0  # a process that has just been started answers later
-_FAREWELL_S: Final = 2.0
 _RESTARTS: Final = Backoff(0.25, 5.0)
-_SOUND_S: Final = 10.0  # a process that ran this long did not fail at its start
 _ROOT: Final = Path(__file__).resolve().parents[3]
 
 
@@ -53,7 +51,7 @@ class RospyProcess:
     @property
     def answers_by_s(self) -> float:
         """Return the monotonic second until which a question that is asked now is answered."""
-        return max(time.monotonic() + _ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
+        return max(time.monotonic() + ANSWER_S, 0.0 if self._is_answering else self._started_s + _START_S)
 
     def poll_frames(self) -> list[Frame]:
         """Transfer frames on the link without blocking; return those received.
@@ -76,14 +74,14 @@ class RospyProcess:
         self._dropped_before += self.link.dropped
         self.epoll.unregister(self.link)
         self.link.close()
-        self._failures = 0 if time.monotonic() - self._started_s > _SOUND_S else self._failures + 1
+        self._failures = 0 if time.monotonic() - self._started_s > STEADY_S else self._failures + 1
         self._start(_RESTARTS.pause_s(self._failures) if self._failures else 0.0)
 
     def close(self) -> None:
         """End the process; may block two seconds while it unregisters from the master."""
         self.link.close()
         self._ended.append(self._process)
-        until_s = time.monotonic() + _FAREWELL_S
+        until_s = time.monotonic() + ANSWER_S
         for process in self._ended:
             try:
                 process.wait(max(0.0, until_s - time.monotonic()))

@@ -18,6 +18,7 @@ from rospy.exceptions import ROSInternalException, TransportInitError
 from rospy.impl.tcpros_base import TCPROSTransport
 from rospy.impl.tcpros_service import ServiceProxy
 
+from gdp.intervals import CONNECT_S, IDLE_S
 from gdp.ports.readiness import readable
 from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_service, ros1_name
@@ -25,8 +26,6 @@ from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_servic
 __all__ = ["Client", "Server", "tickets"]
 
 _WORKERS: Final = 64  # calls of one service under way at once; further calls wait
-_CONNECT_S: Final = 5.0
-_IDLE_S: Final = 10.0  # a connection costs the server a thread
 _SAID_MAX: Final = 4_096  # characters of a server's error text
 _RESPONDED: Final = " responded with an error: "
 _CANNOT: Final = "service cannot process request: "
@@ -129,7 +128,7 @@ class Client:
             with self._lock:
                 self._idle += 1
             try:
-                work = self._work.get(timeout=_IDLE_S)
+                work = self._work.get(timeout=IDLE_S)
             except queue.Empty:
                 work = None
             with self._lock:
@@ -190,7 +189,7 @@ class Client:
         uri = proxy._get_service_uri(request)
         host, port = rospy.core.parse_rosrpc_uri(uri)
         transport = TCPROSTransport(proxy.protocol, proxy.resolved_name)
-        transport.connect(host, port, uri, timeout=_CONNECT_S)
+        transport.connect(host, port, uri, timeout=CONNECT_S)
         return transport
 
 

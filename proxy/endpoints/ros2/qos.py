@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.qos import INFINITE_FROM_S
 from proxy.serial.channel import Channel, Qos
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ __all__ = ["conflict", "filled", "from_profile", "incompatibility", "service_pro
 _INFINITE: Final = (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
 _DEPTH: Final = 10
 _DEPTH_OF_ALL: Final = 1_000
-_INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _LIVELINESS: Final = ("automatic", "manual_by_topic")
 
 
@@ -104,12 +104,12 @@ def service_profile() -> QoSProfile:
 
 
 def _duration(duration: tuple[int, int]) -> tuple[int, int]:
-    return (0, 0) if duration[0] >= _INFINITE_FROM_S else duration
+    return (0, 0) if duration[0] >= INFINITE_FROM_S else duration
 
 
 def _limit(duration: tuple[int, int]) -> tuple[int, int]:
     """Return the duration; zero means unspecified, which is infinite."""
-    return _INFINITE if duration == (0, 0) or duration[0] >= _INFINITE_FROM_S else duration
+    return _INFINITE if duration == (0, 0) or duration[0] >= INFINITE_FROM_S else duration
 
 
 def _seconds(nanoseconds: int) -> tuple[int, int]:

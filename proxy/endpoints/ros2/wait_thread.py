@@ -14,9 +14,10 @@ from contextlib import ExitStack
 from threading import Lock, Thread
 from typing import Final
 
+from gdp.intervals import WATCH_S
 from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, Source, SubscriptionEntity
-from proxy.endpoints.ros2.graph_cache import LOOK_EVERY_S, GraphCache
+from proxy.endpoints.ros2.graph_cache import GraphCache
 from proxy.endpoints.ros2.qos import incompatibility
 from proxy.endpoints.ros2.session import ContextNode
 
@@ -158,7 +159,7 @@ class WaitThread:
                 self._post([event for source in client_entity for event in source.tend(now_s)])
             if now_s >= due_s:
                 self._refresh_graph()
-                due_s = time.monotonic() + LOOK_EVERY_S
+                due_s = time.monotonic() + WATCH_S
         wait_set.destroy_when_not_in_use()
         return due_s
 

@@ -201,7 +201,7 @@ def test_a_log_is_followed_until_its_machine_is_gone(
 
     provider = SimpleNamespace(poll_s=0.0, log=log, close=lambda: None)
     monkeypatch.setattr(logs, "open_provider", lambda site: provider)
-    monkeypatch.setattr(logs, "_LOOK_S", 0.0)
+    monkeypatch.setattr(logs, "WATCH_S", 0.0)
     result = fog("logs", "m1", "node", "--follow", "-n", "1", "--json")
     said = [json.loads(line) for line in result.stdout.splitlines()]
     assert said == [{"machine": "m1", "program": "node", "line": each} for each in ("two", "three", "four")]

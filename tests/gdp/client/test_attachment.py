@@ -11,7 +11,7 @@ from gdp.client.participant import Topic
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.intervals import ADVERTISEMENT
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
 from lab.simulation import Simulation
@@ -58,7 +58,7 @@ def test_a_refused_advertisement_is_not_made_again_at_once() -> None:
 
 def test_advertisements_are_renewed_before_their_lease_ends() -> None:
     world = ring()
-    world.network.run(3 * ADVERTISEMENT_LEASE_S)
+    world.network.run(3 * ADVERTISEMENT.lease_s)
     assert world.switches["nuc1"].attached.get(world.members[ROBOT].name, world.members[ROBOT].name) is not None
     assert world.ribs["school"].rib.names == 1
 
@@ -117,7 +117,7 @@ def test_who_leaves_is_gone_in_every_tier() -> None:
 def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
     world = ring()
     world.network.stop(ROBOT)
-    world.network.run(ADVERTISEMENT_LEASE_S + 1)
+    world.network.run(ADVERTISEMENT.lease_s + 1)
     assert [host.rib.names for host in world.ribs.values()] == [0, 1, 1]
 
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason
 from gdp.frame.codec import decode
-from gdp.limits import READER_GRACE_S, READER_LEASE_S, WINDOW_BYTES
+from gdp.intervals import FORGET_S, READER
+from gdp.limits import WINDOW_BYTES
 from gdp.message.loss import LossReason, LostRange
 from tests.gdp.client.pipe import End, Pipe, publisher_of
 
@@ -73,7 +74,7 @@ def test_a_reader_that_was_away_for_longer_learns_exactly_what_it_lost_and_why()
     (end,) = live(pipe, b"a")
     stream(pipe, 2.0)
     silence(end, is_silent=True)
-    stream(pipe, READER_LEASE_S + READER_GRACE_S + 5.0)
+    stream(pipe, READER.lease_s + FORGET_S + 5.0)
     published = pipe.publisher.messages
     silence(end, is_silent=False)
     pipe.run(5.0)
@@ -90,7 +91,7 @@ def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_retur
     pipe = Pipe(publisher_of())
     stays, moves = live(pipe, b"a", b"b")
     silence(moves, is_silent=True)
-    pipe.run(READER_LEASE_S + 1.0)
+    pipe.run(READER.lease_s + 1.0)
     for _ in range(60):
         pipe.publish([bytes(100_000)])
         assert pipe.publisher.has_space()
@@ -127,7 +128,7 @@ def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named()
     (end,) = live(pipe, b"a")
     stream(pipe, 1.0)
     silence(end, is_silent=True)
-    pipe.run(READER_LEASE_S + 1.0)
+    pipe.run(READER.lease_s + 1.0)
     for _ in range(50):
         pipe.publish([bytes(1 << 20)])
         assert pipe.publisher.has_space()
@@ -146,9 +147,9 @@ def test_a_reader_that_was_killed_is_given_up_after_the_grace_time_and_counted()
     stream(pipe, 1.0)
     silence(end, is_silent=True)
     stream(pipe, 2.0)
-    assert not pipe.run(READER_GRACE_S, pipe.publisher.is_acknowledged)
+    assert not pipe.run(FORGET_S, pipe.publisher.is_acknowledged)
     assert pipe.publisher.losses.total == 0
-    pipe.run(READER_LEASE_S + 1.0)
+    pipe.run(READER.lease_s + 1.0)
     assert list(pipe.publisher.losses.ranges) == [LostRange(11, 30, LossReason.GIVEN_UP)]
     assert pipe.publisher.acknowledgements.acknowledged == 10
 
@@ -240,7 +241,7 @@ def test_a_suspended_reader_is_counted_once_however_often_it_falls_silent() -> N
     stream(pipe, 1.0)
     for _ in range(3):
         silence(end, is_silent=True)
-        stream(pipe, READER_LEASE_S + READER_GRACE_S + 3.0, every_s=1.0)
+        stream(pipe, READER.lease_s + FORGET_S + 3.0, every_s=1.0)
         silence(end, is_silent=False)
         pipe.run(3.0)
         stream(pipe, 5.0, every_s=1.0)

@@ -12,7 +12,7 @@ from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from gdp.names import Name
 from tests.gdp.client.incarnation_ids import reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, Pipe, publisher_of, sequenced
@@ -104,7 +104,7 @@ def test_a_joiner_between_two_audiences_gets_no_more_than_the_depth() -> None:
     pipe.publish(MESSAGES[:5])
     pipe.run(1.0)
     first.deaf = first.mute = True
-    pipe.run(READER_LEASE_S + 1.0)
+    pipe.run(READER.lease_s + 1.0)
     assert pipe.publisher.readers == 0
     del pipe.ends[first.reader.name]
     pipe.publish(MESSAGES[5:7])
@@ -119,7 +119,7 @@ def test_a_dead_reader_is_evicted_after_its_lease_and_delays_no_other_after() ->
     pipe.run(1.0)
     dead.deaf = dead.mute = True
     pipe.publish([b"x" * 100_000] * 60)
-    assert not pipe.run(READER_LEASE_S - 2.0, lambda: len(live.delivered) == 60)
+    assert not pipe.run(READER.lease_s - 2.0, lambda: len(live.delivered) == 60)
     assert pipe.run(4.0, lambda: len(live.delivered) == 60)
     assert pipe.publisher.readers == 1
 
@@ -130,7 +130,7 @@ def test_a_reader_that_reports_but_never_moves_holds_up_the_others_for_one_lease
     pipe.run(1.0)
     stuck.deaf = True
     pipe.publish([b"x" * 100_000] * 60)
-    assert pipe.run(READER_LEASE_S + 2.0, lambda: len(live.delivered) == 60)
+    assert pipe.run(READER.lease_s + 2.0, lambda: len(live.delivered) == 60)
     begun_s = pipe.now_s
     pipe.publish([b"y" * 100_000] * 60)
     assert pipe.run(3.0, lambda: len(live.delivered) == 120), "held up a second time"
@@ -146,7 +146,7 @@ def test_a_reader_that_was_cut_off_for_longer_than_its_lease_goes_on_where_the_p
     cut.deaf = cut.mute = True
     for _ in range(20):
         pipe.publish([b"meanwhile"])
-        pipe.run(READER_LEASE_S / 10)
+        pipe.run(READER.lease_s / 10)
     cut.deaf = cut.mute = False
     pipe.run(20.0)
     cut.loss = 0.3

@@ -6,10 +6,10 @@ import pytest
 
 from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.sequence_numbers import SequenceRegistry, SequenceState
-from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, private_incarnation, private_name
+from gdp.client.unicast_stream import Party, PeerIncarnation, private_incarnation, private_name
 from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
 from gdp.errors import LocalError
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import FORGET_S, READER
 from gdp.names import Name
 from tests.gdp.client.incarnation_ids import note_keys, source_of
 from tests.gdp.client.pipe import SECRETS, WRITER
@@ -83,8 +83,8 @@ def test_a_silent_client_gives_way_to_one_that_asks() -> None:
     for number in range(STREAMS_MAX):
         desk.stream(client(number), 1500, 0.0)
     for stream in desk:
-        stream.handle_timer(READER_LEASE_S + 1)
-    desk.stream(client(STREAMS_MAX), 1500, READER_LEASE_S + 1)
+        stream.handle_timer(READER.lease_s + 1)
+    desk.stream(client(STREAMS_MAX), 1500, READER.lease_s + 1)
     assert len(desk) == STREAMS_MAX
 
 
@@ -92,11 +92,11 @@ def test_an_idle_stream_is_forgotten_and_its_numbers_are_not() -> None:
     sequence_registry = SequenceRegistry()
     desk = streams_of(sequence_registry)
     desk.stream(Party(CLIENT, EXCHANGE), 1500, 0.0).publish(bytes(60_000))
-    desk.forget_idle(IDLE_S)
+    desk.forget_idle(FORGET_S)
     assert len(desk) == 1
     for stream in desk:
-        stream.handle_timer(READER_LEASE_S + 1)
-    desk.forget_idle(2 * IDLE_S)
+        stream.handle_timer(READER.lease_s + 1)
+    desk.forget_idle(2 * FORGET_S)
     assert (len(desk), len(sequence_registry)) == (0, 1)
     assert desk.stream(Party(CLIENT, EXCHANGE), 1500, 200.0).past == SequenceState(2, 0, 1)
 

@@ -12,7 +12,8 @@ from gdp.config.config import PortConfig, RibConfig, SwitchConfig
 from gdp.config.schema import Section, first_fault, load
 from gdp.config.yaml_source import ConfigFileError
 from gdp.errors import ConfigError
-from gdp.limits import COST_AUTO, COST_DEFAULT, DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
+from gdp.intervals import NEIGHBOUR
+from gdp.limits import COST_AUTO, COST_DEFAULT, RIB_NAMES_PER_SENDER
 from gdp.names import Name
 from proxy.config.rule import Rule
 
@@ -44,7 +45,7 @@ def refusals(place: Path, text: str) -> list[str]:
 def test_a_switch_needs_no_more_than_who_it_is(place: Path) -> None:
     config = switch(place, SWITCH)
     assert (config.ports, config.attach, config.data_plane, config.metrics) == ((), (), "auto", None)
-    assert (config.hello_s, config.dead_s) == (HELLO_S, DEAD_S)
+    assert (config.hello_s, config.dead_s) == (NEIGHBOUR.refresh_s, NEIGHBOUR.lease_s)
     assert config.domain.transit is None
 
 

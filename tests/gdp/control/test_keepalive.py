@@ -21,7 +21,8 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import CLOCK_SKEW_S, COST_AUTO, DEAD_S, HELLO_IDLE, HELLO_S
+from gdp.intervals import HELLO_IDLE, NEIGHBOUR
+from gdp.limits import CLOCK_SKEW_S, COST_AUTO
 from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 
@@ -116,9 +117,9 @@ def test_a_silent_cut_is_noticed_within_the_detection_time() -> None:
 
 def test_neighbours_that_hear_keepalives_sign_few_hellos() -> None:
     pair = up(Pair())
-    pair.run(HELLO_IDLE * HELLO_S)
+    pair.run(HELLO_IDLE * NEIGHBOUR.refresh_s)
     assert pair.count(Kind.HELLO) <= 4
-    assert pair.count(Kind.KEEPALIVE) >= 2 * HELLO_IDLE * HELLO_S / 0.07
+    assert pair.count(Kind.KEEPALIVE) >= 2 * HELLO_IDLE * NEIGHBOUR.refresh_s / 0.07
 
 
 @pytest.mark.parametrize(
@@ -334,13 +335,13 @@ def test_a_frozen_node_is_let_go_and_comes_back() -> None:
 
 def test_a_node_whose_timers_are_late_asks_for_patience_and_less_so_later() -> None:
     slow = Slowness()
-    assert slow.multiplier(FAST, DEAD_S, 0.0) == 3
+    assert slow.multiplier(FAST, NEIGHBOUR.lease_s, 0.0) == 3
     slow.late(0.14, 0.0)
-    assert slow.multiplier(FAST, DEAD_S, 0.0) == 7
-    assert slow.multiplier(FAST, DEAD_S, 10.0) == 5
-    assert slow.multiplier(FAST, DEAD_S, 60.0) == 3
+    assert slow.multiplier(FAST, NEIGHBOUR.lease_s, 0.0) == 7
+    assert slow.multiplier(FAST, NEIGHBOUR.lease_s, 10.0) == 5
+    assert slow.multiplier(FAST, NEIGHBOUR.lease_s, 60.0) == 3
     slow.late(60.0, 60.0)
-    assert slow.multiplier(FAST, DEAD_S, 60.0) == int(DEAD_S / 0.07)
+    assert slow.multiplier(FAST, NEIGHBOUR.lease_s, 60.0) == int(NEIGHBOUR.lease_s / 0.07)
 
 
 def test_a_key_that_makes_a_secret_everybody_knows_is_refused() -> None:

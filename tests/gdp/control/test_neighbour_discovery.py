@@ -17,7 +17,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
-from gdp.limits import DEAD_S, HELLO_S
+from gdp.intervals import NEIGHBOUR
 from gdp.names import ZERO, Name
 from gdp.trust.domain import Policy
 from tests.gdp.control.members import (
@@ -56,7 +56,7 @@ def greet(one: HelloProtocol, two: HelloProtocol, begin_s: float, rounds: int = 
     """Let two HelloProtocol instances exchange statements; return all that the second sent."""
     said = []
     for step in range(rounds):
-        now_s = begin_s + step * HELLO_S
+        now_s = begin_s + step * NEIGHBOUR.refresh_s
         for hello in hellos(one, now_s):
             hear(two, hello, now_s)
         for hello in hellos(two, now_s):
@@ -102,8 +102,8 @@ def test_two_that_hear_each_other_are_neighbours() -> None:
 def test_who_is_heard_but_does_not_hear_is_no_neighbour() -> None:
     one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     for step in range(4):
-        for hello in hellos(two, step * HELLO_S):
-            hear(one, hello, step * HELLO_S)
+        for hello in hellos(two, step * NEIGHBOUR.refresh_s):
+            hear(one, hello, step * NEIGHBOUR.refresh_s)
     assert one.neighbours.all_up() == []
 
 
@@ -149,7 +149,7 @@ def test_a_restart_in_an_instant_is_noticed() -> None:
     again = hello_protocol(B, 3)
     changes = []
     for step in range(4):
-        now_s = 1.0 + step * HELLO_S
+        now_s = 1.0 + step * NEIGHBOUR.refresh_s
         for hello in hellos(one, now_s):
             hear(again, hello, now_s)
         changes += [hear(one, hello, now_s) for hello in hellos(again, now_s)]
@@ -159,8 +159,8 @@ def test_a_restart_in_an_instant_is_noticed() -> None:
 def test_a_neighbour_that_falls_silent_is_let_go() -> None:
     one, _, _ = pair()
     heard_s = one.neighbours.all_up()[0].heard_s
-    assert one.drop_silent(heard_s + DEAD_S - 0.01) == []
-    assert [(n.name, before) for n, before in one.drop_silent(heard_s + DEAD_S)] == [(B.name, UP)]
+    assert one.drop_silent(heard_s + NEIGHBOUR.lease_s - 0.01) == []
+    assert [(n.name, before) for n, before in one.drop_silent(heard_s + NEIGHBOUR.lease_s)] == [(B.name, UP)]
 
 
 def test_a_lost_link_takes_its_neighbours_away_at_once() -> None:

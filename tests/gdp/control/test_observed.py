@@ -11,7 +11,7 @@ from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
-from gdp.limits import DEAD_S
+from gdp.intervals import NEIGHBOUR
 from tests.gdp.control.members import at, hello_in, hello_protocol, node, statement_of
 
 A, B, C = node("a"), node("b"), node("c")
@@ -88,7 +88,7 @@ def test_an_address_observed_by_a_lost_neighbour_is_forgotten_at_both_ends() -> 
     one, two = tunnel.ends
     one.set_observed(0, B.name, SEEN)
     tunnel.run(1)
-    tunnel.run(2 * DEAD_S, silent=one)
+    tunnel.run(2 * NEIGHBOUR.lease_s, silent=one)
     assert two.neighbours.observed_addresses() == {}
     tunnel.run(2)
     assert one.neighbours.get(0, B.name) is not None

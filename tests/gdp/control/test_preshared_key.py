@@ -14,7 +14,7 @@ from gdp.control.preshared_key import NO_KEY, SIZES, PresharedKeyAgreement
 from gdp.crypto.kem import KEM_PUBLIC_BYTES
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
-from gdp.limits import DEAD_S
+from gdp.intervals import NEIGHBOUR
 from tests.gdp.control.members import Nonces, at, hello_in, hello_protocol, node, statement_of_frames
 
 ENDS = sorted((node("a"), node("b")), key=lambda each: each.name)
@@ -22,7 +22,9 @@ STEP_S = 0.05
 DIAL_S = 1.0
 REKEY_S, REJECT_S = 120.0, 180.0  # WireGuard paper, section 6.1
 RETRY_S = 5.0  # REKEY_TIMEOUT
-RECOVERY_S = 2 * DEAD_S + RETRY_S + 2.0  # the loss is seen at both ends, a handshake, the hellos of the agreement
+RECOVERY_S = (
+    2 * NEIGHBOUR.lease_s + RETRY_S + 2.0
+)  # the loss is seen at both ends, a handshake, the hellos of the agreement
 
 
 class Lab:
@@ -116,7 +118,7 @@ def test_a_restarted_end_gets_a_new_key_within_the_bound(lab: Lab, number: int) 
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_cut_in_one_direction_clears_the_key_at_both_ends(lab: Lab, number: int) -> None:
     lab.lost[number] = True
-    lab.run(2 * DEAD_S + 0.5)
+    lab.run(2 * NEIGHBOUR.lease_s + 0.5)
     assert lab.keys == [NO_KEY, NO_KEY]
     lab.lost[number] = False
     lab.run(RECOVERY_S)
@@ -127,7 +129,7 @@ EVENTS = st.one_of(
     st.tuples(st.just("restart"), st.integers(0, 1)),
     st.tuples(st.just("lose"), st.integers(0, 1)),
     st.tuples(st.just("heal"), st.integers(0, 1)),
-    st.tuples(st.just("run"), st.sampled_from([STEP_S, 2 * STEP_S, 0.3, DEAD_S, 2 * DEAD_S])),
+    st.tuples(st.just("run"), st.sampled_from([STEP_S, 2 * STEP_S, 0.3, NEIGHBOUR.lease_s, 2 * NEIGHBOUR.lease_s])),
     st.tuples(st.just("rekey"), st.just(0)),
 )
 

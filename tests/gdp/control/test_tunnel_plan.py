@@ -8,7 +8,7 @@ from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.tunnel_plan import (
     DIAL_S,
-    REBIND_S,
+    REBINDS,
     Dialer,
     RebindSchedule,
     TunnelId,
@@ -80,6 +80,6 @@ def test_an_uplink_takes_another_port_when_every_border_falls_silent() -> None:
     assert not schedule.update(100.0, is_up=False)  # none has answered yet: the NAT has no stale mapping
     assert not schedule.update(101.0, is_up=True)
     found = [at / 10 for at in range(1_020, 1_300) if schedule.update(at / 10, is_up=False)]
-    assert found == pytest.approx([102.0 + REBIND_S, 105.0, 109.0, 117.0], abs=0.11)
+    assert found == pytest.approx([102.0 + REBINDS.first_s, 105.0, 109.0, 117.0], abs=0.11)
     assert not schedule.update(130.0, is_up=True)
-    assert not schedule.update(130.0 + REBIND_S / 2, is_up=False)
+    assert not schedule.update(130.0 + REBINDS.first_s / 2, is_up=False)

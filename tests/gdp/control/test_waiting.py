@@ -11,7 +11,7 @@ from gdp.control.waiting import Wait, WaitLog, WaitReason
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, StatementError
-from gdp.limits import HELLO_S, WAIT_REPORT_S
+from gdp.intervals import NEIGHBOUR, REPORT_S
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from tests.gdp.control.members import CLOUD, ELSEWHERE, POLICY, Nonces, at, hello_protocol, node, statement_of
@@ -34,20 +34,20 @@ def reasons(of: Attachment, now_s: float = 0.0) -> list[WaitReason]:
 def test_what_lasts_is_reported_once_and_again_when_it_changes() -> None:
     log = WaitLog()
     assert log.update([DOWN], 0.0) == []
-    assert log.update([DOWN], WAIT_REPORT_S) == [DOWN]
-    assert log.update([DOWN], 2 * WAIT_REPORT_S) == []
-    assert log.update([ALONE], 2 * WAIT_REPORT_S) == []
-    assert log.update([ALONE], 2 * WAIT_REPORT_S + 1) == [ALONE]
+    assert log.update([DOWN], REPORT_S) == [DOWN]
+    assert log.update([DOWN], 2 * REPORT_S) == []
+    assert log.update([ALONE], 2 * REPORT_S) == []
+    assert log.update([ALONE], 2 * REPORT_S + 1) == [ALONE]
     assert log.lasting == [ALONE]
 
 
 def test_what_is_over_in_time_is_not_reported_and_what_comes_back_waits_again() -> None:
     log = WaitLog()
     log.update([DOWN], 0.0)
-    log.update([], WAIT_REPORT_S - 1)
-    assert log.update([DOWN], WAIT_REPORT_S) == []
-    assert log.update([DOWN], 2 * WAIT_REPORT_S) == [DOWN]
-    log.update([], 2 * WAIT_REPORT_S)
+    log.update([], REPORT_S - 1)
+    assert log.update([DOWN], REPORT_S) == []
+    assert log.update([DOWN], 2 * REPORT_S) == [DOWN]
+    log.update([], 2 * REPORT_S)
     assert log.lasting == []
 
 
@@ -55,8 +55,8 @@ def test_a_port_and_a_missing_rib_are_reported_apart() -> None:
     log = WaitLog()
     log.update([DOWN], 0.0)
     log.update([DOWN, NO_RIB], 2.0)
-    assert log.update([DOWN, NO_RIB], WAIT_REPORT_S) == [DOWN]
-    assert log.update([DOWN, NO_RIB], WAIT_REPORT_S + 2) == [NO_RIB]
+    assert log.update([DOWN, NO_RIB], REPORT_S) == [DOWN]
+    assert log.update([DOWN, NO_RIB], REPORT_S + 2) == [NO_RIB]
 
 
 def test_a_node_whose_link_is_down_and_then_up_says_so() -> None:
@@ -86,7 +86,7 @@ def test_a_neighbour_of_a_domain_that_is_not_trusted_is_named_while_it_is_heard(
         alone.hello_protocol.receive(
             ReceivedFrame(0, b"\2far\0\0", hello.frames[0]), parse(statement_of(hello.frames[0])), at(0.0)
         )
-    (wait,) = attachment_waits(alone, HELLO_S)
+    (wait,) = attachment_waits(alone, NEIGHBOUR.refresh_s)
     assert wait == Wait(WaitReason.STRANGER, 0, ELSEWHERE.root.label, refused=DropReason.WRONG_DOMAIN)
     assert reasons(alone, 10.0) == [WaitReason.NO_NEIGHBOUR]
 

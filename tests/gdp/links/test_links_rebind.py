@@ -13,11 +13,12 @@ from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.settings import NodeSettings
-from gdp.control.tunnel_plan import REBIND_MAX_S, REBIND_S, TunnelId
+from gdp.control.tunnel_plan import REBINDS, TunnelId
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
+from gdp.intervals import PACE_S
 from gdp.links import tunnels as tunnels_module
-from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
+from gdp.links.links import TunnelLinks
 from gdp.names import Name
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
@@ -75,8 +76,8 @@ class Robot:
         """Let time pass with these neighbours up; return how often each uplink took another port."""
         before = self.rebinds()
         self.up = {each.name for each in up}
-        for _ in range(round(duration_s / LINKS_PERIOD_S)):
-            self.now_s += LINKS_PERIOD_S
+        for _ in range(round(duration_s / PACE_S)):
+            self.now_s += PACE_S
             self.links.handle_timer(at(self.now_s))
         return [now - then for now, then in zip(self.rebinds(), before, strict=True)]
 
@@ -95,7 +96,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
 
 def test_uplinks_over_which_no_tunnel_is_up_take_another_port(robot: Robot) -> None:
     assert robot.run(5, BORDER) == [0, 0]
-    assert robot.run(2 * REBIND_S) == [1, 1]
+    assert robot.run(2 * REBINDS.first_s) == [1, 1]
 
 
 def test_an_uplink_with_a_direct_tunnel_that_is_up_keeps_its_port(robot: Robot) -> None:
@@ -115,8 +116,8 @@ def test_an_uplink_over_which_a_peer_that_dials_this_switch_is_up_keeps_its_port
 def test_a_direct_tunnel_that_falls_silent_with_the_border_delays_no_other_port(robot: Robot) -> None:
     robot.open_direct()
     robot.run(5, BORDER, SERVER)
-    robot.run(REBIND_S / 2, SERVER)
-    assert robot.run(2 * REBIND_S) == [1, 1]
+    robot.run(REBINDS.first_s / 2, SERVER)
+    assert robot.run(2 * REBINDS.first_s) == [1, 1]
 
 
 def test_a_direct_tunnel_that_outlived_the_border_has_time_to_come_back_over_its_port(robot: Robot) -> None:
@@ -124,5 +125,5 @@ def test_a_direct_tunnel_that_outlived_the_border_has_time_to_come_back_over_its
     robot.run(5, BORDER, SERVER)
     for _ in range(3):
         assert robot.run(OUTAGE_S, SERVER)[0] == 0
-        assert robot.run(REBIND_MAX_S - 1)[0] == 0
+        assert robot.run(REBINDS.most_s - 1)[0] == 0
     assert robot.run(2)[0] == 1

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.limits import (
-    FLIGHT_MAX_BYTES,
-    FLIGHT_MESSAGES_MAX,
-    NACKS_PER_REPORT,
-    PROBE_MAX_S,
-    READER_LEASE_S,
-    REPAIRS_MAX_BYTES,
-)
+from gdp.intervals import READER
+from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MESSAGES_MAX, NACKS_PER_REPORT, REPAIRS_MAX_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.flow_control import PROBES
 from gdp.message.renumbering import Renumbering
 from gdp.message.send_window import SendWindow
 
@@ -248,7 +243,7 @@ def test_probes_come_when_readers_are_silent_and_back_off() -> None:
         times.append(due_s - now_s)
         now_s = due_s
     assert times == sorted(times)
-    assert times[-1] == pytest.approx(PROBE_MAX_S)
+    assert times[-1] == pytest.approx(PROBES.most_s)
     window.handle_acknack(A, has(2), now_s)
     assert window.next_probe() is None
 
@@ -259,8 +254,8 @@ def test_a_reader_that_does_not_move_for_its_lease_is_slow() -> None:
     window.handle_acknack(A, has(2), 0.1)
     for at in range(1, 6):
         window.handle_acknack(B, has(1), float(at))
-    assert window.slow_readers(READER_LEASE_S - 0.1) == []
-    assert window.slow_readers(READER_LEASE_S + 0.2) == [B]
+    assert window.slow_readers(READER.lease_s - 0.1) == []
+    assert window.slow_readers(READER.lease_s + 0.2) == [B]
 
 
 def test_a_reader_that_moves_too_slowly_is_slow_only_where_others_wait_for_it() -> None:
@@ -274,7 +269,7 @@ def test_a_reader_that_moves_too_slowly_is_slow_only_where_others_wait_for_it() 
         assert window.slow_readers(9.0) == expected
 
 
-@pytest.mark.parametrize("lag_s", [1.0, READER_LEASE_S])
+@pytest.mark.parametrize("lag_s", [1.0, READER.lease_s])
 def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has(lag_s: float) -> None:
     window = SendWindow(lag_s=lag_s)
     for reader in (A, B):
@@ -308,7 +303,7 @@ def test_a_reader_that_lagged_behind_a_removed_one_is_not_slow() -> None:
     window.drop_reader(A)
     assert window.readers.next_slow() is None
     assert window.slow_readers(2.0) == []
-    assert window.slow_readers(READER_LEASE_S + 0.2) == [B]
+    assert window.slow_readers(READER.lease_s + 0.2) == [B]
 
 
 def test_a_reader_that_owed_nothing_for_long_is_no_slow_reader_when_something_new_goes_out() -> None:
@@ -318,7 +313,7 @@ def test_a_reader_that_owed_nothing_for_long_is_no_slow_reader_when_something_ne
     put(window, 2, message(2, 10))
     window.frames_to_send(1_000.0)
     assert window.slow_readers(1_000.1) == []
-    assert window.slow_readers(1_000.1 + READER_LEASE_S) == [A]
+    assert window.slow_readers(1_000.1 + READER.lease_s) == [A]
 
 
 def test_a_newcomer_begins_at_its_message() -> None:

@@ -12,8 +12,9 @@ from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.frame.kinds import Flag
+from gdp.intervals import CONNECT_S
 from gdp.links.relay_tls import tls_context
-from gdp.relay.connection import HANDSHAKE_S, ConnectionState, RelayConnection
+from gdp.relay.connection import ConnectionState, RelayConnection
 from gdp.relay.framing import PREFIX, ControlMessage, ControlType
 from gdp.trust.domain import Policy
 from tests.gdp.relay.ends import DAY_S, NOW, SETTINGS, Ends, at, domain, ends, exchange, member
@@ -132,8 +133,8 @@ def test_silence_of_the_other_end_is_noticed_within_a_second(pair: tuple[RelayCo
 
 def test_a_handshake_that_does_not_proceed_ends() -> None:
     server = ends().server()
-    assert server.get_timer(0.0) == HANDSHAKE_S
-    server.handle_timer(HANDSHAKE_S)
+    assert server.get_timer(0.0) == CONNECT_S
+    server.handle_timer(CONNECT_S)
     assert server.state is CLOSED
 
 

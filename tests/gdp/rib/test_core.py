@@ -14,7 +14,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StoreError
-from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore
@@ -619,7 +619,7 @@ def test_a_rib_below_that_is_back_has_half_a_lease_to_relay_again_what_was_kept(
         if second >= 40 and probed:
             sign_of_life(at_rib, second + 0.1)
         ends_s = ends_s or (second if at_rib.names == 0 else 0.0)
-    assert ends_s >= 40 + ADVERTISEMENT_LEASE_S / 2
+    assert ends_s >= 40 + ADVERTISEMENT.lease_s / 2
 
 
 def test_no_proof_of_an_advertiser_outlives_its_validity_because_a_rib_is_silent() -> None:

@@ -18,7 +18,8 @@ from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of, rank_in
 from gdp.frame.kinds import Kind
-from gdp.limits import ENDPOINT_LEASE_S, ENDPOINT_RECORDS_BURST
+from gdp.intervals import ENDPOINT
+from gdp.limits import ENDPOINT_RECORDS_RATE
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.rib.endpoints import RibEndpoints
@@ -123,9 +124,9 @@ def test_a_record_is_dropped_unless_it_is_renewed() -> None:
     core, wire = rib(), record().wire
     give(core, wire)
     give(core, wire, now_s=40.0)
-    tick(core, ENDPOINT_LEASE_S + 1)
+    tick(core, ENDPOINT.lease_s + 1)
     assert len(core.state.endpoints) == 1
-    tick(core, 40.0 + ENDPOINT_LEASE_S)
+    tick(core, 40.0 + ENDPOINT.lease_s)
     assert len(core.state.endpoints) == 0
 
 
@@ -198,8 +199,8 @@ def test_a_flood_of_records_by_one_member_costs_no_signatures_beyond_its_rate_an
     core = rib()
     wires = [record(sequence=sequence).wire for sequence in range(1, 60)]
     answered = sum(len(give(core, wire)) for wire in wires)
-    assert answered <= ENDPOINT_RECORDS_BURST
-    assert core.state.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_BURST
+    assert answered <= ENDPOINT_RECORDS_RATE.burst
+    assert core.state.refusals[DropReason.QUOTA] >= len(wires) - ENDPOINT_RECORDS_RATE.burst
     assert len(core.state.endpoints) == 1
     assert responses(give(core, record(TWO).wire, TWO), TWO)[0].refused is None
 
@@ -251,9 +252,9 @@ def test_a_rib_that_has_just_started_fetches_what_its_peers_keep() -> None:
 def test_two_ribs_do_not_keep_a_record_alive_that_its_switch_does_not_renew() -> None:
     one, two = rib(peers=(PEER.name,)), rib(PEER, peers=(RIB.name,))
     give(one, record().wire)
-    for now_s in range(2 * int(ENDPOINT_LEASE_S)):
+    for now_s in range(2 * int(ENDPOINT.lease_s)):
         equalise(one, two, now_s=float(now_s))
-        assert (len(one.state.endpoints), len(two.state.endpoints)) == (1, 1) or now_s >= ENDPOINT_LEASE_S - 2
+        assert (len(one.state.endpoints), len(two.state.endpoints)) == (1, 1) or now_s >= ENDPOINT.lease_s - 2
     assert (len(one.state.endpoints), len(two.state.endpoints)) == (0, 0)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gdp.rib.upstream_advertisements import PROBE_S, QUIET_S, RETURN_S, SILENT_MIN_S, UpstreamAdvertisements
+from gdp.intervals import RETRY_S
+from gdp.rib.upstream_advertisements import PROBE_S, SILENT_MIN_S, UpstreamAdvertisements
 from tests.gdp.switch.net import name
 
 FIRST, SECOND = name("first"), name("second")
@@ -21,13 +22,13 @@ def silent_first() -> UpstreamAdvertisements:
 def test_a_preferred_rib_is_used_again_once_it_answers_a_probe() -> None:
     upstream = silent_first()
     left_s = PROBE_S + SILENT_MIN_S
-    assert upstream.preferred(left_s + RETURN_S - 0.01) == ()
-    assert upstream.preferred(left_s + RETURN_S) == (FIRST,)
-    assert upstream.preferred(left_s + RETURN_S + 0.01) == ()
-    assert upstream.preferred(left_s + 2 * RETURN_S) == (FIRST,)
-    assert upstream.record_alive(FIRST, left_s + 2 * RETURN_S + 0.1)
+    assert upstream.preferred(left_s + RETRY_S - 0.01) == ()
+    assert upstream.preferred(left_s + RETRY_S) == (FIRST,)
+    assert upstream.preferred(left_s + RETRY_S + 0.01) == ()
+    assert upstream.preferred(left_s + 2 * RETRY_S) == (FIRST,)
+    assert upstream.record_alive(FIRST, left_s + 2 * RETRY_S + 0.1)
     assert upstream.rib == FIRST
-    assert upstream.preferred(left_s + 9 * RETURN_S) == ()
+    assert upstream.preferred(left_s + 9 * RETRY_S) == ()
 
 
 def test_a_late_answer_of_a_slow_rib_does_not_bring_it_back() -> None:
@@ -40,9 +41,9 @@ def test_a_tier_that_owes_an_answer_is_silent_until_any_of_its_ribs_is_heard() -
     upstream = UpstreamAdvertisements((FIRST, SECOND))
     assert not upstream.is_silent(1_000.0)
     upstream.record_asked(1.0)
-    upstream.record_asked(1.0 + QUIET_S / 2)
-    assert not upstream.is_silent(1.0 + QUIET_S - 0.01)
-    assert upstream.is_silent(1.0 + QUIET_S)
-    assert upstream.record_alive(SECOND, 1.0 + QUIET_S), "all queries are due: it is back"
-    assert not upstream.is_silent(1.0 + QUIET_S)
-    assert not upstream.record_alive(SECOND, 2.0 + QUIET_S)
+    upstream.record_asked(1.0 + 2 * PROBE_S / 2)
+    assert not upstream.is_silent(1.0 + 2 * PROBE_S - 0.01)
+    assert upstream.is_silent(1.0 + 2 * PROBE_S)
+    assert upstream.record_alive(SECOND, 1.0 + 2 * PROBE_S), "all queries are due: it is back"
+    assert not upstream.is_silent(1.0 + 2 * PROBE_S)
+    assert not upstream.record_alive(SECOND, 2.0 + 2 * PROBE_S)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.rib.upstream_queries import RETRY_S, WATCH_AGAIN_S, UpstreamQueries
+from gdp.intervals import ADVERTISEMENT
+from gdp.rib.upstream_queries import RETRY_S, WATCH, UpstreamQueries
 from gdp.rib.watches import Asker
 from tests.gdp.switch.net import name
 
@@ -13,7 +13,7 @@ TOPIC = name("topic")
 ASKER = Asker(name("switch"), name("domain"), is_rib=False)
 
 
-def watched(lease_s: float = ADVERTISEMENT_LEASE_S) -> UpstreamQueries:
+def watched(lease_s: float = ADVERTISEMENT.lease_s) -> UpstreamQueries:
     """Return the queries of a RIB that got a response for a watched name at 0 s, with this lease."""
     queries = UpstreamQueries(is_top=False)
     assert queries.request(TOPIC, ASKER, 1_000.0, 0.0, is_known=False)
@@ -26,7 +26,8 @@ def asks(queries: UpstreamQueries, now_s: float) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("lease_s", "again_s"), [(ADVERTISEMENT_LEASE_S, WATCH_AGAIN_S), (2.4, 0.8), (0.0, RETRY_S), (1e9, WATCH_AGAIN_S)]
+    ("lease_s", "again_s"),
+    [(ADVERTISEMENT.lease_s, WATCH.refresh_s), (2.4, 0.8), (0.0, RETRY_S), (1e9, WATCH.refresh_s)],
 )
 def test_a_watch_is_renewed_while_the_lease_of_the_response_lasts(lease_s: float, again_s: float) -> None:
     queries = watched(lease_s)
@@ -46,27 +47,27 @@ def test_an_update_with_a_short_lease_is_renewed_in_time_and_one_with_a_long_lea
 
 def test_a_renewal_is_repeated_until_a_response_comes() -> None:
     queries = watched()
-    due_s = WATCH_AGAIN_S
+    due_s = WATCH.refresh_s
     for doubled in range(5):
         assert not asks(queries, due_s - 0.01)
         assert asks(queries, due_s)
-        due_s += WATCH_AGAIN_S if doubled == 4 else RETRY_S * 2**doubled
+        due_s += WATCH.refresh_s if doubled == 4 else RETRY_S * 2**doubled
     assert asks(queries, due_s)
     assert queries.answered(TOPIC, due_s) == []
-    assert not asks(queries, due_s + WATCH_AGAIN_S - 0.01)
-    assert asks(queries, due_s + WATCH_AGAIN_S)
+    assert not asks(queries, due_s + WATCH.refresh_s - 0.01)
+    assert asks(queries, due_s + WATCH.refresh_s)
 
 
 def test_an_update_without_a_query_renews_no_watch() -> None:
     queries = watched()
-    queries.answered(TOPIC, WATCH_AGAIN_S - 0.5)
-    assert asks(queries, WATCH_AGAIN_S)
+    queries.answered(TOPIC, WATCH.refresh_s - 0.5)
+    assert asks(queries, WATCH.refresh_s)
 
 
 def test_a_silent_tier_gets_one_query_for_each_renewal() -> None:
     queries = watched()
-    assert queries.due(WATCH_AGAIN_S, is_silent=True)[0]
-    assert not queries.due(2 * WATCH_AGAIN_S - 0.01, is_silent=True)[0]
-    (query,) = queries.due(2 * WATCH_AGAIN_S, is_silent=True)[0]
+    assert queries.due(WATCH.refresh_s, is_silent=True)[0]
+    assert not queries.due(2 * WATCH.refresh_s - 0.01, is_silent=True)[0]
+    (query,) = queries.due(2 * WATCH.refresh_s, is_silent=True)[0]
     assert query.is_unanswered
-    assert query.again_s == 3 * WATCH_AGAIN_S
+    assert query.again_s == 3 * WATCH.refresh_s

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gdp.errors import LocalError
+from gdp.intervals import REFUSED_S
 from gdp.names import Name
 from gdp.service.dispatch import GATHER_S, HEDGE_FIRST_S, Ask, Dispatch, End
-from gdp.service.latency import LATELY_S
 from gdp.service.replication import ALL, Mode, Replication
 from gdp.service.replication_messages import LogId, ReplicaStatus, Snapshot, call_of
 from gdp.service.sequencer import Sequencer
@@ -44,7 +44,7 @@ def test_one_that_refuses_at_once_does_not_draw_the_requests() -> None:
     dispatch.poll_effects()
     begin(dispatch, 1.0)
     assert asked_first(dispatch) == (SLOW,)
-    begin(dispatch, 1.0 + 2 * LATELY_S)
+    begin(dispatch, 1.0 + 2 * REFUSED_S)
     assert asked_first(dispatch) == (BAD,)  # it may work again by now
 
 

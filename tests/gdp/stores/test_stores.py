@@ -158,7 +158,7 @@ def test_what_could_not_be_written_is_written_when_the_disk_has_space_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr("gdp.stores.background_database.RETRY_S", 0.001)
+    monkeypatch.setattr("gdp.stores.background_database.TICK_S", 0.001)
     pair, folder = MemoryPair(Site()), tmp_path / "disk"
     pair.give(pair.one, pair.site.relay("/a", 1))
     snapshot = Snapshot(folder / "rib.sqlite")
@@ -176,7 +176,7 @@ def test_what_could_not_be_written_is_written_when_the_disk_has_space_again(
 
 
 def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.stores.background_database.RETRY_S", 0.001)
+    monkeypatch.setattr("gdp.stores.background_database.TICK_S", 0.001)
     monkeypatch.setattr("gdp.nodes.rib_upkeep.CHANGES_MAX", 4)
     site, folder = Site(), tmp_path / "disk"
     upkeep = MemoryUpkeep(folder / "rib.sqlite")

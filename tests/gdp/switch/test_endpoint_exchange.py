@@ -16,7 +16,7 @@ from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of
-from gdp.limits import ENDPOINT_LEASE_S
+from gdp.intervals import ENDPOINT
 from gdp.names import Name
 from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
 from gdp.trust.domain import Policy
@@ -70,7 +70,7 @@ def test_a_record_is_sent_at_once_and_again_until_the_rib_keeps_it() -> None:
     times = [now_s for now_s, _ in sent(made, 20.0)]
     assert times[:4] == pytest.approx([0.0, 0.3, 0.9, 2.1])
     made.receive(kept(1), at(20.0))
-    assert made.get_timer() == pytest.approx(20.0 + ENDPOINT_LEASE_S / 3)
+    assert made.get_timer() == pytest.approx(20.0 + ENDPOINT.lease_s / 3)
 
 
 def test_a_record_that_the_rib_has_lost_is_sent_again_at_once() -> None:

@@ -9,7 +9,8 @@ from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason
 from gdp.frame.codec import HEADER_BYTES, Header, encode
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import HOPS_MAX, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
+from gdp.intervals import LINK_STATE
+from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
 from lab.simulation import Simulation
 from tests.journeys.flows import ring
@@ -97,7 +98,7 @@ def test_a_state_played_back_changes_nothing_and_goes_no_further() -> None:
 def test_a_switch_that_is_gone_is_forgotten_and_the_others_are_not() -> None:
     world = ring()
     world.network.stop("nuc3")
-    world.network.run(LINK_STATE_LEASE_S + LINK_STATE_REFRESH_S + 1)
+    world.network.run(LINK_STATE.lease_s + LINK_STATE.refresh_s + 1)
     gone = bytes(world.identities["nuc3"].name)
     assert gone not in origins(world, "nuc1", Scope.BORDER)
     assert len(origins(world, "nuc1", Scope.BORDER)) == 4

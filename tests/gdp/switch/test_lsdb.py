@@ -6,7 +6,7 @@ import pytest
 
 from gdp.control.link_state import Scope
 from gdp.errors import DropReason, StatementError
-from gdp.limits import LINK_STATE_LEASE_S
+from gdp.intervals import LINK_STATE
 from gdp.switch import lsdb
 from gdp.switch.lsdb import LinkStateDatabase
 from tests.gdp.switch.net import AWAY, HOME, known, link, name, state
@@ -34,9 +34,9 @@ def test_a_change_of_links_is_a_new_version_and_a_renewal_is_not() -> None:
 
 def test_what_is_not_renewed_is_forgotten() -> None:
     states = known(state("a"))
-    assert states.next_expiry() == LINK_STATE_LEASE_S
+    assert states.next_expiry() == LINK_STATE.lease_s
     before = states.version
-    states.expire(LINK_STATE_LEASE_S)
+    states.expire(LINK_STATE.lease_s)
     assert (len(states), states.next_expiry()) == (0, None)
     assert states.version > before
 

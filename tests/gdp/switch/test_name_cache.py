@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.intervals import NEGATIVE_LEASE_S
 from gdp.switch.name_cache import Location, NameCache
 from gdp.trust.right import Right
 from tests.gdp.switch.net import HOME, name

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
+from gdp.intervals import ADVERTISEMENT
+from gdp.limits import PENDING_S
 from gdp.names import Name
 from gdp.switch.name_queries import BATCH_MAX, QUERIES_MAX, RETRY_S, TRIES_MAX, NameQueries
 from gdp.switch.query_window import WINDOW
@@ -49,7 +50,7 @@ def test_a_watch_goes_on_after_its_answer() -> None:
     queries.watch(TOPIC, 0.0)
     queries.receive_answer(TOPIC, 0.0)
     assert polled(queries, 1.0) == []
-    assert polled(queries, ADVERTISEMENT_LEASE_S / 4) == [(TOPIC, queries.watch_s)]
+    assert polled(queries, ADVERTISEMENT.lease_s / 4) == [(TOPIC, queries.watch_s)]
 
 
 def test_a_watch_is_sent_at_once_though_the_name_was_queried_before() -> None:
@@ -154,8 +155,8 @@ def test_a_watch_is_renewed_in_time_however_often_the_rib_sends_updates() -> Non
         sent_s += [now_s] if polled(queries, now_s) else []
         queries.receive_answer(TOPIC, now_s)
     assert sent_s[0] == 0
-    assert all(b - a <= ADVERTISEMENT_LEASE_S / 4 for a, b in pairwise(sent_s))
-    assert len(sent_s) >= 60 / (ADVERTISEMENT_LEASE_S / 4)
+    assert all(b - a <= ADVERTISEMENT.lease_s / 4 for a, b in pairwise(sent_s))
+    assert len(sent_s) >= 60 / (ADVERTISEMENT.lease_s / 4)
 
 
 def test_a_renewal_of_a_watch_is_repeated_until_a_response_comes() -> None:
@@ -163,12 +164,12 @@ def test_a_renewal_of_a_watch_is_repeated_until_a_response_comes() -> None:
     queries.watch(TOPIC, 0.0)
     polled(queries, 0.0)
     queries.receive_answer(TOPIC, 0.0)
-    renewed_s = ADVERTISEMENT_LEASE_S / 4
+    renewed_s = ADVERTISEMENT.lease_s / 4
     due_s = renewed_s
     for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S, renewed_s, renewed_s):
         assert not polled(queries, due_s - 0.02)
-        assert polled(queries, due_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+        assert polled(queries, due_s) == [(TOPIC, ADVERTISEMENT.lease_s)]
         due_s += pause_s
     queries.receive_answer(TOPIC, due_s)
     assert not polled(queries, due_s + renewed_s - 0.02)
-    assert polled(queries, due_s + renewed_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    assert polled(queries, due_s + renewed_s) == [(TOPIC, ADVERTISEMENT.lease_s)]

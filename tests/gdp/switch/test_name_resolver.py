@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import DropReason
-from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S, PENDING_S, QUESTIONS_BURST
+from gdp.intervals import ADVERTISEMENT, NEGATIVE_LEASE_S
+from gdp.limits import PENDING_S, QUESTIONS_RATE
 from gdp.names import Name
 from gdp.switch.name_cache import Location
 from gdp.switch.name_queries import QUERIES_MAX, RETRY_S, TRIES_MAX
@@ -82,7 +83,7 @@ def test_a_name_that_one_rib_does_not_know_is_queried_at_each_other_one_once_and
         resolver.receive_unknown(SERVER, rib, 0.1 * len(asked), others)
         asked.append(rib)
     assert (resolver.queries_to_send(1.0), resolver.queries.passed_over(SERVER)) == ([], frozenset())
-    assert resolver.queries_to_send(ADVERTISEMENT_LEASE_S / 4 + 0.3) != []
+    assert resolver.queries_to_send(ADVERTISEMENT.lease_s / 4 + 0.3) != []
 
 
 def test_a_frame_waits_while_ribs_do_not_know_its_name_and_then_is_dropped() -> None:
@@ -126,11 +127,11 @@ def test_a_frame_that_has_no_query_is_counted() -> None:
 
 def test_a_neighbour_above_its_rate_opens_no_query() -> None:
     resolver = NameResolver(ME)
-    for number in range(int(QUESTIONS_BURST) + 10):
+    for number in range(int(QUESTIONS_RATE.burst) + 10):
         resolver.resolve(name(str(number)), 0.0, NEIGHBOUR)
-    assert len(resolver.queries) == QUESTIONS_BURST
+    assert len(resolver.queries) == QUESTIONS_RATE.burst
     resolver.resolve(SERVER, 0.0, b"n" + name("other"))
-    assert len(resolver.queries) == QUESTIONS_BURST + 1
+    assert len(resolver.queries) == QUESTIONS_RATE.burst + 1
 
 
 def test_a_name_that_only_publishes_has_no_reader() -> None:
@@ -163,7 +164,7 @@ def test_a_location_that_is_used_is_watched() -> None:
     resolver = NameResolver(ME)
     resolver.receive_location(location(), 0.0)
     resolver.resolve(SERVER, 0.0)
-    assert resolver.queries_to_send(0.0) == [(SERVER, 2 * ADVERTISEMENT_LEASE_S)]
+    assert resolver.queries_to_send(0.0) == [(SERVER, 2 * ADVERTISEMENT.lease_s)]
 
 
 def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
@@ -178,20 +179,20 @@ def test_a_location_outlives_its_lease_only_while_no_rib_answers() -> None:
 def test_a_new_rib_gets_every_watch_at_once() -> None:
     resolver = NameResolver(ME)
     resolver.queries.watch(TOPIC, 0.0)
-    assert resolver.queries_to_send(0.0) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    assert resolver.queries_to_send(0.0) == [(TOPIC, ADVERTISEMENT.lease_s)]
     resolver.receive_location(location(TOPIC, Right.PUBLISH), 0.0)
     assert resolver.queries_to_send(1.0) == []
     resolver.rib_changed(1.0, has_rib=True)
-    assert resolver.queries_to_send(1.0) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    assert resolver.queries_to_send(1.0) == [(TOPIC, ADVERTISEMENT.lease_s)]
 
 
 def test_the_echo_of_a_relayed_advertisement_answers_no_query_until_it_is_repeated() -> None:
     resolver = NameResolver(ME)
-    watch = [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    watch = [(TOPIC, ADVERTISEMENT.lease_s)]
     resolver.queries.watch(TOPIC, 0.0)
     assert resolver.queries_to_send(0.0) == watch
     resolver.receive_location(location(TOPIC), 0.01, is_ours=True)
     assert resolver.queries_to_send(RETRY_S) == watch
     resolver.receive_location(location(TOPIC), RETRY_S + 0.01, is_ours=True)
     assert resolver.queries_to_send(2 * RETRY_S + 0.1) == []
-    assert resolver.queries_to_send(ADVERTISEMENT_LEASE_S / 4 + 1) == watch
+    assert resolver.queries_to_send(ADVERTISEMENT.lease_s / 4 + 1) == watch

@@ -5,10 +5,11 @@ from __future__ import annotations
 from gdp.errors import DropReason
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
+from gdp.intervals import NEGATIVE_LEASE_S
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.switch.table import NOWHERE
-from gdp.switch.unicast import NEGATIVE_S, _Installed
+from gdp.switch.unicast import _Installed
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, flowing, ring
 
@@ -32,7 +33,7 @@ def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -
     send(world, ABSENT)
     world.network.run(0.01)
     assert nuc1.table.entries[ABSENT + robot] == NOWHERE
-    world.network.run(NEGATIVE_S + 0.5)
+    world.network.run(NEGATIVE_LEASE_S + 0.5)
     assert ABSENT + robot not in nuc1.table.entries
 
 

@@ -16,7 +16,8 @@ import pytest
 from fog.host.bundle import install
 from fog.host.preemption_notice import read_notice
 from fog.machine import MachineBundle
-from gdp_extensions.aws.notice import DRAIN_BEFORE_S, Metadata, Watch
+from gdp.intervals import DRAIN_S
+from gdp_extensions.aws.notice import Metadata, Watch
 from gdp_extensions.aws.provider import WATCHER
 
 ACTION = "/latest/meta-data/spot/instance-action"
@@ -112,7 +113,7 @@ def test_a_notice_is_reported_at_once_and_the_machine_drains_in_time(service: Se
     assert not seen.watch.poll(LEAVES_AT - 120)
     assert not seen.watch.poll(LEAVES_AT - 90)
     assert (seen.notices, seen.drains) == ([LEAVES_AT], 0)
-    assert seen.watch.poll(LEAVES_AT - DRAIN_BEFORE_S)
+    assert seen.watch.poll(LEAVES_AT - DRAIN_S)
     assert (seen.notices, seen.drains) == ([LEAVES_AT], 1)
 
 

@@ -113,7 +113,7 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     upkeep.start(rib, site.now())
     password = (servers.parent / "admin.password").read_text().strip()
     with monkeypatch.context() as patient:
-        patient.setattr("gdp_extensions.cluster.link._TIMEOUT_S", 30.0)  # a busy server flushes late
+        patient.setattr("gdp_extensions.cluster.link.PROMPT_S", 30.0)  # a busy server flushes late
         for client in (link := ClusterLink(config)).primaries():
             client.execute_command("AUTH", "admin", password)
             client.execute_command("FUNCTION FLUSH")

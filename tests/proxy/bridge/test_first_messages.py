@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from proxy.endpoints.core.qos import default
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -59,7 +59,7 @@ def test_waiting_readers_get_all_that_a_node_says_before_it_leaves(
     sites.run(count * every_s + stays_s)
     talker.close()
     said = [str(number) for number in range(count)]
-    assert sites.run(READER_LEASE_S + 4, lambda: all(ear.texts == said for ear in ears)), [len(e.texts) for e in ears]
+    assert sites.run(READER.lease_s + 4, lambda: all(ear.texts == said for ear in ears)), [len(e.texts) for e in ears]
     sites.run(2)
     assert [ear.texts for ear in ears] == [said, said]
 
@@ -74,7 +74,7 @@ def test_a_reader_that_comes_later_gets_nothing_from_before(sites: Sites) -> Non
     assert sites.run(3, robot.is_read)
     talker.publish(string("sit down"))
     assert sites.run(1, lambda: ear.texts == ["sit down"])
-    sites.run(READER_LEASE_S)
+    sites.run(READER.lease_s)
     assert ear.texts == ["sit down"]
 
 
@@ -106,7 +106,7 @@ def test_what_no_reader_waits_for_is_kept_for_a_moment_and_counted(sites: Sites)
         talker.publish(string(str(number)))
     sites.run(1)
     assert len(robot.stream.queue.deferred.waiting) == 64
-    sites.run(READER_LEASE_S)
+    sites.run(READER.lease_s)
     assert len(robot.stream.queue.deferred.waiting) == 0
     assert robot.stream.losses.total == 100
     talker.publish(string("?"))

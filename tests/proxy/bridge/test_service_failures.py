@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from gdp.names import Name
 from lab.network import SimLink
 from tests.proxy.bridge import known
@@ -106,7 +106,7 @@ def test_a_proxy_that_dies_mid_call_fails_it_before_the_client_gives_up(sites: S
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == 1)
     sites.kill(server)
-    assert sites.run(READER_LEASE_S + 2, lambda: len(caller.outcomes) == 1)
+    assert sites.run(READER.lease_s + 2, lambda: len(caller.outcomes) == 1)
     assert caller.outcomes == ["the far server is gone"]
     assert sites.run(1.5, lambda: not caller.sees_server())
 
@@ -204,7 +204,7 @@ def test_a_restarted_server_proxy_serves_again(sites: Sites) -> None:
     server, _, local, caller = pair(sites)
     local.answer = lambda _: switched("yes")
     sites.restart(server)
-    sites.run(READER_LEASE_S + 2)
+    sites.run(READER.lease_s + 2)
     assert caller.sees_server()
     caller.call(switch(on=True))
     assert sites.run(0.5, lambda: caller.outcomes == [switched("yes")])
@@ -235,7 +235,7 @@ def test_one_of_two_servers_that_dies_does_not_fail_the_call(sites: Sites) -> No
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == second.asked == 1)
     sites.kill(server)
-    sites.run(READER_LEASE_S + 2)
+    sites.run(READER.lease_s + 2)
     assert caller.outcomes == []
     assert caller.sees_server()
     second.waiting[0][1](switched("yes"))
@@ -270,7 +270,7 @@ def test_a_call_that_the_one_refused_fails_when_the_other_dies(sites: Sites) -> 
     caller.call(switch(on=True))
     assert sites.run(1, lambda: second.asked == 1)
     sites.kill(other)
-    assert sites.run(READER_LEASE_S + 2, lambda: caller.outcomes == ["the far server is gone"])
+    assert sites.run(READER.lease_s + 2, lambda: caller.outcomes == ["the far server is gone"])
 
 
 def test_a_request_above_the_rules_limit_fails_with_a_reason_and_the_next_is_served(sites: Sites) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites, named
 from tests.proxy.endpoints.fake import Publication
@@ -69,7 +69,7 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     assert sites.run(1, lambda: len(ear.heard) == 1)
     talker.close()
     assert sites.run(
-        READER_LEASE_S + 1,
+        READER.lease_s + 1,
         lambda: not list(robot.member.publications) and not list(server.member.subscriptions.writer_proxies()),
     )
     talker = talk(robot)
@@ -85,7 +85,7 @@ def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Site
     talker.publish(string("goodbye"))
     talker.close()
     assert sites.run(1, lambda: ear.texts == ["goodbye"])
-    assert sites.run(READER_LEASE_S + 1, lambda: not list(robot.member.publications))
+    assert sites.run(READER.lease_s + 1, lambda: not list(robot.member.publications))
 
 
 @pytest.mark.parametrize("size", [20, 60_000])
@@ -100,7 +100,7 @@ def test_the_last_message_of_a_publisher_that_leaves_at_once_arrives_by_a_thin_l
     talker.publish(string("x" * size))
     talker.close()
     assert sites.run(5, lambda: len(ear.heard) == 1)
-    assert sites.run(READER_LEASE_S + 1, lambda: not list(robot.member.publications))
+    assert sites.run(READER.lease_s + 1, lambda: not list(robot.member.publications))
     assert robot.faults == {}
 
 
@@ -195,7 +195,7 @@ def test_messages_without_a_far_reader_are_counted_and_not_sent(sites: Sites) ->
     talker = talk(robot)
     sites.run(2)
     talker.publish(string("kept for readers that wait"))
-    sites.run(READER_LEASE_S + 1)
+    sites.run(READER.lease_s + 1)
     talker.publish(string("?"))
     sites.run(1)
     assert (robot.context.traffic.unread, robot.stream.losses.total) == (1, 2)

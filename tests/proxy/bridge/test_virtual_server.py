@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.limits import READER_LEASE_S
+from gdp.intervals import READER
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
@@ -90,7 +90,7 @@ def test_failures_of_many_calls_are_paced_after_the_last_server_has_gone(sites: 
         call(caller)
     assert sites.run(1, lambda: local.asked >= 8)
     sites.kill(next(each for each in sites.machines if each is not client))
-    assert sites.run(READER_LEASE_S + 2, lambda: len(caller.outcomes) > 0)
+    assert sites.run(READER.lease_s + 2, lambda: len(caller.outcomes) > 0)
     assert len(caller.outcomes) <= 10  # what a client's queue holds
     assert sites.run(1, lambda: caller.outcomes == ["the far server is gone"] * 50)
     assert sites.run(2, lambda: not caller.sees_server())

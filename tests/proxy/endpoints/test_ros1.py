@@ -254,7 +254,7 @@ def test_a_type_that_is_not_installed_is_advertised_by_its_definition(net: Net, 
 
 
 def test_an_unknown_type_is_refused_with_what_to_install(monkeypatch: pytest.MonkeyPatch, ear: Ear) -> None:
-    monkeypatch.setattr("proxy.endpoints.ros1.rospy_process._ANSWER_S", 30.0)  # it imports the package
+    monkeypatch.setattr("proxy.endpoints.ros1.rospy_process.ANSWER_S", 30.0)  # it imports the package
     assert ear.endpoint.channel("/x", "sensor_msgs/msg/Image").hash == "060021388200f6f0f447d0fcd9c64743"
     with pytest.raises(LocalError, match="no_msgs/msg/Such is not known here"):
         ear.endpoint.channel("/x", "no_msgs/msg/Such")

@@ -84,7 +84,7 @@ def test_an_endpoint_of_another_form_counts_as_unknown() -> None:
 def replying(folder: Path, monkeypatch: pytest.MonkeyPatch, reply: bytes | None) -> Iterator[list[bytes]]:
     """Serve requests with this reply; None: serve one, and never reply."""
     monkeypatch.setattr(uapi, "SOCKET_FOLDER", folder)
-    monkeypatch.setattr(uapi, "_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(uapi, "ANSWER_S", 0.2)
     heard: list[bytes] = []
     end = threading.Event()
 
