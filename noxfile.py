@@ -38,7 +38,7 @@ def fast(session: nox.Session) -> None:
     """Run ruff, the import rules and the quick tests; needs no root."""
     session.run(".venv/bin/ruff", "check", ".", external=True)
     session.run(".venv/bin/lint-imports", external=True)
-    session.run(PYTHON, "-m", "pytest", "-x", *(session.posargs or FAST_TESTS), external=True)
+    session.run(PYTHON, "-m", "pytest", "-x", "-n", "auto", *(session.posargs or FAST_TESTS), external=True)
 
 
 @nox.session(python=False)

@@ -348,7 +348,8 @@ class Attachment:
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""
-        return (self._own,) if self._own is not None and self.is_in_use else self._advertisements.values()
+        own = self._own
+        return (own,) if own is not None and own.refused is DropReason.IN_USE else self._advertisements.values()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""

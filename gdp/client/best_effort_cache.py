@@ -117,7 +117,7 @@ class BestEffortCache(HistoryCache):
 
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` repairs that are still in time."""
-        if not self._repairs:
+        if not self._repairs.queue:
             return []
         self.drop_expired(now_s)
         frames = self._repairs.frames_to_send(self, limit, now_s)

@@ -80,7 +80,7 @@ class GoverningPaths:
 
     def is_doubled(self, now_s: float) -> bool:
         """Return whether each frame travels over two paths now."""
-        return self.has_second(now_s) and self._count != SPREAD
+        return self._count not in (1, SPREAD) and now_s < self.second_until_s
 
     def allowance(self, now_s: float) -> int:
         """Return how many bytes of frames may leave now, as far as the paths permit; 0: none.

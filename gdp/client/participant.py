@@ -295,7 +295,8 @@ class Participant:
         turns; urgent ones go first each time.
         """
         out = self.attachment.frames_to_send()
-        self.publications.release_requests(now_s)
+        if self.publications.requests:
+            self.publications.release_requests(now_s)
         if not out and (self._scheduler or self._reception.reporting):
             self.flush(now_s)
             out = self.attachment.frames_to_send()

@@ -126,7 +126,7 @@ class Publisher:
     @property
     def readers(self) -> int:
         """Return how many readers have introduced themselves and are alive; none before a tree is installed."""
-        return 0 if self.queue.mtu is None else len(self.matched)
+        return 0 if self.queue.mtu is None else len(self.matched.active)
 
     def is_followed_by(self, name: Name, now_s: float, awake_s: float) -> bool:
         """Return whether a tree is installed, and a reader is alive and keeps up.
@@ -148,7 +148,8 @@ class Publisher:
     @property
     def is_wanted(self) -> bool:
         """Return whether a message published now is for a reader, or for one that may return to its window."""
-        return self.queue.mtu is not None and bool(self.matched or (self.confirms and self._window.readers.suspended))
+        may_return = self.confirms and self._window.readers.suspended
+        return self.queue.mtu is not None and bool(self.matched.active or may_return)
 
     @property
     def confirms(self) -> bool:
@@ -269,14 +270,14 @@ class Publisher:
                 self.drops[DropReason.NO_READER] += 1
                 self.skip(LossReason.NO_READER, now_s)
             return None
-        self.queue.add(message, gather_bytes=WINDOW_BYTES if self.matched else BUNDLE_BYTES, added_s=now_s)
+        self.queue.add(message, gather_bytes=WINDOW_BYTES if self.matched.active else BUNDLE_BYTES, added_s=now_s)
         self.published(self)
         return self.messages
 
     def skip(self, reason: LossReason, now_s: float | None = None) -> None:
         """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason."""
         self.queue.skip(reason, now_s)
-        if self.matched:
+        if self.matched.active:
             self._heartbeats.wanted = True
             self.published(self)
 
@@ -341,7 +342,7 @@ class Publisher:
             self.governing_paths.blocking.get_timer(),
             self._awaits_until_s if self._awaits_until_s < _NEVER else None,
         )
-        if not self.matched or self.queue.mtu is None:
+        if not self.matched.active or self.queue.mtu is None:
             return due_s
         return earliest(due_s, self._heartbeats.get_timer(), protection.copies.get_timer())
 
@@ -354,10 +355,10 @@ class Publisher:
         queue, mtu = self.queue, self.queue.mtu
         self.sent_frames.count()
         self.has_more = False
-        if mtu is None or not self.matched:
+        if mtu is None or not self.matched.active:
             self.protection.copies.clear()
             self.protection.parity.clear()
-            if not self.matched:
+            if not self.matched.active:
                 queue.drop_unread()
             return []
         queue.drop_aged(now_s)

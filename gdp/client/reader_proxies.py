@@ -116,6 +116,7 @@ class ReaderProxies:
     """Readers of one publisher, by name.
 
     Attributes:
+        active: those that are not suspended.
         is_reachable: a tree to them is installed.
     """
 
@@ -123,51 +124,51 @@ class ReaderProxies:
         self._topic = topic
         self._source = source
         self._patience = patience
-        self._readers: dict[bytes, ReaderProxy] = {}
+        self.active: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
         self.is_reachable = False
 
     def __len__(self) -> int:
-        return len(self._readers)
+        return len(self.active)
 
     def __contains__(self, name: bytes) -> bool:
-        return name in self._readers
+        return name in self.active
 
     def __getitem__(self, name: bytes) -> ReaderProxy:
-        return self._readers[name]
+        return self.active[name]
 
     def __iter__(self) -> Iterator[bytes]:
         return iter(self.reading())
 
     def reading(self) -> list[bytes]:
         """Return the names of those that are not suspended."""
-        return [*self._readers]
+        return [*self.active]
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
-        return self.is_reachable and name in self._readers
+        return self.is_reachable and name in self.active
 
     def reporting(self, now_s: float) -> list[bytes]:
         """Return the readers to which a tree is installed; those that have missed reports come last."""
-        return sorted(self._readers, key=lambda name: self.is_quiet(name, now_s)) if self.is_reachable else []
+        return sorted(self.active, key=lambda name: self.is_quiet(name, now_s)) if self.is_reachable else []
 
     def names(self) -> list[bytes]:
         """Return the names of all, suspended ones included."""
-        return [*self._readers, *self._suspended]
+        return [*self.active, *self._suspended]
 
     def all(self) -> list[ReaderProxy]:
         """Return all, suspended ones included."""
-        return [*self._readers.values(), *self._suspended.values()]
+        return [*self.active.values(), *self._suspended.values()]
 
     def silent(self, now_s: float) -> list[bytes]:
         """Return those that have not been heard for ``READER.lease_s``."""
-        return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER.lease_s]
+        return [name for name, reading in self.active.items() if now_s - reading.heard_s > READER.lease_s]
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
         due_s = _NEVER
-        for readers, lease_s in ((self._readers, READER.lease_s), (self._suspended, _NEVER)):
+        for readers, lease_s in ((self.active, READER.lease_s), (self._suspended, _NEVER)):
             for each in readers.values():
                 behind_s = _NEVER if each.behind_s is None else each.behind_s + FORGET_S
                 heard_s = each.heard_s + lease_s
@@ -177,7 +178,7 @@ class ReaderProxies:
 
     def suspend(self, name: bytes, now_s: float) -> None:
         """Suspend a silent reader, until it reports again or is forgotten."""
-        reading = self._suspended[name] = self._readers.pop(name)
+        reading = self._suspended[name] = self.active.pop(name)
         reading.behind_s = now_s if reading.behind_s is None else reading.behind_s
 
     def is_suspended(self, name: bytes) -> bool:
@@ -190,27 +191,27 @@ class ReaderProxies:
         if reading is None:
             return False
         reading.heard_s = now_s
-        self._readers[name] = reading
+        self.active[name] = reading
         return True
 
     def overdue(self, now_s: float) -> list[tuple[bytes, ReaderProxy]]:
         """Return those whose window has been suspended for ``FORGET_S``, and the first of too many."""
-        everyone = [*self._readers.items(), *self._suspended.items()]
+        everyone = [*self.active.items(), *self._suspended.items()]
         late = [each for each in everyone if each[1].behind_s is not None and now_s - each[1].behind_s > FORGET_S]
         return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
 
     def is_quiet(self, name: bytes, now_s: float) -> bool:
         """Return whether a reader has missed two of its reports: it is absent rather than slow."""
-        return now_s - self._readers[name].heard_s > 2 * self._patience.idle_s
+        return now_s - self.active[name].heard_s > 2 * self._patience.idle_s
 
     def is_alive(self, name: bytes, now_s: float, awake_s: float) -> bool:
         """Return whether a node is a reader, and was not silent for too long since ``awake_s``."""
-        reading = self._readers.get(name)
+        reading = self.active.get(name)
         return reading is not None and now_s - max(reading.heard_s, awake_s) <= self._patience.quiet_s
 
     def suspend_again(self, name: bytes, now_s: float) -> None:
         """Exclude a reader from the window for a penalty time, each time for longer."""
-        reading = self._readers[name]
+        reading = self.active[name]
         lags = min(_SUSPENSION_MIN_LAGS << reading.suspensions, _SUSPENSION_MAX_LAGS)
         reading.out_until_s = now_s + lags * self._patience.lag_s
         reading.suspensions = min(reading.suspensions + 1, _SUSPENSION_MAX_LAGS)
@@ -231,18 +232,18 @@ class ReaderProxies:
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
         """Make a known node a reader, in place of a former incarnation of it."""
-        former = self._readers.get(name) or self._suspended.pop(name, None)
+        former = self.active.get(name) or self._suspended.pop(name, None)
         incarnation_id, confirmed = self._incarnation_ids[name, incarnation], 0
         if former is not None:  # one that never began has reported nothing of what an earlier one lacks
             confirmed = former.sequence if former.start is None else former.confirmed or former.sequence
-        reading = self._readers[name] = ReaderProxy(
+        reading = self.active[name] = ReaderProxy(
             incarnation=incarnation, incarnation_id=incarnation_id, heard_s=now_s, confirmed=confirmed
         )
         return reading
 
     def forget(self, name: bytes) -> bool:
         """Forget a reader, suspended or not; return whether it was one."""
-        return (self._readers.pop(name, None) or self._suspended.pop(name, None)) is not None
+        return (self.active.pop(name, None) or self._suspended.pop(name, None)) is not None
 
     def introduce(self, header: Header, frame: bytes, secret: bytes) -> None:
         """Process the sealed introduction of a reader; that of a known incarnation is not opened.
@@ -292,7 +293,7 @@ class ReaderProxies:
         is_new = AckNackFlag.NEW in acknack.flags
         if not may_begin and (is_new or not is_current):
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
-        if name not in self._readers and len(self._readers) >= READERS_MAX:
+        if name not in self.active and len(self.active) >= READERS_MAX:
             raise EnvelopeError(DropReason.QUOTA, "readers")
         if reading is not None and is_current:
             reading.heard_s = now_s
@@ -305,4 +306,4 @@ class ReaderProxies:
         return acknack, True
 
     def _reading_of(self, name: bytes) -> ReaderProxy | None:
-        return self._readers.get(name) or self._suspended.get(name)
+        return self.active.get(name) or self._suspended.get(name)

@@ -89,7 +89,7 @@ class SendQueue:
     @property
     def is_empty(self) -> bool:
         """Return whether nothing waits outside the window."""
-        return not (self.deferred.waiting or self._gathered or self._best_effort)
+        return not (self.deferred.waiting or self._gathered.messages or self._best_effort)
 
     def has_space(self) -> bool:
         """Return whether a message may be added without evicting an unacknowledged one."""
@@ -106,7 +106,7 @@ class SendQueue:
         """Return the first sequence number that has no message number yet, or the next one."""
         if self.deferred.waiting:
             return self.deferred.waiting[0][0]
-        return self._gathered.first if self._gathered else self.ledger.last + 1
+        return self._gathered.first if self._gathered.messages else self.ledger.last + 1
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -204,7 +204,7 @@ class SendQueue:
 
     def seal_gathered(self) -> None:
         """Seal what waited to be bundled."""
-        while self._gathered:
+        while self._gathered.messages:
             self._seal_next()
 
     def drop_expired(self, now_s: float) -> bool:
@@ -233,10 +233,10 @@ class SendQueue:
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
         frames = self._best_effort.poll_frames(max(limit, 1))
-        if not self._gathered or self._window.has_frames:
+        if not self._gathered.messages or self._window.has_frames:
             frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
         sends_window = self.is_acknowledged
-        while self._gathered and len(frames) < limit:
+        while self._gathered.messages and len(frames) < limit:
             if self._window.sent[0] < self.next_number if sends_window else self._best_effort:
                 break
             self._seal_next()

@@ -77,8 +77,7 @@ class Services:
 
     def end_call(self, service: Name, call: Hashable) -> None:
         """Cancel what has not left of a call's requests, and their repairs; those of a withdrawn name have ended."""
-        requests = self._publications.requests.get(service)
-        if requests is not None:
+        if (requests := self._publications.requests.get(service)) is not None:
             requests.cancel(call)
 
     def peers(self, service: Name) -> list[Name]:

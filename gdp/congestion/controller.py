@@ -245,7 +245,9 @@ class PathController:
         """Signal an empty queue at once."""
         model, frames_s = self.model, max(self.model.bytes_s / self._mtu, 1.0)
         # the base may be that of a short frame: what a full one takes to leave is no queue
-        wanted_s = min(_wanted_frames(frames_s) / frames_s, _WANTED_MOST_S) + 1 / frames_s
+        # and the least window of a lone flow on a thin path is no queue of another one
+        most_s = max(_WANTED_MOST_S, _LEAST_FRAMES * self._mtu / (model.capacity_bytes_s or float("inf")))
+        wanted_s = min(_wanted_frames(frames_s) / frames_s, most_s) + 1 / frames_s
         if model.queue_s <= max(_EMPTY_SHARE * (model.highest_s - model.base_rtt_s), wanted_s, _STANDING_S / 2):
             self._empty_s = now_s
             self._signal(Signal.QUEUE_EMPTY, now_s)

@@ -48,16 +48,16 @@ def unpack(wire: bytes) -> list[bytes]:
 
 
 class Gathered:
-    """Small messages that wait for their seal, oldest first; their sequence numbers are consecutive."""
+    """Small messages that wait for their seal, ``messages``, oldest first; their sequence numbers are consecutive."""
 
     def __init__(self) -> None:
-        self._messages = deque[bytes]()
+        self.messages = deque[bytes]()
         self._added_s = deque[float | None]()  # when each was published; None: unknown
         self.first = 0  # sequence number of the oldest
         self.held_bytes = 0
 
     def __len__(self) -> int:
-        return len(self._messages)
+        return len(self.messages)
 
     @staticmethod
     def is_small(message: bytes, capacity: int) -> bool:
@@ -67,7 +67,7 @@ class Gathered:
     @property
     def oldest_bytes(self) -> int:
         """Return about how many bytes of frames the oldest message takes with a seal of its own."""
-        return len(self._messages[0]) + _ALONE_BYTES
+        return len(self.messages[0]) + _ALONE_BYTES
 
     def oldest_added_s(self, now_s: float) -> float:
         """Return when the oldest message was published; messages without a time wait from now on."""
@@ -86,9 +86,9 @@ class Gathered:
 
     def add(self, sequence: int, message: bytes, added_s: float | None = None) -> None:
         """Add a message that was published at ``added_s`` (monotonic seconds; None: unknown)."""
-        if not self._messages:
+        if not self.messages:
             self.first = sequence
-        self._messages.append(message)
+        self.messages.append(message)
         self._added_s.append(added_s)
         self.held_bytes += len(message) + _ALONE_BYTES
 
@@ -100,8 +100,8 @@ class Gathered:
         """
         together: list[bytes] = []
         added_s: float | None = None
-        while self._messages:
-            capacity -= len(self._messages[0]) + _LENGTH.size
+        while self.messages:
+            capacity -= len(self.messages[0]) + _LENGTH.size
             if together and capacity < 0:
                 break
             message, added_s = self._remove_oldest()
@@ -110,6 +110,6 @@ class Gathered:
         return together, added_s
 
     def _remove_oldest(self) -> tuple[bytes, float | None]:
-        message = self._messages.popleft()
+        message = self.messages.popleft()
         self.held_bytes -= len(message) + _ALONE_BYTES
         return message, self._added_s.popleft()

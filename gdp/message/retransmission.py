@@ -32,15 +32,12 @@ def repair_allowance() -> TokenBucket:
 
 
 class RetransmissionQueue:
-    """Fragments to be sent again, in the order of the requests."""
+    """Fragments to be sent again: ``queue``, by message number and fragment, in the order of the requests."""
 
     def __init__(self) -> None:
-        self._queue: OrderedDict[tuple[int, int], None] = OrderedDict()
+        self.queue: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._round_s = _NEVER  # when the present round began
         self._round_bytes = 0  # bytes that it may still send again
-
-    def __bool__(self) -> bool:
-        return bool(self._queue)
 
     def request(
         self,
@@ -76,8 +73,8 @@ class RetransmissionQueue:
                 if self._round_bytes <= 0:
                     break
                 key = (number, part)
-                if key not in self._queue and message.again_s.get(part, _NEVER) <= now_s - wait_s:
-                    self._queue[key] = None
+                if key not in self.queue and message.again_s.get(part, _NEVER) <= now_s - wait_s:
+                    self.queue[key] = None
                     self._round_bytes -= len(message.frames[part])
         allowance.charge(now_s, examined)
 
@@ -90,12 +87,12 @@ class RetransmissionQueue:
             is_lacked: whether a reader may lack a fragment of a message that is cached; None: not known.
         """
         frames: list[bytes] = []
-        while self._queue and len(frames) < limit:
-            (number, part), _ = self._queue.popitem(last=False)
+        while self.queue and len(frames) < limit:
+            (number, part), _ = self.queue.popitem(last=False)
             if number in cache.messages and (is_lacked is None or is_lacked(number, part)):
                 frames.append(cache.note_repair(number, part, now_s))
         return frames
 
     def clear(self) -> None:
         """Discard all requests."""
-        self._queue.clear()
+        self.queue.clear()

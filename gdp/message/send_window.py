@@ -230,13 +230,13 @@ class SendWindow:
     @property
     def has_frames(self) -> bool:
         """Return whether something waits to be sent, or sent again; or no reader waits for it."""
-        return bool(self._unsent or self._repairs) or not self.readers.active
+        return bool(self._unsent or self._repairs.queue) or not self.readers.active
 
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
         self._now_s = now_s
         frames: list[bytes] = []
-        if self._repairs and (frames := self._repaired_frames(limit, now_s, self._repairs)):
+        if self._repairs.queue and (frames := self._repaired_frames(limit, now_s, self._repairs)):
             self._flow.round_trip.discard_sample()
         acked_at = self.readers.acked_at(self._sent_at)
         if self._sent_at == acked_at:
@@ -253,7 +253,7 @@ class SendWindow:
 
     def late_repairs_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again for readers that do not govern, once nothing new waits."""
-        if self._unsent or not self._late_repairs or limit <= 0:
+        if self._unsent or not self._late_repairs.queue or limit <= 0:
             return []
         self._flow.round_trip.discard_sample()
         return self._repaired_frames(limit, now_s, self._late_repairs)

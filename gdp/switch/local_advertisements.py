@@ -138,7 +138,8 @@ class LocalAdvertisements:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
         interval_s = _RELAYS.bounded_s(_ROUND_TRIPS * trip_s)
-        repeats, due = Backoff(interval_s, interval_s), []
+        # behind a slow link the relays of all names are a queue of their own, for which the next ones must not count
+        repeats, due = Backoff(interval_s, _RELAYS.most_s if interval_s > _RELAYS.first_s else interval_s), []
         for key in self._relays.poll_due(now_s):
             name, advertiser = key
             each = self._by_name[name][advertiser]

@@ -52,7 +52,7 @@ def _bounds(value: object) -> object:
     return value
 
 
-Bounds: TypeAlias = tuple[float, float]
+Bounds: TypeAlias = tuple[float, float]  # of which the first is inside
 Dictionary = Annotated[bytes, BeforeValidator(_dictionary), WithJsonSchema({"type": "string", "minLength": 1})]
 SomeBounds = Annotated[Bounds | None, BeforeValidator(_bounds)]
 
@@ -70,7 +70,7 @@ class Compress(Section):
 
 
 class Region(Section):
-    """The part of an image or a point cloud that crosses; of bounds, the first is inside."""
+    """The part of an image or a point cloud that crosses."""
 
     x: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the left, or metres.")
     y: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the top, or metres.")

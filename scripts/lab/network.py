@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -23,7 +23,6 @@ from gdp.switch.table import Table
 _STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
 _SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
-_UNLIMITED: Final = float("inf")
 
 Tap = Callable[[float, str, str, bytes], None]
 
@@ -46,9 +45,9 @@ class SimLink:
     loss: float = 0.0
     mtu: int = 1_500
     is_up: bool = True
-    bytes_s: float = _UNLIMITED
+    bytes_s: float = float("inf")
     burst_frames: float = 1.0
-    fifo_s: float = _UNLIMITED
+    fifo_s: float = float("inf")
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
     in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
 
@@ -68,8 +67,6 @@ class SimLink:
 
     def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
         """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
-        if self.bytes_s == _UNLIMITED and self.free_s.get(to, now_s) <= now_s:
-            return now_s
         self.free_s[to] = max(self.free_s.get(to, now_s), now_s) + size / self.bytes_s
         return self.free_s[to]
 
@@ -81,33 +78,11 @@ class _End:
     mac: bytes
 
 
-_Wired = tuple[SimLink, _End, _End]  # link, own end, far end
-
-
-class _Mtus(Mapping[int, int]):
-    """MTU of each port that is up, looked up in the links as they are now."""
-
-    def __init__(self, ports: dict[int, _Wired]) -> None:
-        self._ports = ports
-
-    def __getitem__(self, port: int) -> int:
-        sim_link = self._ports[port][0]
-        if not sim_link.is_up:
-            raise KeyError(port)
-        return sim_link.mtu
-
-    def __iter__(self) -> Iterator[int]:
-        return (port for port, (sim_link, _, _) in self._ports.items() if sim_link.is_up)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
 @dataclass(slots=True, kw_only=True)
 class _Node:
     machine: ProtocolCore
     table: Table | None
-    ports: dict[int, _Wired] = field(default_factory=dict)
+    ports: dict[int, tuple[SimLink, _End, _End]] = field(default_factory=dict)  # link, own end, far end
     costs: dict[int, int] = field(default_factory=dict)  # by port
     timer_s: float | None = None
     due_s: float | None = None  # of its own timer; one that moved later keeps the event at ``timer_s``
@@ -116,10 +91,6 @@ class _Node:
     is_alive: bool = True
     came: Counter[int] = field(default_factory=Counter)  # frames, by port
     stalled: list[tuple[_End, bytes]] | None = None  # frames that arrived while it was frozen
-    mtus: _Mtus = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.mtus = _Mtus(self.ports)
 
 
 class SimNetwork:
@@ -302,7 +273,7 @@ class SimNetwork:
         for frame in transmit.frames:
             self._send(wired, ethernet(transmit.mac, wired[1].mac) + frame)
 
-    def _send(self, wired: _Wired, frame: bytes) -> None:
+    def _send(self, wired: tuple[SimLink, _End, _End], frame: bytes) -> None:
         sim_link, own, far = wired
         for tap in self.taps:
             tap(self._now_s, own.node, far.node, frame)
@@ -323,8 +294,7 @@ class SimNetwork:
 
     def _deliver(self, end: _End, frame: bytes) -> None:
         node = self._nodes[end.node]
-        to = frame[:6]
-        if not node.is_alive or (to != end.mac and to != BROADCAST):
+        if not node.is_alive or frame[:6] not in (end.mac, BROADCAST):
             return
         if node.stalled is not None:
             if len(node.stalled) < _STALLED_MAX:
@@ -332,7 +302,8 @@ class SimNetwork:
             return
         node.came[end.port] += 1
         if node.table is not None:
-            decision = decide(frame, node.table.entries, node.mtus, node.table.sides, end.port)
+            mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
+            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
                 return

@@ -65,7 +65,7 @@ def test_a_line_that_is_no_request_is_refused(line: bytes) -> None:
 
 
 def test_an_unknown_command_is_answered_with_the_known_ones() -> None:
-    known = "ask, drain, lookup, reload, show, snapshot, status, topics, topology"
+    known = "ask, drain, incident, lookup, reload, show, snapshot, status, topics, topology"
     with pytest.raises(ControlRequestError, match=f"unknown command 'dance'; expected {known}"):
         decode_request(json.dumps({"command": "dance"}).encode())
 

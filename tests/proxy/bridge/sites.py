@@ -36,7 +36,6 @@ from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
 ROBOT: Final = "nuc1/robot"
 SERVER: Final = "nuc5/server"
-_LOOK_S: Final = 0.002
 _GRAPHS: Final = {1: "{endpoint: ros1}", 2: "{endpoint: ros2, domain: 0}"}
 _TICK_S: Final = 0.5  # of the proxy's loop
 _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
@@ -72,9 +71,11 @@ class Machine:
 
     def is_due(self, now_s: float) -> bool:
         """Return whether the proxy's loop would wake up now."""
-        due_s = self.bridge.get_timer()
         has_news = bool(self.member._reception.messages) or any(endpoint._events for endpoint in self.endpoints)
-        return has_news or now_s >= self.tick_at_s or (due_s is not None and due_s <= now_s)
+        if has_news or now_s >= self.tick_at_s:
+            return True
+        due_s = self.bridge.get_timer()
+        return due_s is not None and due_s <= now_s
 
     @property
     def endpoint(self) -> FakeEndpoint:
@@ -130,14 +131,18 @@ class Sites:
     Args:
         folder: an empty one, for the files that rules name.
         topology: None: the ring of five.
+        look_s: after which a proxy with news wakes up.
         options: further ones of ``Simulation``.
     """
 
-    def __init__(self, folder: Path, seed: int = 1, topology: Topology | None = None, **options: Any) -> None:
+    def __init__(
+        self, folder: Path, seed: int = 1, topology: Topology | None = None, look_s: float = 0.005, **options: Any
+    ) -> None:
         self.world = Simulation(topology=topology or ring5(), seed=seed, keepalive_ms=500, **options)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder
+        self._look_s = look_s
         furnish(folder)
         assert self.world.run_until_attached()
         self._look()
@@ -261,13 +266,14 @@ class Sites:
         return self.world.topic(str(metadata["name"]), member, rights, **reported)
 
     def _look(self) -> None:
+        now_s = self.now_s
         for machine in self.machines:
-            if machine.is_due(self.now_s):
-                machine.tick_at_s = self.now_s + _TICK_S
-                machine.bridge.work(self.now_s)
-                machine.member.flush(self.now_s)
+            if machine.is_due(now_s):
+                machine.tick_at_s = now_s + _TICK_S
+                machine.bridge.work(now_s)
+                machine.member.flush(now_s)
                 self.world.network.send_pending(machine.label)
-        self.world.network.call(_LOOK_S, self._look)
+        self.world.network.call(self._look_s, self._look)
 
 
 def named(name: str, type_name: str = known.STRING, kind: str = "topic") -> Metadata:

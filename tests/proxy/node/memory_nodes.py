@@ -95,7 +95,7 @@ def outputs(folder: Path, projections: Projections = MappingProxyType({})) -> di
 
 class _Network:
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
-        self.sites = sites = Sites(folder, topology=_LINE)
+        self.sites = sites = Sites(folder, topology=_LINE, look_s=0.002)
         clock = SimpleNamespace(monotonic=lambda: sites.now_s, time=lambda: sites.world.network.now.unix_s)
         stack.enter_context(mock.patch.object(runtime_module, "time", clock))
         self.robot = sites.add(ROBOT, expose=[_CHATTER, _SWITCH, _BEST_EFFORT])
