@@ -6,24 +6,27 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from gdp.client.reader_proxies import READERS_MAX
-from gdp.client.unicast_streams import STREAMS_MAX
+from gdp.client.reader_proxies import READERS_MAX, ReaderProxies
+from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
 from gdp.exchange.sync_set import FANOUT
-from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
-from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
+from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX
+from gdp.message.reassembly import Reassembler
+from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX, NameQueries
+from gdp.switch.pending_frames import PendingFrames
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
 
 GENERAL_MAX: Final = 4_096  # tables of peers, sessions or old statements keep no more than this
-LIMITS: Final[Mapping[str, int]] = {
-    "NameQueries._queries": QUERIES_MAX + USED_NAMES_MAX,
-    "Parked._by_name": PENDING_FRAMES_MAX,
-    "Readers._by_name": READERS_MAX,
-    "PrivateStreams._streams": STREAMS_MAX,
-    "_Fetch.prefixes": FANOUT * FANOUT,
-    "JoinBuffer._unfinished": JOIN_MESSAGES_MAX,
-    "ReplayWindow._finished": REPLAY_WINDOW_MESSAGES,
-}
+LIMITS: Final[Mapping[str, int]] = {  # by class and attribute
+    f"{of.__name__}.{attribute}": most
+    for of, attribute, most in (
+        (NameQueries, "_queries", QUERIES_MAX + USED_NAMES_MAX),
+        (PendingFrames, "_by_name", PENDING_FRAMES_MAX),
+        (ReaderProxies, "active", READERS_MAX),
+        (UnicastStreams, "_streams", STREAMS_MAX),
+        (Reassembler, "_unfinished", JOIN_MESSAGES_MAX),
+    )
+} | {"_Fetch.prefixes": FANOUT * FANOUT}
 _CONTAINERS: Final = (dict, list, set, frozenset, deque)
 _DEEP_ITEMS: Final = 64  # items of one container that are examined
 _PACKAGES: Final = "gdp."
