@@ -339,12 +339,8 @@ class Attachment:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        due_s = earliest(self.hello_protocol.get_timer(), self._sync.get_timer())
-        if self.switch is not None:
-            for each in self._due_advertisements():
-                if due_s is None or each.advertisement_at_s < due_s:
-                    due_s = each.advertisement_at_s
-        return due_s
+        at_s = [] if self.switch is None else [each.advertisement_at_s for each in self._due_advertisements()]
+        return earliest(self.hello_protocol.get_timer(), self._sync.get_timer(), *at_s)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""

@@ -226,10 +226,8 @@ class Publications:
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        due_s = earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due())
-        if self.requests:
-            due_s = earliest(due_s, *(requests.get_timer() for requests in self.requests.values()))
-        return due_s
+        requests = [each.get_timer() for each in self.requests.values()] if self.requests else ()
+        return earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due(), *requests)
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

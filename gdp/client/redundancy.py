@@ -122,11 +122,7 @@ class Redundancy:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second at which a copy is due, or None."""
-        due_s: float | None = None
-        for waiting in self._waiting:
-            if waiting and (due_s is None or waiting[0][0] < due_s):
-                due_s = waiting[0][0]
-        return due_s
+        return min(waiting[0][0] for waiting in self._waiting if waiting) if any(self._waiting) else None
 
     def clear(self) -> None:
         """Drop the copies that wait: there is no reader any more."""

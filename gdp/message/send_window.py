@@ -178,7 +178,8 @@ class SendWindow:
         positions = self.readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
-        self._skip_received()
+            position.first_number = move.new_number(position.first_number)
+        self._skip_unwanted()
         for position in positions:
             position.acked_at = position.mark_at = self._sent_at
         self._release_acknowledged()
@@ -219,7 +220,7 @@ class SendWindow:
             self.readers.resume(reader, now_s)
         state = self.readers.active[reader]
         state.next_number = max(state.next_number, acknack.next_number)
-        self._skip_received()
+        self._skip_unwanted()
         before = self.readers.acked_at(self._sent_at)
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self.readers.acked_at(self._sent_at)
@@ -238,13 +239,17 @@ class SendWindow:
         frames: list[bytes] = []
         if self._repairs.queue and (frames := self._repaired_frames(limit, now_s, self._repairs)):
             self._flow.round_trip.discard_sample()
+        least = self.readers.least_active() if self.governing is None else self.readers.most_active()
+        if self._unsent and self._unsent[0][0] < least:
+            self._skip_unwanted()
         acked_at = self.readers.acked_at(self._sent_at)
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
         if self._unsent:
             self.readers.reset_stall_timers(self._sent_at, now_s)
             first_at = self.readers.first_at() if self.governing is not None else acked_at
-            frames += self._new_frames(first_at + self._flow.window_bytes, limit - len(frames))
+            may_reach, below = first_at + self._flow.window_bytes, least + FLIGHT_MESSAGES_MAX
+            frames += self._new_frames(may_reach, below, limit - len(frames))
         if frames and not self.cache.repaired:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
         if not self.readers.active and not self._unsent:
@@ -279,11 +284,9 @@ class SendWindow:
         self.retransmissions += len(frames)
         return frames
 
-    def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
-        """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
+    def _new_frames(self, may_reach: int, below: int, limit: int) -> list[bytes]:
+        """Return at most ``limit`` frames that were never sent, up to a position, of messages below a number."""
         frames: list[bytes] = []
-        least = self.readers.least_active() if self.governing is None else self.readers.most_active()
-        below = least + FLIGHT_MESSAGES_MAX
         while self._unsent and self._sent_at < may_reach and len(frames) < limit and self._unsent[0][0] < below:
             number, part = self._unsent[0]
             message, begin_at = self.cache.messages[number].frames, self.cache.messages[number].begin_at
@@ -300,9 +303,9 @@ class SendWindow:
             self._sent_at = self.cache.end_at
         return frames
 
-    def _skip_received(self) -> None:
-        """Do not send again, under its new number, what every active reader has received under its old one."""
-        least = min(self.readers.least_active(), self._sent_before) if self.readers.active else 0
+    def _skip_unwanted(self) -> None:
+        """Do not send what every reader has received under its old number, nor what is older than all of them."""
+        least = min(self.readers.least(), max(self._sent_before, self.readers.first())) if self.readers.active else 0
         while self._unsent and self._unsent[0][0] < least:
             self._sent_at = self.cache.messages[self._unsent.popleft()[0]].end_at
             for reader in self.readers.active.values():

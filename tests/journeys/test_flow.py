@@ -103,6 +103,22 @@ def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
     flow.outlive()
 
 
+def test_what_is_older_than_a_reader_does_not_delay_its_first_message() -> None:
+    flow = advertise(ring())
+    network = flow.world.network
+    flow.world.leads[ROBOT].bytes_s = 50_000
+    flow.publisher.await_readers(network.now.mono_s + 6)
+    for _ in range(8):
+        flow.publish(bytes(20_000))  # all of them take three seconds
+    network.run(1)
+    flow.read_by(SERVER)
+    assert network.run(2, lambda: flow.is_read_by(1))
+    flow.publish(b"now")
+    assert network.run(0.5, lambda: flow.has(SERVER, 1))
+    assert [each.message for each in flow.got[SERVER]] == [b"now"]
+    flow.outlive()
+
+
 def test_two_publishers_of_one_topic_both_reach_its_reader() -> None:
     world = ring()
     world.add_member("nuc3/second", "nuc3")

@@ -179,6 +179,19 @@ def test_what_every_reader_received_under_an_old_number_is_not_sent_again() -> N
     assert window.frames_to_send(0.3) == message(9, 200)
 
 
+def test_what_is_older_than_every_reader_is_not_sent() -> None:
+    window = SendWindow(history_depth=0)
+    window.add_reader(A, 3, 0.0)
+    window.add_reader(B, 4, 0.0)
+    for number in range(1, 5):  # they waited to be sealed until the readers came
+        put(window, number, message(number, 100))
+    assert window.frames_to_send(0.0, 250) == [*message(3, 100), *message(4, 100)]
+    assert window.acknowledged == 2
+    window.handle_acknack(A, has(5), 0.1)
+    window.handle_acknack(B, has(5), 0.1)
+    assert window.is_acknowledged()
+
+
 def test_the_slowest_reader_holds_the_window() -> None:
     window = window_of(2, 10, (A, B))
     window.frames_to_send(0.0)
