@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from gdp.intervals import ADVERTISEMENT, NEVER_S
 from gdp.names import Name
-from gdp.rib.upstream_advertisements import PROBE_S
+from gdp.rib.upstream_advertisements import QUIET_S
 
 __all__ = ["LowerRibs"]
 
@@ -42,19 +42,19 @@ class LowerRibs:
         """Return for how many seconds to keep a route that a RIB did not renew; 0: the RIB is alive, the lease ends."""
         known = self._ribs.setdefault(rib, _Rib())
         since_s = now_s - known.probed_s
-        if known.heard_s < known.probed_s and since_s >= 2 * PROBE_S:
+        if known.heard_s < known.probed_s and since_s >= QUIET_S:
             known.is_silent = True
         if known.is_silent:
             return ADVERTISEMENT.lease_s / 2  # it renews within a third
         left_s = known.returned_s + ADVERTISEMENT.lease_s / 2 - now_s
         if left_s > 0.0:
             return left_s
-        return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * 2 * PROBE_S else 2 * PROBE_S
+        return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * QUIET_S else QUIET_S
 
     def is_probe_due(self, rib: Name, now_s: float) -> bool:
         """Return whether to probe a RIB whose routes are kept; that counts as done."""
         known = self._ribs.setdefault(rib, _Rib())
-        is_due = now_s - known.probed_s >= 2 * PROBE_S
+        is_due = now_s - known.probed_s >= QUIET_S
         if is_due:
             known.probed_s = now_s
         return is_due
