@@ -265,7 +265,7 @@ class AckNackHandler:
             return queue.next_number
         if (cached := self._window.cache.first_since(since_s)) is not None:
             return cached
-        return queue.next_number + sum(added_s is None or added_s < since_s for *_, added_s in queue.deferred.waiting)
+        return queue.next_number + queue.deferred.count_before(since_s)
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue

@@ -41,6 +41,10 @@ class DeferredMessages:
         self._held_bytes -= len(oldest[1])
         return oldest
 
+    def count_before(self, since_s: float) -> int:
+        """Return how many were published before a second; those of an unknown time were."""
+        return sum(added_s is None or added_s < since_s for *_, added_s in self.waiting)
+
     def drop_beyond(self, keep: int, options: SendOptions, now_s: float | None, *, is_latched: bool) -> int:
         """Drop the oldest messages above ``keep``, and beyond the history; return how many."""
         dropped = 0
