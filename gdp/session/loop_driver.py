@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from gdp.client.publisher import Publisher
+from gdp.due_queue import earliest
 from gdp.ports.netdev import NetdevPlane
 from gdp.runtime.runtime import Runtime
 from gdp.session.protocol.core import SessionCore
@@ -147,8 +148,7 @@ class LoopDriver:
     def _set_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        times = [self._runtime.next_due_s(), self._core.get_timer()]
-        due_s = min((each for each in times if each is not None), default=None)
+        due_s = earliest(self._runtime.next_due_s(), self._core.get_timer())
         if due_s is not None:
             delay_s = max(due_s - time.monotonic(), 0.0)
             self._timer = self._loop.call_later(delay_s, self._work)

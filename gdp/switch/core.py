@@ -27,6 +27,7 @@ from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
@@ -270,8 +271,7 @@ class SwitchCore:
         """Return the monotonic second of the next timer, or None."""
         if self._rest_due_s is None:
             self._rest_due_s = self._next_of_rest()
-        times = (self._rest_due_s, self.hello_protocol.get_timer(), self.diagnostics.get_timer())
-        return min([time for time in times if time is not None])
+        return earliest(self._rest_due_s, self.hello_protocol.get_timer(), self.diagnostics.get_timer())
 
     def _next_of_rest(self) -> float:
         """Return the monotonic second of the next timer outside neighbour discovery."""
