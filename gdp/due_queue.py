@@ -12,9 +12,10 @@ import heapq
 from itertools import count
 from typing import Any, Final, Generic, TypeVar
 
+from gdp.intervals import NEVER_S
+
 __all__ = ["DueQueue", "earliest"]
 
-_NEVER: Final = float("inf")
 _SLACK: Final = 64  # void entries that are not yet worth a rebuild
 
 K = TypeVar("K")
@@ -42,15 +43,15 @@ class DueQueue(Generic[K]):
 
     def due_s(self, key: K) -> float:
         """Return when a key is due; infinity: it does not wait."""
-        return self._due_s.get(key, _NEVER)
+        return self._due_s.get(key, NEVER_S)
 
     def put(self, key: K, at_s: float | None) -> None:
         """Have a key due at a second, instead of when it was before; None or infinity: never."""
-        if at_s is None or at_s == _NEVER:
+        if at_s is None or at_s == NEVER_S:
             self.discard(key)
             return
         self._due_s[key] = at_s
-        if at_s < self._place_s.get(key, _NEVER):
+        if at_s < self._place_s.get(key, NEVER_S):
             self._stand(key, at_s)
 
     def discard(self, key: K) -> None:

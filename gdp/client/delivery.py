@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, RemoteError
 from gdp.frame.kinds import Flag
+from gdp.intervals import NEVER_S
 from gdp.limits import NUMBER_MAX, REPLAY_WINDOW_MESSAGES, SEQUENCE_BYTES
 from gdp.message.bundle import unpack
 from gdp.message.frame_recovery import FrameRecovery
@@ -30,7 +31,6 @@ __all__ = ["NOT_BEGUN", "Delivered", "Delivery", "Ended"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
 _OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
-_NEVER: Final = float("inf")
 
 
 class Delivered(NamedTuple):
@@ -120,7 +120,7 @@ class Delivery:
         self._gone: tuple[LostRange, ...] = ()  # that the writer reports as lost for every reader
         self._skipped: LossReason | None = None  # why the next gap is skipped; None: unknown
         self._waiting: dict[int, ReassembledMessage] = {}  # behind a gap, by number
-        self._gap_until_s = _NEVER  # best effort, two paths: until then the slower one may bring what is missing
+        self._gap_until_s = NEVER_S  # best effort, two paths: until then the slower one may bring what is missing
         self._gap_at = 0  # ... and the number that is missing
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
 
@@ -205,7 +205,7 @@ class Delivery:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next ``handle_timer``; infinity: none."""
-        held_s = self._held[0][0] if self._held else _NEVER
+        held_s = self._held[0][0] if self._held else NEVER_S
         return held_s if held_s < self._gap_until_s else self._gap_until_s
 
     def finish(self) -> None:
@@ -220,7 +220,7 @@ class Delivery:
         """Release all memory."""
         for number in self._numbers:
             self._pop(number)
-        self._gap_until_s = _NEVER
+        self._gap_until_s = NEVER_S
         self._held.clear()
 
     def poll(self) -> list[Delivered]:
@@ -231,7 +231,7 @@ class Delivery:
     def _deliver(self, now_s: float) -> None:
         """Deliver the consecutive messages, and without a reliable writer those behind a gap that nothing fills."""
         waiting = self._waiting
-        gap_until_s, self._gap_until_s = self._gap_until_s, _NEVER
+        gap_until_s, self._gap_until_s = self._gap_until_s, NEVER_S
         if not self.is_live or not waiting:
             return
         while self.expected in waiting:
@@ -241,7 +241,7 @@ class Delivery:
             return
         lag_s, free_to = self._lag_s(), self._late.hold(self._numbers, now_s)
         if lag_s > 0:
-            is_same = self._gap_at == self.expected and now_s < gap_until_s < _NEVER
+            is_same = self._gap_at == self.expected and now_s < gap_until_s < NEVER_S
             self._gap_at, self._gap_until_s = self.expected, gap_until_s if is_same else now_s + lag_s
         elif free := [number for number in self._numbers if number < free_to]:
             self._skip_to(free[-1] + 1)

@@ -16,6 +16,7 @@ from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
+from gdp.intervals import NEVER_S
 from gdp.limits import SPREAD
 from gdp.message.frame_loss import Readers
 from gdp.message.send_window import SendWindow
@@ -25,7 +26,6 @@ from gdp.token_bucket import TokenBucket
 __all__ = ["GoverningPaths"]
 
 _ALL: Final = 1 << 30
-_NEVER: Final = float("inf")
 _ALONE_FROM_S: Final = 1.0  # after a second path: round trips enough to measure the one that remains
 _LIMIT_BURST_S: Final = 0.05  # of ``max_bits_s``: a burst of this time leaves at once
 
@@ -114,7 +114,7 @@ class GoverningPaths:
         due_s = governs((path.next_send_s() for path in self._governing()), default=now_s)
         if self._limit is not None and (left := self._limit.left(now_s)) <= 0:
             due_s = max(due_s, now_s + self._limit.seconds_for(1 - left))
-        return None if due_s == _NEVER else due_s
+        return None if due_s == NEVER_S else due_s
 
     def is_limited(self, now_s: float) -> bool:
         """Return whether messages wait now because ``max_bits_s`` lets no frame leave."""
@@ -223,7 +223,7 @@ class GoverningPaths:
     def _present(self) -> list[bytes]:
         """Return the readers whose nodes have not started again since they began to read. Without any, return all."""
         readers, is_former = self._readers, self._paths.is_former
-        everyone = readers.reading()
+        everyone = [*readers.active]
         if len(everyone) < 2:
             return everyone
         return [name for name in everyone if not is_former(name, readers[name].incarnation_id.started)] or everyone

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.intervals import READER
+from gdp.intervals import NEVER_S, READER
 from gdp.limits import REPORT_DELAY_S
 from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
 
@@ -23,7 +23,6 @@ __all__ = ["HeartbeatSchedule"]
 
 _BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
 _PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each sending of a new description but the last
-_NEVER: Final = float("inf")
 
 
 class HeartbeatSchedule:
@@ -44,15 +43,15 @@ class HeartbeatSchedule:
         self.starts: dict[bytes, StreamStart] = {}
         self._description = description
         self._said = len(_PAUSES_S) + 1  # times that the description was sent; beyond the last it is not new
-        self._again_s = _NEVER  # when the description is sent again
-        self._at_s = self._remind_s = -_NEVER  # when the next Heartbeat, and the next reminder, may be sent
+        self._again_s = NEVER_S  # when the description is sent again
+        self._at_s = self._remind_s = -NEVER_S  # when the next Heartbeat, and the next reminder, may be sent
 
     def describe(self, description: bytes) -> bool:
         """Set the description; return whether it is new."""
         if description == self._description:
             return False
         self._description, self._said, self.wanted = description, 0, True
-        self._at_s = -_NEVER
+        self._at_s = -NEVER_S
         return True
 
     @property
@@ -68,7 +67,7 @@ class HeartbeatSchedule:
         """Return the monotonic second at which a Heartbeat may be sent or will be wanted, or None."""
         at_s = self._at_s if self.wanted else self._again_s
         at_s = min(at_s, self._remind_s) if self.is_reminder_wanted else at_s
-        return None if at_s == _NEVER else at_s
+        return None if at_s == NEVER_S else at_s
 
     def is_due(self, now_s: float) -> bool:
         """Return whether a Heartbeat is wanted and may be sent."""
@@ -84,7 +83,7 @@ class HeartbeatSchedule:
         is_news = self._said <= len(_PAUSES_S)
         about = self._description if self.starts or is_news else b""
         if is_news:
-            self._again_s = now_s + _PAUSES_S[self._said] if self._said < len(_PAUSES_S) else _NEVER
+            self._again_s = now_s + _PAUSES_S[self._said] if self._said < len(_PAUSES_S) else NEVER_S
             self._said += 1
         wire = place._replace(starts=dict(self.starts), description=about).to_wire()
         self.starts.clear()

@@ -31,6 +31,7 @@ from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
+from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
 from gdp.message.loss import LossReason
@@ -40,7 +41,6 @@ from gdp.names import Name
 __all__ = ["Publisher"]
 
 _ALL: Final = 1 << 30
-_NEVER: Final = float("inf")
 _AWAITED_MAX: Final = 64  # messages kept for readers that waited; as many as a latched topic of ROS keeps here
 
 
@@ -92,7 +92,7 @@ class Publisher:
         self.paths, self.options, self.is_urgent = settings.paths, settings.options, settings.urgent
         self.has_more = False
         self.published: Callable[[Publisher], None] = lambda _: None
-        self._awaits_until_s = _NEVER
+        self._awaits_until_s = NEVER_S
         self._node_paths = ReaderPaths() if reader_paths is None else reader_paths
         self._keys = KeyEpochs(topic, source, secrets, address)
         self._window = SendWindow(history_depth=settings.depth, first_number=past.next_number, lag_s=lag_s)
@@ -326,7 +326,7 @@ class Publisher:
             self.acknowledgements.exclude(name, now_s)
         self.protection.late.drop_expired(now_s)
         if now_s >= self._awaits_until_s:
-            self._awaits_until_s = _NEVER
+            self._awaits_until_s = NEVER_S
             self.queue.await_readers(0)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
         self._heartbeats.handle_timer(now_s)
@@ -340,7 +340,7 @@ class Publisher:
             self.matched.next_silent(),
             protection.late.get_timer(),
             self.governing_paths.blocking.get_timer(),
-            self._awaits_until_s if self._awaits_until_s < _NEVER else None,
+            self._awaits_until_s if self._awaits_until_s < NEVER_S else None,
         )
         if not self.matched.active or self.queue.mtu is None:
             return due_s

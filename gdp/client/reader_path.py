@@ -16,7 +16,7 @@ from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import Flight
 from gdp.congestion.path_model import FIRST_RTT_S
 from gdp.congestion.states import State
-from gdp.intervals import FORGET_S, PACE_S
+from gdp.intervals import FORGET_S, NEVER_S, PACE_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 from gdp.requests import Backoff
 
@@ -33,7 +33,6 @@ _BEHIND_REPORTS: Final = 2
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
 _MESSAGE_FRAMES: Final = 100  # of a large message, one loss among which costs a round trip
-_NEVER: Final = float("inf")
 _UNLIMITED: Final = 1 << 30
 
 
@@ -93,7 +92,7 @@ class ReaderPath:
         if self.may_probe:
             return 0.0
         next_s = self.controller.next_send_s(self._mtu)
-        return _NEVER if next_s is None else next_s
+        return NEVER_S if next_s is None else next_s
 
     def note_idle(self) -> None:
         """Note that nothing waits, though more might leave."""

@@ -22,7 +22,7 @@ from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.intervals import FORGET_S, READER, SERVER
+from gdp.intervals import FORGET_S, NEVER_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart
 from gdp.names import Name
@@ -53,7 +53,6 @@ class ReaderTimeouts(NamedTuple):
 TOPICS: Final = ReaderTimeouts(READER.lease_s, READER.lease_s, READER.refresh_s)
 # other replicas must not wait for a dead one
 CALLS: Final = ReaderTimeouts(READER.refresh_s, SERVER.lease_s, SERVER.refresh_s, fastest_governs=True)
-_NEVER: Final = float("inf")
 
 
 class _Incarnation:
@@ -139,11 +138,7 @@ class ReaderProxies:
         return self.active[name]
 
     def __iter__(self) -> Iterator[bytes]:
-        return iter(self.reading())
-
-    def reading(self) -> list[bytes]:
-        """Return the names of those that are not suspended."""
-        return [*self.active]
+        return iter([*self.active])
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
@@ -167,14 +162,14 @@ class ReaderProxies:
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
-        due_s = _NEVER
-        for readers, lease_s in ((self.active, READER.lease_s), (self._suspended, _NEVER)):
+        due_s = NEVER_S
+        for readers, lease_s in ((self.active, READER.lease_s), (self._suspended, NEVER_S)):
             for each in readers.values():
-                behind_s = _NEVER if each.behind_s is None else each.behind_s + FORGET_S
+                behind_s = NEVER_S if each.behind_s is None else each.behind_s + FORGET_S
                 heard_s = each.heard_s + lease_s
                 earlier_s = behind_s if behind_s < heard_s else heard_s
                 due_s = earlier_s if earlier_s < due_s else due_s
-        return None if due_s == _NEVER else due_s + 0.001
+        return None if due_s == NEVER_S else due_s + 0.001
 
     def suspend(self, name: bytes, now_s: float) -> None:
         """Suspend a silent reader, until it reports again or is forgotten."""

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.client.publisher import Publisher
+from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES
 
 __all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
@@ -23,7 +24,6 @@ BYTES_AT_ONCE: Final = 160 << 10  # of ordinary frames, before any other publish
 BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
 _QUANTUM_FRAMES: Final = 2  # of the publisher with the least share in each round, where the path is the limit
 _RESERVED_S: Final = 0.25  # and for as long after that paths are not reserved, so that a slow reader stops no others
-_NEVER: Final = float("inf")
 
 
 class SendScheduler:
@@ -63,7 +63,7 @@ class SendScheduler:
 
     def next_due(self) -> float | None:
         """Return the monotonic second at which a path permits more; None: nothing waits, or for a reader's report."""
-        return None if self._held_until_s == _NEVER else self._held_until_s
+        return None if self._held_until_s == NEVER_S else self._held_until_s
 
     def poll_turn(self, now_s: float) -> list[list[bytes]]:
         """Return the frames that leave now, urgent and ordinary ones apart; an empty publisher leaves the queue."""
@@ -103,13 +103,13 @@ class SendScheduler:
         self._new.clear()
         self._ordinary = {publisher: 0} if allowance <= 0 or publisher.has_more else {}
         if self._ordinary and not frames:
-            self._held_until_s = _or_never(publisher.governing_paths.next_send_s(now_s)) if allowance <= 0 else _NEVER
+            self._held_until_s = _or_never(publisher.governing_paths.next_send_s(now_s)) if allowance <= 0 else NEVER_S
         return frames
 
     def _poll_urgent(self, now_s: float) -> tuple[list[bytes], float]:
         """Return urgent frames, and when a path permits more."""
         frames: list[bytes] = []
-        due_s = _NEVER
+        due_s = NEVER_S
         for publisher in sorted(self._urgent, key=lambda each: each.options.rank):
             allowance = publisher.governing_paths.allowance(now_s)
             frames += self._poll(publisher, min(allowance, self._at_once), now_s)
@@ -122,7 +122,7 @@ class SendScheduler:
     def _poll_ordinary(self, now_s: float) -> tuple[list[bytes], float]:
         """Return one round of ordinary frames, and when a path permits more."""
         frames: list[bytes] = []
-        due_s, left = _NEVER, self._at_once
+        due_s, left = NEVER_S, self._at_once
         shares = [publisher.options.share for publisher in self._ordinary]
         total, least = sum(shares), min(shares, default=1)
         reserved = frozenset[bytes]()
@@ -179,4 +179,4 @@ class SendScheduler:
 
 
 def _or_never(due_s: float | None) -> float:
-    return _NEVER if due_s is None else due_s
+    return NEVER_S if due_s is None else due_s

@@ -19,8 +19,6 @@ from gdp.trust.right import Right
 
 __all__ = ["Services", "StallClock"]
 
-# a participant that is called later than this, although hellos are due, was not scheduled
-
 
 class StallClock:
     """Time of a participant's latest event, and since when it has been scheduled without a stall; monotonic seconds."""
@@ -29,7 +27,10 @@ class StallClock:
         self.now_s = self.awake_s = 0.0
 
     def advance(self, now_s: float) -> None:
-        """Set the time; after a stall, frames that the peers sent meanwhile are still to be processed."""
+        """Set the time; after a stall, frames that the peers sent meanwhile are still to be processed.
+
+        A participant that is called so late, although hellos are due, was not scheduled.
+        """
         if now_s - self.now_s > 2 * NEIGHBOUR.refresh_s:
             self.awake_s = now_s
         self.now_s = now_s

@@ -31,7 +31,7 @@ from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
 from gdp.frame.kinds import Flag, Kind
-from gdp.intervals import READER
+from gdp.intervals import NEVER_S, READER
 from gdp.limits import (
     NACKS_PER_REPORT,
     NUMBER_MAX,
@@ -56,7 +56,6 @@ from gdp.trust.advertisement import Advertisement
 __all__ = ["WriterProxy", "WriterProxyState"]
 
 ANNOUNCE_S: Final = 0.1
-_NEVER: Final = float("inf")
 _LATCHED: Final = int(Flag.LATCHED)
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
 
@@ -238,7 +237,7 @@ class WriterProxy:
             waited_us = max(round((now_s - self._waits_since_s) * 1e6), 0)
             acknack = AckNack(AckNackFlag.NEW, number, 0, (), sequence, held_us=waited_us)
             return self._over_paths(self._sealer.seal_first(acknack))
-        missing, awaited_s = self._missing(now_s) if self.delivery.is_reliable else ((), _NEVER)
+        missing, awaited_s = self._missing(now_s) if self.delivery.is_reliable else ((), NEVER_S)
         if (self._copies is not None or self._data.repeats.copies) and self.delivery.is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
@@ -261,7 +260,7 @@ class WriterProxy:
         self.recovery.close()
         self.delivery.close()
         self._late.close()
-        self.schedule.due_s = _NEVER
+        self.schedule.due_s = NEVER_S
         delivery, expected = self.delivery, self.delivery.expected
         acknack = AckNack(AckNackFlag.BYE, expected, 0, (), delivery.sequence, self.losses.total)
         return self._over_paths([self._sealer.seal(acknack)])
@@ -340,7 +339,7 @@ class WriterProxy:
         That is gaps below the newest fragment, and all that a Heartbeat announced.
         """
         missing: list[MissingRange] = []
-        due_s = _NEVER
+        due_s = NEVER_S
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
         for number in self._data.window.unfinished(self.delivery.expected, end):

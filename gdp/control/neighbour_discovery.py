@@ -42,7 +42,7 @@ from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
-from gdp.intervals import HELLO_IDLE, UPKEEP_S
+from gdp.intervals import HELLO_IDLE, NEVER_S, UPKEEP_S
 from gdp.limits import COST_AUTO, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
@@ -52,7 +52,6 @@ __all__ = ["HelloProtocol"]
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
-_NEVER: Final = float("inf")
 
 
 class HelloProtocol:
@@ -92,7 +91,7 @@ class HelloProtocol:
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
         self._incarnation = settings.incarnation
-        self._due_s = _NEVER  # when the next call was requested
+        self._due_s = NEVER_S  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
         self._digest_for = digest_for
         self._incarnation_id = settings.incarnation_id
@@ -386,7 +385,7 @@ class HelloProtocol:
             port.nonce, port.exchange_key = _new_session(self._random_bytes)
             port.ended.clear()
             port.joins.clear()
-            port.answer_at_s, port.credit_bytes = _NEVER, 0
+            port.answer_at_s, port.credit_bytes = NEVER_S, 0
             port.hurry(now_s)
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
@@ -402,7 +401,7 @@ class HelloProtocol:
     def drop_silent(self, now_s: float) -> list[Change]:
         """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
         self.liveness.note_call(self._due_s, now_s)
-        self._due_s, self._next_s = _NEVER, None
+        self._due_s, self._next_s = NEVER_S, None
         self.reception.drop_expired(now_s)
         changes: list[Change] = []
         for port in self.ports.values():
@@ -456,7 +455,7 @@ class HelloProtocol:
             self._next_s = self._find_next()
         reply_at_s = self.reception.reply_at_s
         self._due_s = reply_at_s if reply_at_s < self._next_s else self._next_s
-        return None if self._due_s == _NEVER else self._due_s
+        return None if self._due_s == NEVER_S else self._due_s
 
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
@@ -491,7 +490,7 @@ class HelloProtocol:
 
     def _answer(self, port: HelloPort, now_s: float) -> list[bytes]:
         """Return a hello for the candidates, or nothing if they have sent fewer bytes."""
-        port.answer_at_s = _NEVER
+        port.answer_at_s = NEVER_S
         frames = self._hello(port, now_s)
         size = sum(map(len, frames))
         port.owes_answer = size > port.credit_bytes
@@ -502,7 +501,7 @@ class HelloProtocol:
 
     def _hello(self, port: HelloPort, now_s: float) -> list[bytes]:
         port.sequence += 1
-        port.said_s, port.answer_at_s = now_s, _NEVER
+        port.said_s, port.answer_at_s = now_s, NEVER_S
         heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(

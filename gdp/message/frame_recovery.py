@@ -20,6 +20,7 @@ from typing import Final
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import FLAGS_AT, Header, decode
 from gdp.frame.kinds import Flag
+from gdp.intervals import NEVER_S
 from gdp.limits import RECOVERY_BYTES
 from gdp.message import erasure
 from gdp.message.parity import Block, Parity, blocks_of, frame_of, shard_of, span_of
@@ -36,7 +37,6 @@ _MESSAGES_MAX: Final = 16
 _OVERHEAD_BYTES: Final = 128  # of a kept frame, in addition to its bytes
 _PARITY: Final = int(Flag.PARITY)
 _SHARED_FLAGS: Final = 0xFF & ~int(Flag.LAST)
-_NEVER: Final = float("inf")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -156,7 +156,7 @@ class FrameRecovery:
     def next_expiry(self) -> float:
         """Return the monotonic second at which ``drop_expired`` has something to do; infinity: none."""
         if not self._messages:
-            return _NEVER
+            return NEVER_S
         return min(message.last_s for message in self._messages.values()) + _FORGET_S
 
     def close(self) -> None:

@@ -34,6 +34,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gdp.frame.codec import Header
+from gdp.intervals import NEVER_S
 from gdp.limits import NACKS_PER_REPORT, REPAIR_S, REPAIRS_ABOVE_PARTS, REPORT_DELAY_S, REPORT_GAP_S
 from gdp.message.acknack import MissingRange
 from gdp.message.flow_control import RoundTripEstimator
@@ -50,7 +51,6 @@ _GAPS_MAX: Final = 1_024  # of one message that are examined at once
 _FASTEST: Final = 0.8  # of the usual time: an earlier repair was caused by an earlier request
 _MARGIN_S: Final = 0.01
 _EPSILON_S: Final = 1e-6
-_NEVER: Final = float("inf")
 _NONE: Final = 1 << 64  # above all numbers of messages
 _ALL: Final = 1 << 32  # above all fragments of a message
 _Range = tuple[int, int]  # fragments, both included
@@ -74,10 +74,10 @@ class _Incomplete:
 
     until_s: float  # it is repaired until then
     quiet_s: float  # when the tail counts as missing, unless a fragment has come
-    hold_until_s: float = _NEVER  # later messages wait until then
+    hold_until_s: float = NEVER_S  # later messages wait until then
     next_part: int = 0  # behind the newest fragment
     requested_end: int = 0
-    gap_s: float = _NEVER  # when a gap behind that was found
+    gap_s: float = NEVER_S  # when a gap behind that was found
     gap_end: int = 0
     requests: list[_Request] = field(default_factory=list)
     is_answered: bool = False
@@ -107,8 +107,8 @@ class LateRepairs:
         self._lag_s = lag_s
         self._awaited_s = awaited_s
         self._incomplete: dict[int, _Incomplete] = {}
-        self._due_s = _NEVER  # when something may be requested
-        self._hold_s = _NEVER  # until when complete messages wait
+        self._due_s = NEVER_S  # when something may be requested
+        self._hold_s = NEVER_S  # until when complete messages wait
         self._highest = -1  # number of the latest message that has begun
         self._unanswered = 0  # messages in a row
         self._repair = RoundTripEstimator()  # from a request to its repair
@@ -133,7 +133,7 @@ class LateRepairs:
         if part < entry.requested_end:
             self._handle_answer(entry, part, now_s)
         known_end = max(entry.next_part, self._data.progress(number))
-        if part > known_end and entry.gap_s == _NEVER:
+        if part > known_end and entry.gap_s == NEVER_S:
             entry.gap_s, entry.gap_end = now_s, part
             self._due_s = min(self._due_s, now_s + self._delay_s())
         if part >= known_end:
@@ -150,19 +150,19 @@ class LateRepairs:
             if before < number:
                 each.hold_until_s = min(each.hold_until_s, now_s + HOLD_S)
         if not self._incomplete:
-            self._due_s = _NEVER
+            self._due_s = NEVER_S
 
     def forget(self, below: int) -> None:
         """Give up the messages numbered under ``below``."""
         for number in [number for number in self._incomplete if number < below]:
             self._remove(number)
         if not self._incomplete:
-            self._due_s = _NEVER
+            self._due_s = NEVER_S
 
     def close(self) -> None:
         """Forget everything."""
         self._incomplete.clear()
-        self._due_s = self._hold_s = _NEVER
+        self._due_s = self._hold_s = NEVER_S
 
     def wait_s(self, below: int, now_s: float) -> float:
         """Return for how long messages numbered under ``below`` may still be repaired; 0: none is."""
@@ -177,7 +177,7 @@ class LateRepairs:
         """
         first = min(self._awaited(now_s), default=_NONE) if self._incomplete else _NONE
         is_waiting = bool(numbers) and numbers[-1] > first
-        self._hold_s = self._incomplete[first].wait_until_s if is_waiting else _NEVER
+        self._hold_s = self._incomplete[first].wait_until_s if is_waiting else NEVER_S
         return first
 
     def give_up(self, now_s: float) -> bool:
@@ -193,13 +193,13 @@ class LateRepairs:
                 self._remove(number)
                 self._data.give_up(number)
         if has_ended:
-            self._hold_s = _NEVER  # until ``hold`` is called
+            self._hold_s = NEVER_S  # until ``hold`` is called
         return has_ended
 
     def poll_missing(self, now_s: float) -> tuple[MissingRange, ...]:
         """Return the fragments that are to be requested now, once."""
         missing: list[MissingRange] = []
-        self._due_s = _NEVER
+        self._due_s = NEVER_S
         for number, entry in self._incomplete.items():
             if len(missing) >= NACKS_PER_REPORT:
                 self._due_s = now_s
@@ -297,10 +297,10 @@ class LateRepairs:
             due += self._request(entry, lacking, seen_end, limit - len(due), now_s)
             if entry.requested_end >= end:
                 is_more = bool(_within(gaps, end, newest + 1))
-                entry.gap_s, entry.gap_end = now_s if is_more else _NEVER, newest + 1
+                entry.gap_s, entry.gap_end = now_s if is_more else NEVER_S, newest + 1
             elif entry.requested_end >= seen_end:
                 entry.gap_s = now_s + REPORT_DELAY_S  # more is examined when the first gaps are filled
-        entry.quiet_s = touched_s + REPORT_DELAY_S if entry.requested_end < parts else _NEVER
+        entry.quiet_s = touched_s + REPORT_DELAY_S if entry.requested_end < parts else NEVER_S
         return due
 
     def _request(self, entry: _Incomplete, lacking: list[_Range], end: int, limit: int, now_s: float) -> list[_Range]:

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 from typing import Final
 
+from gdp.intervals import NEVER_S
+
 __all__ = ["ServerWindow"]
 
 _STALL_S: Final = 0.5  # without any answer
 _PATIENCE_S: Final = 2.0  # of requests that wait, while others are answered
 _AGAIN_S: Final = 0.25  # until the window doubles again
-_NEVER: Final = float("inf")
 
 
 class ServerWindow:
@@ -35,8 +36,8 @@ class ServerWindow:
         self._given: dict[int, None] = {}  # not overtaken, the oldest first
         self._extra = 0
         self._grant = 1  # growth at the next stall
-        self._stall_at_s = _NEVER  # when the server has answered nothing for too long
-        self._double_at_s = _NEVER  # when requests have waited for too long
+        self._stall_at_s = NEVER_S  # when the server has answered nothing for too long
+        self._double_at_s = NEVER_S  # when requests have waited for too long
 
     @property
     def is_open(self) -> bool:
@@ -49,7 +50,7 @@ class ServerWindow:
 
     def answered(self, number: int) -> None:
         """Record an answer."""
-        self._stall_at_s, self._grant = _NEVER, 1
+        self._stall_at_s, self._grant = NEVER_S, 1
         if number in self._given:
             for earlier in list(self._given):
                 del self._given[earlier]
@@ -66,17 +67,17 @@ class ServerWindow:
         """Forget all requests."""
         self._given.clear()
         self._extra, self._grant = 0, 1
-        self._stall_at_s = self._double_at_s = _NEVER
+        self._stall_at_s = self._double_at_s = NEVER_S
 
     def handle_waiting(self, now_s: float, *, waits: bool) -> None:
         """Note whether requests wait now for the window; it grows where they have waited for too long."""
         if not waits:
-            self._stall_at_s = self._double_at_s = _NEVER
+            self._stall_at_s = self._double_at_s = NEVER_S
         elif not self.is_open:
             if now_s >= self._stall_at_s:
                 self._extra += self._grant
                 self._grant *= 2
-                self._stall_at_s = _NEVER
+                self._stall_at_s = NEVER_S
             if now_s >= self._double_at_s:
                 self._extra += self._size + self._extra
                 self._double_at_s = now_s + _AGAIN_S
@@ -86,4 +87,4 @@ class ServerWindow:
     def get_timer(self) -> float | None:
         """Return the monotonic second at which the window grows, or None."""
         due_s = min(self._stall_at_s, self._double_at_s)
-        return None if due_s == _NEVER else due_s
+        return None if due_s == NEVER_S else due_s
