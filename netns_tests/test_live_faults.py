@@ -226,6 +226,7 @@ def test_a_master_that_restarts(pair: Pair, a: Peer, b: Peer) -> None:
     until(lambda: a.tell("pulse.publish(String())") or late.tell("len(heard['/pulse'])"), "/pulse after the restart")
 
 
+@pytest.mark.nightly
 def test_what_crossed_still_does_when_three_leases_are_over(pair: Pair, a: Peer, b: Peer) -> None:
     pair.outlive()
     flows(a, b)
