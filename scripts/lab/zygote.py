@@ -77,7 +77,7 @@ class Program:
 
     @classmethod
     def from_argv(cls, argv: Sequence[str], path: str = "") -> Program | None:
-        """Return the project's program that a command line starts; None: another. ``path``: of a shell's commands."""
+        """Return the project's program that a command line starts; None: another. ``path``: of commands."""
         words = [os.fspath(each) for each in argv]
         spaces, pdeathsig, is_bare, environment = list[str](), 0, False, dict[str, str]()
         while words:
@@ -94,11 +94,12 @@ class Program:
                     environment[name] = value
             elif words[:-1] in (["bash", "-c"], ["bash", "-ec"]) and _PLAIN.fullmatch(words[-1]):
                 words = shlex.split(words[-1].removeprefix("exec "))
-                words[:1] = [shutil.which(each, path=environment.get("PATH", path)) or each for each in words[:1]]
                 break
             else:
                 break
             words = words[1:] if words[:1] == ["--"] else words
+        if words and "/" not in words[0]:
+            words[0] = shutil.which(words[0], path=environment.get("PATH", path)) or words[0]
         if not words or Path(words[0]).parent != Path(sys.executable).parent:
             return None
         values = tuple(environment.items())
