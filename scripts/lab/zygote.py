@@ -98,8 +98,7 @@ class Program:
             else:
                 break
             words = words[1:] if words[:1] == ["--"] else words
-        if words and "/" not in words[0]:
-            words[0] = shutil.which(words[0], path=environment.get("PATH", path)) or words[0]
+        words[:1] = [shutil.which(each, path=environment.get("PATH", path)) or each for each in words[:1]]
         if not words or Path(words[0]).parent != Path(sys.executable).parent:
             return None
         values = tuple(environment.items())
