@@ -188,7 +188,7 @@ class Zygote:
 
     def can_run(self, program: Program, environment: Mapping[str, str], cwd: Path) -> bool:
         """Return whether a forked process is the same as an executed one would be."""
-        if _settings(environment) != self._settings:
+        if _settings(environment) != ({} if program.is_bare else self._settings):  # an interpreter adds some by itself
             return False
         first = Path(program.file).parent if program.file else cwd
         folders = [first, *map(Path, filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))]
