@@ -75,7 +75,7 @@ class Machines:
         """Run one command line to its end; return its output."""
         self.done.append(line)
         words = line.split()
-        program = Path(sys.executable).with_name(words[0])
+        program = Path(sys.executable).parent / words[0]
         is_plain = _SPECIAL.isdisjoint(line) and program.exists()  # the shell would start it with the same words
         return self.hosts[home].output(*([str(program), *words[1:]] if is_plain else ["bash", "-ec", line]))
 

@@ -50,7 +50,7 @@ _PRELOADED: Final = (
     "pyroute2.netns",
 )
 # These start programs that a zygote forks.
-_STARTERS: Final = ("fog.cli.app", "fog.host.cli", "proxy.cli.replay", "ring", "internet_demo", "fog_demo")
+_STARTERS: Final = ("fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo")
 _DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
