@@ -46,11 +46,14 @@ _PRELOADED: Final = (
     "gdp.cli.relay",
     "proxy.cli.proxy",
     "proxy.cli.replay",
+    "proxy.recordings.child",
     "fog.cli.app",
     "ring.cli",
 )
+# These start programs that a zygote forks.
 _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
 _PLAIN: Final = re.compile(r"(?:[\w ./:,=@+%-]|'[^']*')+")  # a shell takes it for words
+_DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
@@ -65,10 +68,11 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What to run in a forked process; ``module`` as by ``python -m``, or else ``file`` as a script."""
+    """What to run in a forked process: ``module`` as by ``-m``, ``code`` as by ``-c``, or ``file`` as a script."""
 
     argv: list[str]
     module: str = ""
+    code: str = ""
     file: str = ""
     spaces: tuple[str, ...] = ()
     pdeathsig: int = 0
@@ -107,6 +111,8 @@ class Program:
             return replace(program, file=words[0]) if Path(words[0]).name in _scripts() else None
         if words[1:2] == ["-m"] and len(words) > 2 and words[2].partition(".")[0] in _PACKAGES:
             return replace(program, module=words[2])
+        if words[1:2] == ["-c"] and len(words) > 2 and _DECODER in words[2].splitlines():
+            return replace(program, code=words[2])
         if len(words) > 1 and words[1].endswith(".py") and Path(words[1]).resolve().is_relative_to(ROOT):
             return replace(program, file=words[1])
         return None
@@ -152,10 +158,11 @@ class Zygote:
         self._settings = _settings(os.environ)
 
     @classmethod
-    def start(cls) -> Zygote:
+    def start(cls, modules: Sequence[str] = _PRELOADED) -> Zygote:
         """Start a zygote: in an interpreter of its own, or as a fork of a process that a zygote has forked.
 
-        Call this before there are threads. In the new process it does not return.
+        Call this before there are threads. In the new process it does not return. ``modules``: what one in an
+        interpreter of its own imports, in this order.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -168,8 +175,10 @@ class Zygote:
                     sys.exit()
                 return cls(pid, ours)
             environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+            environment["OPENBLAS_NUM_THREADS"] = "1"  # a fork has no other threads
             theirs.set_inheritable(True)
             words = [sys.executable, __file__, str(theirs.fileno()), _PLACE_OF_NAME]
+            ours.send(json.dumps(modules).encode())
             return cls(os.posix_spawn(sys.executable, words, environment), ours)
 
     def fork(self, request: Request, descriptors: Sequence[int]) -> int:
@@ -278,7 +287,7 @@ def main() -> None:
     sys.path[:1] = [str(ROOT), str(ROOT / "scripts")]  # of this copy, also where the interpreter has another installed
     link = socket.socket(fileno=int(sys.argv[1]))
     sys.modules["lab.zygote"] = sys.modules["__main__"]  # so that a program keeps the zygote that it was given
-    for module in _PRELOADED:
+    for module in json.loads(link.recv(_REQUEST_BYTES)):
         importlib.import_module(module)
     started = dict(entry.partition("=")[::2] for entry in Path("/proc/self/environ").read_text().split("\0") if entry)
     added = {name: value for name, value in os.environ.items() if name not in started}
@@ -352,7 +361,7 @@ def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Prog
             os._exit(128 + program.pdeathsig)
     os.environ.clear()
     os.environ.update({**birth.added, **request.environment})
-    first = str(Path(program.file).resolve().parent) if program.file else os.getcwd()
+    first = str(Path(program.file).resolve().parent) if program.file else "" if program.code else os.getcwd()
     paths = filter(None, request.environment.get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = [first, *paths, *birth.path]
     _show(program.argv, request.environment)
@@ -367,6 +376,10 @@ def _run(program: Program) -> None:
         sys.argv = [program.module, *program.argv[3:]]
         sys.modules.pop(program.module, None)  # as a fresh interpreter, which runs it once, as __main__
         runpy.run_module(program.module, run_name="__main__", alter_sys=True)
+        return
+    if program.code:
+        sys.argv = program.argv[1:2] + program.argv[3:]
+        exec(compile(program.code, "<string>", "exec"), {"__name__": "__main__"})
         return
     sys.argv = program.argv[program.argv.index(program.file) :]
     runpy.run_path(program.file, run_name="__main__")
