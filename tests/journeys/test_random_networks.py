@@ -25,7 +25,7 @@ MIDDLE_TIER_DIES = Plan(
 
 
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
-@draws(2)
+@draws(1, long=8)
 @given(plans())
 @example(LOOPED_AT_A_BORDER)
 @example(THREE_TIERS)
