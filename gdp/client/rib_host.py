@@ -63,22 +63,14 @@ class RibHost:
         """Process received frames."""
         self._now_s = now.mono_s
         statements: list[tuple[bytes, Name]] = []
-        has_others = False  # than fragments whose statement is not complete
         for arrival in arrivals:
             try:
-                completed = self._receive_statement(arrival, now)
-                if completed is not None:
-                    has_others = True
-                    statements += completed
+                statements += self._receive_statement(arrival, now)
             except RemoteError as error:
-                has_others = True
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not end the RIB
-                has_others = True
                 self.rib.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
-        if not has_others:
-            return
         self.rib.receive_all(statements, now)
         self._record_connection(now)
         self._post()
@@ -119,8 +111,8 @@ class RibHost:
     def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
 
-    def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]] | None:
-        """Return the statement for the RIB that a frame completes, with its sender; None: it is not complete."""
+    def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
+        """Return the statement for the RIB that a frame completes, with its sender."""
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
@@ -136,7 +128,7 @@ class RibHost:
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
         wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
         if wire is None:
-            return None
+            return []
         sender = Name(header.source)
         opened = self._channels.receive(wire, sender, now)
         if opened is None:
