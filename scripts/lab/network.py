@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -79,25 +79,6 @@ class _End:
     mac: bytes
 
 
-class _PresentMtus(Mapping[int, int]):
-    """MTU of each port whose link is up, read when it is asked for."""
-
-    def __init__(self, ports: dict[int, tuple[SimLink, _End, _End]]) -> None:
-        self._ports = ports
-
-    def __getitem__(self, port: int) -> int:
-        sim_link = self._ports[port][0]
-        if not sim_link.is_up:
-            raise KeyError(port)
-        return sim_link.mtu
-
-    def __iter__(self) -> Iterator[int]:
-        return (port for port, (sim_link, _, _) in self._ports.items() if sim_link.is_up)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
 @dataclass(slots=True, kw_only=True)
 class _Node:
     machine: ProtocolCore
@@ -111,10 +92,6 @@ class _Node:
     is_alive: bool = True
     came: Counter[int] = field(default_factory=Counter)  # frames, by port
     stalled: list[tuple[_End, bytes]] | None = None  # frames that arrived while it was frozen
-    mtus: _PresentMtus = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.mtus = _PresentMtus(self.ports)
 
 
 class SimNetwork:
@@ -215,10 +192,7 @@ class SimNetwork:
         self._settle(name)
 
     def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let time pass; return whether ``until`` came true (True without one).
-
-        Args:
-            until: of what cores and actions change; it is evaluated after each event that called one of them.
+        """Let time pass; return whether ``until`` came true (True without one), after an event that called a core.
 
         Raises:
             LocalError: a core's timer is due repeatedly in one instant, which would be an endless loop on a real clock.
@@ -229,8 +203,7 @@ class SimNetwork:
         while self._events and self._events[0][0] <= end_s:
             at_s, _, action, arguments = heapq.heappop(self._events)
             self._now_s = max(self._now_s, at_s)
-            result = action(*arguments)
-            if until is not None and result is not _QUIET and until():
+            if action(*arguments) is not _QUIET and until is not None and until():
                 return True
         self._now_s = end_s
         return until is None
@@ -270,9 +243,8 @@ class SimNetwork:
         self._push(node.timer_s, self._timer, name, node)
 
     def _timer(self, name: str, node: _Node) -> object:
-        if self._nodes[name] is not node or not node.is_alive:
-            return _QUIET
-        if node.timer_s is None or node.timer_s > self._now_s:
+        is_present = self._nodes[name] is node and node.is_alive
+        if not is_present or node.timer_s is None or node.timer_s > self._now_s:
             return _QUIET
         node.timer_s = None
         if node.stalled is not None:
@@ -320,7 +292,6 @@ class SimNetwork:
         return self._deliver(end, frame) if sim_link.is_up else _QUIET
 
     def _deliver(self, end: _End, frame: bytes) -> object:
-        """Pass a frame to the data plane of a node, or to its core; return ``_QUIET`` if its core was not called."""
         node = self._nodes[end.node]
         if not node.is_alive or frame[:6] not in (end.mac, BROADCAST):
             return _QUIET
@@ -330,7 +301,8 @@ class SimNetwork:
             return _QUIET
         node.came[end.port] += 1
         if node.table is not None:
-            decision = decide(frame, node.table.entries, node.mtus, node.table.sides, end.port)
+            mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
+            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
                 return _QUIET

@@ -97,7 +97,7 @@ def test_epochs_of_three_days_follow_each_other_without_a_lost_or_doubled_messag
     loss: float, clock_days: float
 ) -> None:
     """A reader is away at a change of the day, another comes on the third; the publisher's clock may be wrong."""
-    world = ring()
+    world = ring(lease_s=6.0)  # shorter than the absence
     away, late, former = (f"nuc{number}/{name}" for number, name in ((4, "away"), (3, "late"), (2, "former")))
     for label in (away, late, former):
         world.add_member(label, label.partition("/")[0])

@@ -105,7 +105,7 @@ def camera(*, fec: bool = True, reliable: bool = False, seed: int = 1, readers: 
 
 @pytest.mark.parametrize(
     ("loss", "burst", "without", "with_parity"),
-    [(0.05, 1.0, (0.1, 0.5), 0.95), (0.02, 8.0, (0.55, 1.0), 0.72), *nightly((0.01, 1.0, (0.6, 0.9), 0.97))],
+    [(0.05, 1.0, (0.1, 0.5), 0.95), *nightly((0.02, 8.0, (0.55, 1.0), 0.72), (0.01, 1.0, (0.6, 0.9), 0.97))],
 )
 def test_jpegs_come_within_one_way_and_10_ms(
     loss: float, burst: float, without: tuple[float, float], with_parity: float
@@ -181,7 +181,7 @@ def test_parity_ends_when_the_loss_ends() -> None:
     made.cable.loss = 0.02
     made.stream(60, 0.1, JPEG_BYTES)
     made.cable.loss = 0.0
-    made.stream(300, 0.05, JPEG_BYTES)
+    made.stream(200, 0.05, JPEG_BYTES)
     before = made.bytes_of[Kind.PARITY]
     made.stream(20, 0.05, JPEG_BYTES)
     assert made.bytes_of[Kind.PARITY] == before > 0

@@ -278,7 +278,7 @@ class Trial:
 @long_example(  # what a full frame takes to leave was another flow's queue
     Plan(5, (), (Thin(1.0, 1, 0, 1, 60),), 0, (Fault("freeze", 0, 5.0, 5.2),), 1)
 )
-@example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO
+@long_example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO
     Plan(
         7,
         ((0, 3), (1, 2), (4, 3)),

@@ -117,8 +117,9 @@ def test_a_path_that_fails_at_any_moment_costs_nothing(which: int, reliable: boo
     assert made.reader.drops()[DropReason.SECOND_COPY]
 
 
-@pytest.mark.parametrize("period_s", [0.003, PERIOD_S])
-@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
+@pytest.mark.parametrize(
+    ("reliable", "period_s"), [(True, PERIOD_S), (False, 0.003), *nightly((True, 0.003), (False, PERIOD_S))]
+)
 def test_what_one_path_loses_is_awaited_from_the_other_and_not_requested(reliable: bool, period_s: float) -> None:
     made = pair(reliable=reliable)
     made.period_s = period_s

@@ -298,7 +298,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
 
 
 def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -> None:
-    world = ring(keepalive_ms=2_000)  # no link fails, and much time passes
+    world = ring(lease_s=20.0, keepalive_ms=2_000)  # no link fails, and much time passes
     server, client = pair(world)
     server.answer(client.member.name, b"1")
     assert work(world, client, until_s=2, have=1)

@@ -261,7 +261,7 @@ def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
 
 
 def test_a_ring_survives_one_fault_after_the_other() -> None:
-    world = ring()
+    world = ring(lease_s=LEASE_S)
     there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
     count = int(LONG_S / PERIOD_S)
     there.stream(count, PERIOD_S, size=100)
