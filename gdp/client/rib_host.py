@@ -62,17 +62,17 @@ class RibHost:
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames."""
         self._now_s = now.mono_s
-        has_others = False  # than fragments whose statement is not complete
+        fragments = 0  # whose statement is not complete
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
-                has_others |= self._receive_frame(arrival, statements, now)
+                fragments += not self._receive_frame(arrival, statements, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not end the RIB
                 self.rib.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
-        if has_others:
+        if fragments < len(arrivals):
             self.rib.receive_all(statements, now)
             self._record_connection(now)
             self._post()

@@ -171,11 +171,7 @@ def assert_as_fast(took_s: list[float], alone_s: list[float]) -> None:
 
 @pytest.mark.parametrize(
     ("case", "size"),
-    [
-        pytest.param(case, size, marks=pytest.mark.nightly if size == LARGE and case != "stalled" else [])
-        for case in CASES
-        for size in CALLS
-    ],
+    [pytest.param(case, size, marks=pytest.mark.nightly if size == LARGE else []) for case in CASES for size in CALLS],
 )
 def test_a_second_server_does_not_delay_the_first_answer(case: str, size: int) -> None:
     replicas = Replicas((OTHER, NEAR))

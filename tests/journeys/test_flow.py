@@ -78,7 +78,7 @@ def test_a_switch_that_restarts_in_an_instant_is_noticed_by_its_session() -> Non
     flow.outlive()
 
 
-@pytest.mark.parametrize("label", ["backbone", "cloud", *nightly("school")])
+@pytest.mark.parametrize("label", ["backbone", *nightly("school", "cloud")])
 def test_a_restarted_rib_disturbs_no_flow_and_is_refilled(label: str) -> None:
     flow = flowing(ring())
     world = flow.world

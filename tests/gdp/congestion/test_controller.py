@@ -170,7 +170,7 @@ def test_two_flows_share_a_path_fairly() -> None:
     assert other.share(15, 30, 20e6) == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.parametrize("fifo_s", [SECOND, *nightly(RTT_S)])
+@pytest.mark.parametrize("fifo_s", [RTT_S, SECOND])
 def test_next_to_a_cubic_flow_each_has_35_to_65_percent(fifo_s: float) -> None:
     link, flow, cubic = path(10, fifo_s=fifo_s), own(), Flow(CubicSender(), start_s=5)
     link.add(flow)
@@ -183,10 +183,8 @@ def test_next_to_a_cubic_flow_each_has_35_to_65_percent(fifo_s: float) -> None:
 _FAST_PATHS = [(fifo_s, is_first) for is_first in (False, True) for fifo_s in (RTT_S / 2, RTT_S, 2 * RTT_S)]
 
 
-@pytest.mark.parametrize(
-    ("fifo_s", "is_first"),
-    [_FAST_PATHS[0], *nightly(*_FAST_PATHS[1:])],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize(("fifo_s", "is_first"), _FAST_PATHS)
 def test_next_to_a_cubic_flow_on_a_fast_path_each_has_35_to_65_percent(fifo_s: float, *, is_first: bool) -> None:
     link, flow = path(100, fifo_s=fifo_s), own(start_s=0 if is_first else 5)
     cubic = Flow(CubicSender(), start_s=5 if is_first else 0)
