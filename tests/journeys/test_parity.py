@@ -122,7 +122,8 @@ def test_jpegs_come_within_one_way_and_10_ms(
     assert shares[1] >= with_parity  # a burst of eight is more than the parity of so few frames can fill
 
 
-@pytest.mark.parametrize(("loss", "with_parity"), [(0.05, 0.8), *nightly((0.01, 0.9))])
+@pytest.mark.nightly
+@pytest.mark.parametrize(("loss", "with_parity"), [(0.05, 0.8), (0.01, 0.9)])
 def test_raw_images_come_within_one_way_and_10_ms(loss: float, with_parity: float) -> None:
     shares = []
     for fec in (False, True):
