@@ -237,6 +237,6 @@ class GoverningPaths:
 
     def _record_blocks(self, now_s: float) -> None:
         """Note which readers hold back the others."""
-        paths = [(name, self._paths.path(name, now_s)) for name in self.names()]
-        states = [PathState(name, path.allowance(now_s), path.sent_bytes) for name, path in paths if not path.is_silent]
-        self.blocking.record(states, now_s)
+        paths = ((name, self._paths.path(name, now_s)) for name in self.names())
+        present = [(name, path) for name, path in paths if path.governs_others]
+        self.blocking.record([PathState(name, path.allowance(now_s), path.sent_bytes) for name, path in present], now_s)

@@ -244,7 +244,7 @@ class Publisher:
         """
         mtu = self.queue.mtu = max(mtu, MTU_MIN_BYTES)
         self.matched.is_reachable = True
-        self._node_paths.set_mtu(self.matched, mtu)
+        self._node_paths.tree_stands(self.matched, mtu)
         self.protection.late.drop_larger(mtu)
         is_resealed = self.queue.refragment_best_effort(mtu)
         move = self.queue.refragment(mtu)

@@ -3,8 +3,9 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). One congestion controller (``gdp/congestion``) for each reader
 node is shared by all publishers of a participant that this node reads. A frame to several readers counts on the path of
 each. On a topic it leaves when all of them permit it, so the slowest reader governs; of requests the fastest path
-governs. A reader that confirms nothing for a timeout governs no others; alone, it gets two frames each timeout. When a
-reader node restarts, its path begins again, and frames to its former incarnation do not count.
+governs. A reader that confirms nothing for a timeout governs no others until a round trip to it is measured again;
+alone, it gets two frames each timeout. When a reader node restarts, its path begins again, and frames to its former
+incarnation do not count.
 """
 
 from __future__ import annotations
@@ -144,6 +145,11 @@ class ReaderPath:
         return self.controller.model.rtt_s or self._trip_s
 
     @property
+    def governs_others(self) -> bool:
+        """Return whether other readers wait for this one: a round trip was measured since its last silence."""
+        return not self.is_silent and (not self._timeouts or self.controller.model.rtt_s is not None)
+
+    @property
     def stall_s(self) -> float:
         """Return how long a path that carries something may confirm nothing."""
         return _PROBE_TRIPS * (self.trip_s or FIRST_RTT_S) + REPORT_DELAY_S
@@ -187,8 +193,11 @@ class ReaderPath:
             self.controller.path_changed(now_s)
         self._hops = hops
 
-    def set_mtu(self, mtu: int) -> None:
-        """Set the bytes of a full frame."""
+    def tree_stands(self, mtu: int) -> None:
+        """Note that a tree leads there, with the bytes of a full frame; after a silence, nothing did so before."""
+        if not self.governs_others:
+            self.controller.rate.forget_all()
+            self._timeouts = min(self._timeouts, 1)
         if mtu != self._mtu:
             self._mtu = mtu
             self.controller.set_mtu(mtu)
@@ -266,19 +275,19 @@ class ReaderPaths:
         """Return whether a reader node has started again since; 0: not known when it started."""
         return 0 < started < self._started.get(reader, 0)
 
-    def set_mtu(self, readers: Iterable[bytes], mtu: int) -> None:
-        """Set the bytes of a full frame to some readers, and on new paths."""
+    def tree_stands(self, readers: Iterable[bytes], mtu: int) -> None:
+        """Note that a tree leads to some readers, with the bytes of a full frame, which also new paths begin with."""
         self._mtu = mtu
         for reader in readers:
             if reader in self._paths:
-                self._paths[reader].set_mtu(mtu)
+                self._paths[reader].tree_stands(mtu)
 
     def governing(self, readers: Iterable[bytes], now_s: float) -> list[ReaderPath]:
-        """Return the paths that govern what leaves for these readers: silent ones only if all are."""
+        """Return the paths that govern what leaves for these readers: one of those that do not, only if none does."""
         paths = [self._paths.get(reader) or self.path(reader, now_s) for reader in readers]
         if len(paths) < 2:
             return paths
-        return [path for path in paths if not path.is_silent] or paths[:1]
+        return [path for path in paths if path.governs_others] or paths[:1]
 
     def fastest(self, readers: Iterable[bytes], now_s: float) -> list[bytes]:
         """Return the one of these readers whose path is the shortest, and has not stalled; none of none."""

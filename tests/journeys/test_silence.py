@@ -1,8 +1,9 @@
-"""Silence of a flow when a border on its path dies, or its switch moves, whatever came and went before."""
+"""Silence of a flow when a border on its path dies, its switch moves or a reader thaws, whatever came before."""
 
 from __future__ import annotations
 
 import random
+from collections import defaultdict
 from functools import partial
 from itertools import pairwise
 
@@ -82,3 +83,33 @@ def test_a_switch_that_moves_to_another_domain_silences_a_flow_for_a_moment_what
     world.network.call(event_s, partial(world.network.set_link, old, up=False))
     world.network.call(event_s + 0.01, partial(world.network.set_link, new, up=True))
     assert silence_s(flow, event_s) <= MOVE_S
+
+
+@momentary
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(4, 16))])
+def test_a_reader_that_was_cut_off_silences_no_other_when_it_is_back_and_is_served_soon(seed: int) -> None:
+    chance = random.Random(seed)
+    links = [Link("a1", "a2"), Link("a1", "a3")]
+    world = network(links, {"a": "123"}, "a1", "a1", "a3", seed)
+    world.add_member("a2/F", "a2", "a")
+    assert world.run_until_attached()
+    flow, lone = flowing(world, source="a1/P", readers=("a3/R", "a2/F")), flowing(world, "/lone", "a1/P", ("a2/F",))
+    freezes_s, lasts_s, every_s = chance.uniform(1.0, 1.5), chance.uniform(0.5, 4.0), 0.2
+    count = round((freezes_s + lasts_s + 5.0) / every_s)
+    for each in (flow, lone):
+        each.stream(count, every_s, size=3_000)
+    begun_s, came_s = world.network.now.mono_s, defaultdict[str, list[float]](list)
+    world.network.call(freezes_s, partial(world.network.freeze, "a2"))
+    world.network.call(freezes_s + lasts_s, partial(world.network.thaw, "a2"))
+
+    def look() -> bool:
+        for label, name in (("a3/R", flow.topic.name), ("a2/F", lone.topic.name)):
+            got = [each for each in world.members[label].poll_messages() if each.topic == name]
+            came_s[label] += [world.network.now.mono_s - begun_s] * len(got)
+        return False
+
+    world.network.run(freezes_s + lasts_s + 6.0, look)
+    assert len(came_s["a3/R"]) == len(came_s["a2/F"]) == count
+    assert max(later - earlier for earlier, later in pairwise(came_s["a3/R"])) < 1.5 * every_s
+    thawed_s = freezes_s + lasts_s
+    assert min(each for each in came_s["a2/F"] if each > thawed_s + every_s) < thawed_s + 1.0

@@ -14,7 +14,7 @@ TRIP_S, STEP_S = 0.01, 0.05
 def test_a_flight_that_is_never_confirmed_is_forgotten_though_others_are() -> None:
     paths, now_s = ReaderPaths(), 10.0
     path = paths.path(READER, now_s)
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     path.sent(
         20 * MTU, 20, now_s
     )  # the lost end of an image: nothing newer of its topic may leave, nothing confirms it
@@ -31,7 +31,7 @@ def test_a_flight_that_is_never_confirmed_is_forgotten_though_others_are() -> No
 
 def test_another_path_begins_with_no_larger_window_than_the_one_before_it() -> None:
     path = ReaderPaths().path(READER, 10.0)
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     path.controller.timed_out(10.0)
     thin = path.controller.window
     path.controller.path_changed(11.0)
@@ -41,7 +41,7 @@ def test_another_path_begins_with_no_larger_window_than_the_one_before_it() -> N
 def test_the_lost_end_of_a_full_window_lets_one_frame_out_whose_report_frees_it() -> None:
     paths, now_s = ReaderPaths(), 10.0
     path = paths.path(READER, now_s)
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     path.acknowledged([path.sent(MTU, 1, now_s)], 0, 0.0, now_s + TRIP_S)
     path.sent(100 * MTU, 100, now_s + TRIP_S)
     assert path.allowance(now_s + TRIP_S) == 0
@@ -60,7 +60,7 @@ def test_the_lost_end_of_a_full_window_lets_one_frame_out_whose_report_frees_it(
 def test_timeouts_that_follow_each_other_double_until_a_round_trip_is_measured() -> None:
     paths, now_s = ReaderPaths(), 10.0
     path = paths.path(READER, now_s)
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     begun_s, timeouts = now_s, list[float]()
     while now_s < begun_s + 12:
         if not path.controller.rate.inflight:
@@ -80,7 +80,7 @@ def test_timeouts_that_follow_each_other_double_until_a_round_trip_is_measured()
 def test_a_reader_node_that_restarted_has_a_new_path_at_once() -> None:
     paths, now_s = ReaderPaths(), 10.0
     path = paths.path(READER, now_s)
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     fresh = PathController(MTU).window
     paths.note_incarnation(READER, 1_000, now_s)
     for _ in range(3):  # it was killed: timeout after timeout
@@ -117,7 +117,7 @@ def test_a_reader_is_behind_when_frames_wait_in_its_own_socket() -> None:
 
 def test_what_leaves_while_another_path_governs_delays_this_one_for_a_moment_only() -> None:
     path, now_s = ReaderPaths().path(READER, 10.0), 10.0
-    path.set_mtu(MTU)
+    path.tree_stands(MTU)
     path.controller.timed_out(now_s)
     for _ in range(600):  # 30 MB to all readers, while this one does not govern
         path.sent(50_000, 34, now_s)
