@@ -232,7 +232,7 @@ KILLED = Plan("chain", 3, 1, (THIN,), False, True, False, 8, 20_000, 1.0, "other
 @pytest.mark.momentary(
     "every trial runs for three leases after its last reader; hypothesis also draws shorter attempts"
 )
-@draws(4)
+@draws(3)
 @given(plans())
 @example(OLDER)
 @example(KILLED)
