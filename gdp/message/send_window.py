@@ -299,10 +299,7 @@ class SendWindow:
         return frames
 
     def _skip_unwanted(self) -> None:
-        """Do not send what no active reader lacks: it has that under its old number, or began later.
-
-        A suspended one gets it as a repair once it reports again.
-        """
+        """Do not send what no active reader lacks; a suspended one gets it as a repair once it reports again."""
         least = self.readers.least_active() if self.readers.active else 0
         while self._unsent and self._unsent[0][0] < least:
             self._sent_at = self.cache.messages[self._unsent.popleft()[0]].end_at
