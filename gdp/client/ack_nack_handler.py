@@ -84,10 +84,10 @@ class AckNackHandler:
             trip_s: round trip of its path; 0: not known.
         """
         queue, ledger = self._queue, self._queue.ledger
-        reader, sequence = self._readers[name], min(acknack.sequence, ledger.last + 1)
+        reader, sequence = self._readers.active[name], min(acknack.sequence, ledger.last + 1)
         if is_new:
             self._drop(name)
-            reader.sequence = sequence or queue.first_waiting
+            reader.sequence = sequence or self._readers.confirmed.get(name) or queue.first_waiting
         if AckNackFlag.BYE in acknack.flags:
             self.forget(name)
             if not self._readers.all():
@@ -137,7 +137,7 @@ class AckNackHandler:
         for name in self._window.slow_readers(now_s):
             if self._readers.is_quiet(name, now_s):
                 self._window.readers.suspend(name)
-                self._readers[name].behind_s = now_s
+                self._readers.active[name].behind_s = now_s
             else:
                 self.exclude(name, now_s)
         for name, reader in self._readers.overdue(now_s):
@@ -151,7 +151,7 @@ class AckNackHandler:
 
     def exclude(self, name: bytes, now_s: float) -> None:
         """Let a slow reader block the others no longer, for a penalty time."""
-        if name in self._window.readers.active or (name in self._readers and not self._queue.is_acknowledged):
+        if name in self._window.readers.active or (name in self._readers.active and not self._queue.is_acknowledged):
             self._readers.suspend_again(name, now_s)
             self._window.drop_reader(name)
             self._heartbeats.wanted = True
@@ -165,12 +165,12 @@ class AckNackHandler:
         Raises:
             StatementError: MALFORMED, ``exchange`` is no key.
         """
-        if name in self._readers:
+        if name in self._readers.active:
             return
         if not self._readers.resume(name, now_s):
             self._readers.record_key(name, incarnation, 0, exchange)
             self._readers.admit(name, incarnation, now_s).sequence = self._queue.first_waiting
-        self._readers[name].behind_s = None
+        self._readers.active[name].behind_s = None
         if name in self._window.readers.suspended:
             self._window.readers.resume(name, now_s)
         else:
@@ -208,7 +208,8 @@ class AckNackHandler:
         self._queue.seal_gathered()  # it is given up, too
         self._queue.ledger.give_up(reader.sequence, self._queue.ledger.last)
         if self._readers.is_suspended(name):
-            self.forget(name)
+            self._readers.give_up(name)
+            self._drop(name)
         else:  # it is alive, and cannot catch up
             self._window.drop_reader(name)
             self._readers.suspend_again(name, now_s)
@@ -225,7 +226,7 @@ class AckNackHandler:
 
     def _start(self, name: bytes, acknack: AckNack, now_s: float) -> None:
         """Choose the first message of a new reader; a repeated request gets the same response."""
-        reader, queue = self._readers[name], self._queue
+        reader, queue = self._readers.active[name], self._queue
         if name not in self._heartbeats.starts and not self._heartbeats.is_full:
             queue.seal_gathered()  # it was published before this reader came
             oldest = self._window.cache.oldest
@@ -241,7 +242,7 @@ class AckNackHandler:
                     begin = min(queue.ledger.first_since(since_s), begin)  # what was published in between is lost
                 if reader.start is not None:  # it is a reader since then: what it did not get since is lost
                     begin = min(reader.start.sequence, begin)
-                reader.start = StreamStart(reader.incarnation, number, begin, reader.confirmed)
+                reader.start = StreamStart(reader.incarnation, number, begin, self._readers.confirmed.get(name, 0))
                 reader.sequence = min(acknack.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
@@ -268,7 +269,7 @@ class AckNackHandler:
         return queue.next_number + queue.deferred.count_before(since_s)
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
-        reader, window, queue = self._readers[name], self._window, self._queue
+        reader, window, queue = self._readers.active[name], self._window, self._queue
         self.lose_ended(window.poll_cancelled(acknack))
         oldest = queue.oldest
         if not (name in window.readers.active or name in window.readers.suspended) and now_s >= reader.out_until_s:

@@ -7,7 +7,7 @@ of a participant share.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import Final
 
 from gdp.client.blocking_readers import BlockingReaders, PathState
@@ -18,7 +18,6 @@ from gdp.client.send_queue import SendQueue
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.intervals import NEVER_S
 from gdp.limits import SPREAD
-from gdp.message.frame_loss import Readers
 from gdp.message.send_window import SendWindow
 from gdp.names import Name
 from gdp.token_bucket import TokenBucket
@@ -185,9 +184,9 @@ class GoverningPaths:
         name = min(paths, key=lambda each: paths[each].allowed_bytes_s)
         return Name(name), paths[name].trip_s, paths[name].allowed_bytes_s
 
-    def measured_readers(self) -> Readers:
+    def measured_readers(self) -> Container[bytes]:
         """Return the readers whose losses protection is for: where the fastest governs, its own alone."""
-        return self.fastest() if self._fastest_governs else self._readers
+        return self.fastest() if self._fastest_governs else self._readers.active
 
     def fastest(self) -> list[bytes]:
         """Return the reader whose path is the shortest; none of none."""
@@ -206,7 +205,7 @@ class GoverningPaths:
             window, following = self._window, self._queue.sent[0]
             keeping_up = [each for each in names if each in window.readers.active]
             return [each for each in keeping_up if not window.readers.is_ahead(each, following)] or keeping_up or names
-        readers, paths = self._readers, self._paths
+        readers, paths = self._readers.active, self._paths
         return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
 
     def confirming(self, frames: Sequence[bytes], again: int) -> list[bytes]:
@@ -222,8 +221,8 @@ class GoverningPaths:
 
     def _present(self) -> list[bytes]:
         """Return the readers whose nodes have not started again since they began to read. Without any, return all."""
-        readers, is_former = self._readers, self._paths.is_former
-        everyone = [*readers.active]
+        readers, is_former = self._readers.active, self._paths.is_former
+        everyone = [*readers]
         if len(everyone) < 2:
             return everyone
         return [name for name in everyone if not is_former(name, readers[name].incarnation_id.started)] or everyone

@@ -125,6 +125,7 @@ class Participant:
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to discover a switch on a port."""
+        self._clock.advance(now.mono_s)
         self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
     def advertise(

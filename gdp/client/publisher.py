@@ -244,7 +244,7 @@ class Publisher:
         """
         mtu = self.queue.mtu = max(mtu, MTU_MIN_BYTES)
         self.matched.is_reachable = True
-        self._node_paths.tree_stands(self.matched, mtu)
+        self._node_paths.tree_stands(self.matched.active, mtu)
         self.protection.late.drop_larger(mtu)
         is_resealed = self.queue.refragment_best_effort(mtu)
         move = self.queue.refragment(mtu)
@@ -306,7 +306,7 @@ class Publisher:
             self.drops[DropReason.SECOND_COPY if is_copy else error.reason] += 1
             return False
         source, hops = header.source, None if header.hops_left & SECOND_PATH else header.hops_left
-        self._node_paths.note_incarnation(source, self.matched[source].incarnation_id.started, now_s)
+        self._node_paths.note_incarnation(source, self.matched.active[source].incarnation_id.started, now_s)
         if self.sent_frames.handle_report(source, report, now_s, waited_s, hops):
             self.drops[DropReason.UNPROVEN] += 1
         self.protection.handle_report(source, report, now_s, is_new=is_new)

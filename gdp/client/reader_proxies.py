@@ -6,13 +6,13 @@ A report opens under a key that depends on its reader's introduction, so no othe
 confirmed.
 
 A reader that is silent for ``READER.lease_s`` is suspended: it may have moved. It does not count as a reader until it
-reports again, and is forgotten ``FORGET_S`` later.
+reports again, and is given up ``FORGET_S`` later. What it had confirmed is remembered: should it start again, it learns
+what it has lost.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -30,7 +30,7 @@ from gdp.names import Name
 __all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
 
 READERS_MAX: Final = 1_024
-_INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered
+_INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered, and readers given up
 _EPOCHS_KEPT: Final = 2  # the one in use and the one before
 _SUSPENSION_MIN_LAGS: Final = 2
 _SUSPENSION_MAX_LAGS: Final = 16
@@ -95,7 +95,6 @@ class ReaderProxy:
         sequence: it has confirmed every message before this one, except ``lost`` of them that it counted as lost.
         advanced_s: when ``sequence`` last rose.
         behind_s: since when its window has been suspended; None: it is not.
-        confirmed: ``sequence`` at the end of a former incarnation; 0: not known.
     """
 
     incarnation: int
@@ -105,7 +104,6 @@ class ReaderProxy:
     lost: int = 0
     advanced_s: float = 0.0
     behind_s: float | None = None
-    confirmed: int = 0
     start: StreamStart | None = None  # None once it has begun to confirm
     out_until_s: float = 0.0  # it must not block the window before
     suspensions: int = 0
@@ -117,6 +115,7 @@ class ReaderProxies:
     Attributes:
         active: those that are not suspended.
         is_reachable: a tree to them is installed.
+        confirmed: ``sequence`` of the last incarnation of a reader that is over, by name; oldest first.
     """
 
     def __init__(self, topic: Name, source: WriterIdentity, patience: ReaderTimeouts = TOPICS) -> None:
@@ -126,19 +125,8 @@ class ReaderProxies:
         self.active: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
+        self.confirmed: dict[bytes, int] = {}
         self.is_reachable = False
-
-    def __len__(self) -> int:
-        return len(self.active)
-
-    def __contains__(self, name: bytes) -> bool:
-        return name in self.active
-
-    def __getitem__(self, name: bytes) -> ReaderProxy:
-        return self.active[name]
-
-    def __iter__(self) -> Iterator[bytes]:
-        return iter([*self.active])
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
@@ -227,18 +215,26 @@ class ReaderProxies:
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
         """Make a known node a reader, in place of a former incarnation of it."""
-        former = self.active.get(name) or self._suspended.pop(name, None)
-        incarnation_id, confirmed = self._incarnation_ids[name, incarnation], 0
-        if former is not None:  # one that never began has reported nothing of what an earlier one lacks
-            confirmed = former.sequence if former.start is None else former.confirmed or former.sequence
-        reading = self.active[name] = ReaderProxy(
-            incarnation=incarnation, incarnation_id=incarnation_id, heard_s=now_s, confirmed=confirmed
-        )
+        self._end(name, self.active.get(name) or self._suspended.pop(name, None))
+        incarnation_id = self._incarnation_ids[name, incarnation]
+        reading = self.active[name] = ReaderProxy(incarnation=incarnation, incarnation_id=incarnation_id, heard_s=now_s)
         return reading
 
     def forget(self, name: bytes) -> bool:
         """Forget a reader, suspended or not; return whether it was one."""
+        self.confirmed.pop(name, None)
         return (self.active.pop(name, None) or self._suspended.pop(name, None)) is not None
+
+    def give_up(self, name: bytes) -> None:
+        """Forget a suspended reader but for what it has confirmed, which counts if it starts again."""
+        self._end(name, self._suspended.pop(name))
+
+    def _end(self, name: bytes, former: ReaderProxy | None) -> None:
+        """Note what an incarnation had confirmed; one that never began says nothing of what an earlier one lacks."""
+        if former is not None and (former.start is None or name not in self.confirmed):
+            self.confirmed[name] = former.sequence
+            if len(self.confirmed) > _INCARNATIONS_MAX:
+                del self.confirmed[next(iter(self.confirmed))]
 
     def introduce(self, header: Header, frame: bytes, secret: bytes) -> None:
         """Process the sealed introduction of a reader; that of a known incarnation is not opened.

@@ -129,7 +129,7 @@ class SendScheduler:
         for publisher, left_of_round in list(self._ordinary.items()):
             publisher.governing_paths.share = publisher.options.share / total
             allowance = publisher.governing_paths.allowance(now_s)
-            is_reserved = bool(reserved) and any(name in publisher.matched for name in reserved)
+            is_reserved = bool(reserved) and any(name in publisher.matched.active for name in reserved)
             if allowance <= 0 or is_reserved:
                 frames += self._poll(publisher, 0, now_s)
                 due_s = min(

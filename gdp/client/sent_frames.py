@@ -83,6 +83,11 @@ class SentFrames:
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
         self._uncounted: dict[int, set[int]] = {}  # fragments sent again to several readers: they give no round trip
 
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Return whether frames have left of which some reader's reports do not show yet what became of them."""
+        return any(reader.flights for reader in self._readers.values())
+
     def leave(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int) -> None:
         """Note frames as in ``sent``; they are entered by ``count``, so that they need not wait for that."""
         self._leaving = frames, names, now_s, again

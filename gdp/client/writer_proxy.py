@@ -161,6 +161,11 @@ class WriterProxy:
         return self._data.drops + self._status.drops
 
     @property
+    def full_parts(self) -> int:
+        """Return how many fragments of full size came, of messages that need several."""
+        return self._data.full_parts
+
+    @property
     def ended(self) -> Ended:
         """Return where it ended, for a later one that continues after it."""
         before, delivery = self._before, self.delivery

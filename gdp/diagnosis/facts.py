@@ -72,11 +72,13 @@ class FlowFact:
         connected: far servers that keep up; ``silent``: far servers that stopped to report.
         messages: local messages taken for the overlay; ``sent``: of these, what left.
         received: messages of the overlay that were published here.
+        full_parts: fragments of full size that came, of messages that need several.
         thinned: messages left out for the rule's ``max_hz``.
         lost: messages lost by reason; ``drops``: frames dropped by reason.
         idle_s: since the last message; None: there was none.
         age_s: since the flow began.
         is_throttled: messages wait for the rule's ``max_bits_s`` now.
+        is_unconfirmed: frames of messages have left, and no report shows so far what became of them.
         governing: the far reader that governs the pace of an exposed topic; empty: one reader, or nothing measured.
         governing_rtt_s: round trip of its path; ``governing_bits_s``: what that path permits.
     """
@@ -116,6 +118,7 @@ class FlowFact:
     messages: int = 0
     sent: int = 0
     received: int = 0
+    full_parts: int = 0
     thinned: int = 0
     lost: Mapping[str, int] = field(default_factory=dict)
     drops: Mapping[str, int] = field(default_factory=dict)
@@ -123,6 +126,7 @@ class FlowFact:
     age_s: float = 0.0
     mtu: int = 0
     is_throttled: bool = False
+    is_unconfirmed: bool = False
     governing: str = ""
     governing_rtt_s: float = 0.0
     governing_bits_s: float = 0.0
@@ -140,6 +144,7 @@ class FlowFact:
             messages=max(self.messages - before.messages, 0),
             sent=max(self.sent - before.sent, 0),
             received=max(self.received - before.received, 0),
+            full_parts=max(self.full_parts - before.full_parts, 0),
             thinned=max(self.thinned - before.thinned, 0),
             lost=_minus(self.lost, before.lost),
             drops=_minus(self.drops, before.drops),

@@ -34,6 +34,9 @@ def arrives(view: View) -> Iterator[Found]:
             thinned = flow.thinned + sum(far.flow.thinned for far in view.exporters)
             left_out = f"; max_hz leaves out {thinned} of {thinned + flow.received} messages" if thinned else ""
             yield f"It arrives {end.place}: last message {age}{rate}{left_out}{_governs(view)}.", ""
+        far = [each.flow for each in view.exporters]
+        if flow.full_parts and not (flow.received or lost or any(e.is_throttled or e.lost or e.faults for e in far)):
+            yield f"It arrives {end.place}: parts of a message came, which is not complete yet{_governs(view)}.", ""
     for end in view.exporters:
         if end.proxy.is_near and not view.importers and end.flow.is_carried and end.flow.readers:
             if end.flow.kind != "topic":
@@ -192,8 +195,9 @@ def mtu_hole(view: View) -> Iterator[Found]:
                 " hears of no reader: short frames pass, long ones do not."
             )
             yield text, f"gdp trace {shlex.quote(view.facts.asked)}"
-        sent = [flow for flow in carried if (flow.sent or flow.messages) and flow.readers]
-        if sent and end.flow.live and not end.flow.received and not end.flow.drops.get("bad-tag"):
+        sent = [flow for flow in carried if flow.is_unconfirmed]  # what waits there says nothing of any link
+        has_come = end.flow.received or end.flow.full_parts
+        if sent and end.flow.live and not has_come and not end.flow.drops.get("bad-tag"):
             mtu = sent[0].mtu or 1_500
             text = (
                 f"Small frames pass, but none with a message arrives {end.place}: a"

@@ -26,7 +26,6 @@ class ReaderPosition:
 
     Attributes:
         acked_at: position before which it has everything.
-        first_number: message with which it began.
         next_number: message before which it has everything.
         last_progress_s: when it last acknowledged something new, or had everything.
         mark_at: what another reader had acknowledged at ``mark_s``; the mark advances when this reader has reached it.
@@ -34,7 +33,6 @@ class ReaderPosition:
     """
 
     acked_at: int
-    first_number: int
     next_number: int
     last_progress_s: float
     mark_at: int
@@ -58,13 +56,12 @@ class ReaderPositions:
         self.active: dict[bytes, ReaderPosition] = {}
         self.suspended: dict[bytes, ReaderPosition] = {}
 
-    def add(self, reader: bytes, acked_at: int, first_number: int, now_s: float) -> None:
+    def add(self, reader: bytes, acked_at: int, next_number: int, now_s: float) -> None:
         """Add an active reader, or restart one."""
         self.suspended.pop(reader, None)
         self.active[reader] = ReaderPosition(
-            acked_at=acked_at, first_number=first_number, next_number=first_number, last_progress_s=now_s,
-            mark_at=acked_at, mark_s=now_s,
-        )  # fmt: skip
+            acked_at=acked_at, next_number=next_number, last_progress_s=now_s, mark_at=acked_at, mark_s=now_s
+        )
 
     def remove(self, reader: bytes) -> bool:
         """Remove a reader; return whether there was one."""
@@ -114,10 +111,6 @@ class ReaderPositions:
         """Return the lowest message number that any reader lacks, suspended or not."""
         least = self.least_active()
         return min([least, *(each.next_number for each in self.suspended.values())]) if self.suspended else least
-
-    def first(self) -> int:
-        """Return the number of the first message that any reader, suspended or not, was to get."""
-        return min((each.first_number for each in self.all()), default=_BEYOND_ALL)
 
     def acknowledge(self, position: ReaderPosition, acked_at: int, now_s: float) -> None:
         """Advance an active reader, and the marks that other readers are measured against."""

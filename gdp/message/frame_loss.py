@@ -9,28 +9,22 @@ and repairs hide it from the messages. The share decays over ``_MEMORY_FRAMES``.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from math import exp
-from typing import Final, Protocol
+from typing import Final
 
 from gdp.frame.codec import NUMBER_AT
 from gdp.intervals import PACE_S
 from gdp.message.acknack import FRAMES_MASK
 
-__all__ = ["FrameLoss", "Readers"]
+__all__ = ["FrameLoss"]
 
 _MEMORY_FRAMES: Final = 1_000
 _LEAST_FRAMES: Final = 64  # before this many were reported, nothing is known
 _MARKS_MAX: Final = 16_384  # message numbers whose place among the sent frames is remembered
 _NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
 _BACKWARDS: Final = FRAMES_MASK >> 1  # a larger step is a count that began again
-
-
-class Readers(Protocol):
-    """The present readers, by name."""
-
-    def __contains__(self, name: bytes, /) -> bool: ...
 
 
 @dataclass(slots=True)
@@ -95,7 +89,7 @@ class FrameLoss:
         """Forget a reader, or a former incarnation of it."""
         self._is_stale |= self._readers.pop(reader, None) is not None
 
-    def loss(self, readers: Readers, now_s: float) -> float | None:
+    def loss(self, readers: Container[bytes], now_s: float) -> float | None:
         """Return the highest share of frames lost to one of ``readers``, 0 to 1; None: not known yet."""
         if self._is_stale and now_s >= self._next_s:
             self._is_stale, self._next_s = False, now_s + PACE_S

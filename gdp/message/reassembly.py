@@ -128,6 +128,7 @@ class Reassembler:
         copies: delay of the second copies, of a source that sends each frame over two paths; None: it does not.
         repeats: copies of urgent frames over one path.
         unfinished_bytes: memory that unfinished messages hold.
+        full_parts: fragments that came of messages of several, without the last ones, which are shorter.
     """
 
     def __init__(
@@ -153,6 +154,7 @@ class Reassembler:
         self.drops: Counter[DropReason] = Counter()
         self.highest = -1  # highest message number of which an authentic fragment came
         self.new_parts = 0
+        self.full_parts = 0
         self.copies: SecondCopies | StripedPaths | None = None
         self.repeats = RepeatedFrames()
         self._under_way = -1  # number of the message whose next fragments are expected
@@ -202,6 +204,7 @@ class Reassembler:
             message.top = first + taken - 1
             message.touched_s = now_s
             self.new_parts += taken
+            self.full_parts += taken
         return taken
 
     def add(self, header: Header, frame: bytes, now_s: float) -> ReassembledMessage | None:
@@ -295,6 +298,7 @@ class Reassembler:
         self._unfinished[number] = message
         self.highest = max(self.highest, number)
         self.new_parts += 1
+        self.full_parts += header.part < header.parts - 1
         message.held_bytes += cost
         message.touched_s = now_s
         message.plain[header.part] = plain

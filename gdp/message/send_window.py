@@ -89,11 +89,6 @@ class SendWindow:
         """Return the message number and the fragment before which everything has been sent."""
         return self._unsent[0] if self._unsent else (self._newest + 1, 0)
 
-    @property
-    def acknowledged(self) -> int:
-        """Return the highest message number that every reader, suspended or not, has acknowledged."""
-        return min(self.readers.least(), self._newest + 1) - 1
-
     def set_history_depth(self, depth: int, next_number: int) -> None:
         """Change how many messages stay for late joiners; ``next_number`` is the lowest that ``add`` will get."""
         self.cache.depth = depth
@@ -178,7 +173,6 @@ class SendWindow:
         positions = self.readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
-            position.first_number = move.new_number(position.first_number)
         self._skip_unwanted()
         for position in positions:
             position.acked_at = position.mark_at = self._sent_at
@@ -208,18 +202,19 @@ class SendWindow:
         self._now_s = now_s
         message = self.cache.messages.get(acknack.next_number)
         position = message.position(acknack.next_part) if message else self.cache.begin_of(acknack.next_number)
+        next_number = min(acknack.next_number, max(self._sent_before, self.sent[0]))  # no reader has more
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
             # the others must not wait for it
             if self.readers.active and position < self.readers.acked_at(self._sent_at):
-                suspended.next_number = max(suspended.next_number, acknack.next_number)
+                suspended.next_number = max(suspended.next_number, next_number)
                 self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()
                 return
             suspended.acked_at = min(position, self._sent_at)
             self.readers.resume(reader, now_s)
         state = self.readers.active[reader]
-        state.next_number = max(state.next_number, acknack.next_number)
+        state.next_number = max(state.next_number, next_number)
         self._skip_unwanted()
         before = self.readers.acked_at(self._sent_at)
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
@@ -304,8 +299,8 @@ class SendWindow:
         return frames
 
     def _skip_unwanted(self) -> None:
-        """Do not send what every reader has received under its old number, nor what is older than all of them."""
-        least = min(self.readers.least(), max(self._sent_before, self.readers.first())) if self.readers.active else 0
+        """Do not send what no active reader lacks; a suspended one gets it as a repair once it reports again."""
+        least = self.readers.least_active() if self.readers.active else 0
         while self._unsent and self._unsent[0][0] < least:
             self._sent_at = self.cache.messages[self._unsent.popleft()[0]].end_at
             for reader in self.readers.active.values():

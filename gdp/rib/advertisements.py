@@ -44,7 +44,6 @@ def receive_advertisement(
     if relayed.domain is not None and member.role is Role.RIB:
         route = replace(route, domain=relayed.domain)
     state.store.put(route)
-    state.former.note_accepted(route)
     state.accepted += 1
     if not isinstance(known, Route):
         who, about = route.advertiser.to_text(), route.name.to_text()

@@ -42,18 +42,12 @@ class FormerAdvertisers:
             del known[next(iter(known))]
         self._gone.put(route.name, known)
 
-    def note_accepted(self, route: Route) -> None:
-        """Forget that an advertiser left, or was refused: it is back."""
-        known = self._gone.get(route.name)
-        if known is not None:
-            known.pop(route.advertiser, None)
-
     def note_refused(self, name: Name, reason: DropReason) -> None:
         """Note why an advertisement of a name was refused."""
         self._refused.put(name, reason.label)
 
     def gone(self, name: Name) -> tuple[GoneFact, ...]:
-        """Return the advertisers of a name that left."""
+        """Return the advertisers of a name that left, those that are back included."""
         return tuple((self._gone.get(name) or {}).values())
 
     def refused(self, name: Name) -> str:

@@ -95,6 +95,7 @@ def answer_for_rib(state: RibState) -> None:
 def rib_facts(rib: RibCoreState, name: Name, now: Timestamps) -> RibFacts:
     """Return what a RIB stores about a name, for a diagnosis. Raises ``StoreError``: the store is away."""
     routes = [route for route in rib.store.routes(name) if route.expires_s > now.mono_s]
+    here = {route.advertiser.to_text() for route in routes}
     return RibFacts(
         name=rib.identity.name.to_text(),
         domain=rib.identity.member.domain.to_text(),
@@ -109,7 +110,7 @@ def rib_facts(rib: RibCoreState, name: Name, now: Timestamps) -> RibFacts:
             )
             for route in routes[:_ROUTES_MAX]
         ),
-        gone=rib.former.gone(name),
+        gone=tuple(each for each in rib.former.gone(name) if each.advertiser not in here),
         refused=rib.former.refused(name),
     )
 

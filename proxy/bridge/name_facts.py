@@ -247,6 +247,7 @@ def _overlay(member: Participant, name: Name, right: Right, now: Timestamps) -> 
         "absent": 0 if subscription is None else len(subscription.absent),
         "is_reliable": not any(each.delivery.is_reliable is False for each in proxies),
         "drops": drops,
+        "full_parts": sum(each.full_parts for each in proxies),
     }
     if right in (Right.SERVE, Right.CALL):
         known |= {
@@ -273,6 +274,7 @@ def _exposed(flow: ExposedTopic, now: Timestamps) -> dict[str, object]:
             "is_reliable": publisher.confirms,
             "mtu": publisher.queue.mtu or 0,
             "is_throttled": publisher.governing_paths.is_limited(now.mono_s),
+            "is_unconfirmed": publisher.sent_frames.is_unconfirmed,
         }
         if (governing := publisher.governing_paths.governing_reader()) is not None:
             reader, rtt_s, bytes_s = governing

@@ -199,11 +199,11 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
 def snapshot(pipe: Pipe) -> object:
     """Return the state of a publisher that control datagrams can change."""
     publisher = pipe.publisher
-    readers = {name: publisher.matched[name] for name in publisher.matched}
+    readers = dict(publisher.matched.active)
     states = {name: (each.incarnation, each.heard_s, each.sequence, each.lost) for name, each in readers.items()}
     return (
         states,
-        publisher._window.acknowledged,
+        publisher._window.readers.least(),
         len(publisher._window.readers.active),
         dict(publisher._heartbeats.starts),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from unittest.mock import patch
 
 import pytest
 from hypothesis import example, given, settings
@@ -166,6 +167,22 @@ def test_a_reader_that_starts_again_counts_what_came_between_its_lives() -> None
     stream(pipe, 1.0)
     assert list(second.writer_proxy.losses.ranges) == [LostRange(11, 40, LossReason.READER_RESTARTED)]
     assert sequences(second) == list(range(41, 51))
+
+
+def test_a_reader_that_starts_again_after_it_was_given_up_counts_what_came_between_its_lives() -> None:
+    pipe = Pipe(publisher_of())
+    (first,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.run(2.0)
+    silence(first, is_silent=True)
+    stream(pipe, 1.0)
+    pipe.run(FORGET_S + READER.lease_s + 2.0)
+    stream(pipe, 1.0)
+    second = pipe.join(b"a", incarnation=8)
+    pipe.run(2.0)
+    stream(pipe, 1.0)
+    assert list(second.writer_proxy.losses.ranges) == [LostRange(11, 30, LossReason.READER_RESTARTED)]
+    assert sequences(second) == list(range(31, 41))
 
 
 def test_a_reader_that_said_goodbye_has_lost_nothing_when_it_comes_again() -> None:
@@ -349,4 +366,21 @@ def test_a_reader_that_is_killed_again_before_it_began_counts_what_it_lacks_sinc
     stream(pipe, 1.0)
     pipe.run(1.0)
     assert got(end) == list(range(10))
+    assert third.writer_proxy.losses.counts == {LossReason.READER_RESTARTED: got(third)[0] - 10}
+
+
+def test_a_reader_that_is_killed_while_too_many_begin_counts_what_it_lacks_since_it_last_did() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.run(1.0)
+    silence(end, is_silent=True)
+    stream(pipe, 1.0, size=4_000)  # too large to wait for a bundle
+    with patch("gdp.client.heartbeat_schedule.STARTS_MAX", 0):
+        pipe.join(b"a", incarnation=8)
+        pipe.run(0.5)
+        third = pipe.join(b"a", incarnation=9)
+        pipe.run(0.5)
+    stream(pipe, 1.0)
+    pipe.run(1.0)
     assert third.writer_proxy.losses.counts == {LossReason.READER_RESTARTED: got(third)[0] - 10}

@@ -123,6 +123,16 @@ def test_the_last_messages_of_a_latched_topic_come_again_to_who_reads_it_again()
     assert [each.message for each in got + flow.got[SERVER]] == [b"the map"] * 2
 
 
+def test_who_reads_before_its_first_event_has_waited_since_then() -> None:
+    world = ring()
+    member = world.restart_member(SERVER)
+    topic = world.topic("/chatter", member, [Right.READ])
+    member.subscribe(topic)
+    subscription = member.subscriptions.get(topic.name)
+    assert subscription is not None
+    assert subscription.since_s == world.network.now.mono_s
+
+
 def test_a_topic_is_read_once_at_a_time() -> None:
     flow = flowing(ring())
     reader = flow.world.members[SERVER]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import pytest
 
@@ -50,6 +51,31 @@ def test_the_reader_that_governs_a_topic_is_named_with_its_path(side: str) -> No
     assert answer.cause is Cause.ARRIVES
     named = f"the slowest reader, proxy {Name.from_text(FAR).short}, governs (round trip 42 ms, 3.1 Mbit/s)"
     assert named in answer.sentence
+
+
+EXPOSED: Final = replace(FLOW, side="expose", messages=8, sent=8, readers=1, mtu=1_500)
+
+
+def between(exposed: FlowFact, imported: FlowFact = FLOW) -> Facts:
+    """Return the facts of a topic's two ends: the reader is known, and got nothing just now."""
+    far = replace(PROXY, name=FAR, is_near=False, flows=(exposed,))
+    return Facts(asked="/a", proxies=(replace(PROXY, flows=(imported,)), far), window_s=1.0)
+
+
+def test_frames_that_no_report_confirms_while_none_of_full_size_comes_show_a_narrow_link() -> None:
+    answer = diagnose(between(replace(EXPOSED, is_unconfirmed=True)))
+    assert answer.cause is Cause.MTU_HOLE
+    assert "less than the 1500 bytes that it states" in answer.sentence
+
+
+def test_a_queue_of_what_no_reader_gets_says_nothing_of_a_link() -> None:
+    assert diagnose(between(EXPOSED)).cause is not Cause.MTU_HOLE  # all of it was older than the reader
+
+
+def test_a_message_that_is_on_its_way_for_long_says_nothing_of_a_link() -> None:
+    answer = diagnose(between(replace(EXPOSED, is_unconfirmed=True), replace(FLOW, full_parts=40)))
+    assert answer.cause is Cause.ARRIVES
+    assert "not complete yet" in answer.sentence
 
 
 @pytest.mark.parametrize(("other", "cause"), [(SWITCH, Cause.ETHERTYPE_FILTERED), (RIB, Cause.LINK_SILENT)])

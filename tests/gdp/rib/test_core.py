@@ -43,12 +43,14 @@ from tests.gdp.trust.world import (
     adcert,
     advertisement,
 )
+from tests.visited import visited
 
 RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 UPPER = NodeKeys.generate(Role.RIB, "upper").join(CLOUD, DAY)
 OTHER_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc2").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 NAME = CAMERA.name
+FILES_OF_A_STATEMENT = {"advertisement": 8, "withdrawal": 9}  # they only fall
 
 
 def at(mono_s: float, unix_s: float = NOW) -> Timestamps:
@@ -692,3 +694,16 @@ def test_a_rib_outlives_a_shared_store_and_a_tier_above_that_are_both_away() -> 
     assert at_rib.state.refusals[DropReason.UNAVAILABLE] > 0
     store.is_away = False
     assert store.get(NAME, ROBOT.name) is not None
+
+
+@pytest.mark.parametrize("kind", FILES_OF_A_STATEMENT)
+def test_a_relayed_statement_visits_few_files(kind: str) -> None:
+    at_rib, seen = rib(upper=UPPER.name), set[str]()
+    ask(at_rib, OTHER_SWITCH, watch_s=60.0)
+    statement = advertisement()
+    if kind == "withdrawal":
+        tell(at_rib, statement)
+        statement = withdrawal(2)
+    visited("rib", seen, lambda: at_rib.receive(relay(statement), SWITCH.name, START))
+    assert {each.to for each in at_rib.statements_to_send()} == {SWITCH.name, OTHER_SWITCH.name, UPPER.name}
+    assert len(seen) <= FILES_OF_A_STATEMENT[kind], sorted(seen)

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from unittest.mock import patch
+
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, encode
+from gdp.frame.codec import Header, decode, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.intervals import NEGATIVE_LEASE_S
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
+from gdp.sansio import ReceivedFrame, Timestamps
 from gdp.switch.table import NOWHERE
 from gdp.switch.unicast import _Installed
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, flowing, ring
+from tests.visited import visited
 
 ABSENT = Name(b"?" * 32)
+FILES_OF_A_MISS = 24  # all that run in the calls that carry it; it only falls
 
 
 def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = Kind.ACKNACK) -> None:
@@ -98,3 +104,25 @@ def test_what_is_remembered_of_entries_goes_with_them() -> None:
     assert all(not why.is_negative for why in nuc1.unicast._installed.values())
     assert set(nuc1.unicast._installed) == {key for keys in nuc1.unicast._keys_of.values() for key in keys}
     assert set(nuc1.unicast._installed) <= set(nuc1.table.entries)
+
+
+def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
+    world = ring()
+    nuc1, server, seen = world.switches["nuc1"], world.members[SERVER].name, set[str]()
+    receive, send_due = nuc1.receive, nuc1.rib_client.send_due
+
+    def received(arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
+        kinds = {decode(each.frame).kind for each in arrivals}
+        is_of_it = kinds & {Kind.ACKNACK, Kind.RIB_ANSWER}
+        visited("switch", seen if is_of_it else set(), lambda: receive(arrivals, now))
+
+    with (
+        patch.object(nuc1, "receive", received),
+        patch.object(nuc1.rib_client, "send_due", lambda now_s: visited("switch", seen, lambda: send_due(now_s))),
+    ):
+        send(world, server)
+        world.network.run(0.0005)
+        assert len(nuc1.resolver.pending) == 1
+        assert world.network.run(1.0, lambda: not len(nuc1.resolver.pending))
+    assert nuc1.table.entries[server + world.members[ROBOT].name]
+    assert len(seen) <= FILES_OF_A_MISS, sorted(seen)

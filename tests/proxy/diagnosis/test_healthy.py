@@ -100,6 +100,17 @@ def test_a_former_fault_is_no_fault(stage: Stage) -> None:
     assert stage.explain().cause is Cause.ARRIVES
 
 
+def test_a_message_that_takes_longer_than_two_samples_are_apart_is_on_its_way(stage: Stage) -> None:
+    stage.add()
+    stage.listen()
+    stage.sites.world.leads[ROBOT].bytes_s = 20_000
+    stage.talk(hz=0.2, size=60_000)  # each takes three seconds
+    stage.run(11.0)
+    answer = stage.explain()
+    assert answer.cause is Cause.ARRIVES
+    assert "not complete yet" in answer.sentence
+
+
 def stage_rule() -> str:
     return "name: /chatter, type: std_msgs/msg/String"
 
