@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from gdp.client.governing_paths import GoverningPaths
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
@@ -46,14 +48,18 @@ class ThinPath(GoverningPaths):
         pass
 
 
+class Names(dict[bytes, Any]):
+    """All names."""
+
+    def __contains__(self, name: object) -> bool:
+        return True
+
+
 class Everyone(ReaderProxies):
     """Readers on every node."""
 
     def __init__(self) -> None:
-        pass
-
-    def __contains__(self, name: bytes) -> bool:
-        return True
+        self.active = Names()
 
 
 class Flood(Publisher):
