@@ -1,4 +1,4 @@
-"""Hardware requirements, independent of providers: ``cpu:16``, ``mem:64``, ``T4``, ``gpu:A100:2``, ``cpu:4,mem:16``.
+"""Hardware requirements, independent of providers (``cpu:16``, ``T4``, ``gpu:A100:2``, ``cpu:4,mem:16``), and offers.
 
 Sans-I/O.
 """
@@ -6,12 +6,12 @@ Sans-I/O.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["Hardware"]
+__all__ = ["Hardware", "Offer"]
 
 GPUS: Final = ("T4", "L4", "A10G", "V100", "A100", "H100", "K80", "P100", "P4", "L40S")
 _FORM: Final = "cpu:N, mem:GiB, a GPU such as T4, or gpu:T4:2; several with commas between"
@@ -70,3 +70,16 @@ class Hardware:
             and other.memory_gib >= self.memory_gib
             and (not self.gpu or (other.gpu == self.gpu and other.gpus >= self.gpus))
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """One line of a provider's price list: a machine type in a region."""
+
+    provider: str
+    region: str
+    type_name: str
+    hardware: Hardware
+    _: KW_ONLY
+    is_spot: bool
+    usd_per_hour: float

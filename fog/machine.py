@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 
-from fog.offer import Offer
+from fog.hardware import Offer
 
 __all__ = ["Machine", "MachineBundle", "MachineSpec", "MachineState", "Program"]
 

@@ -8,9 +8,8 @@ from typing import Final
 
 import yaml
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState, Program
-from fog.offer import Offer
 from fog.providers.local.netlinks import UP
 from fog.providers.local.provider import LocalProvider
 from gdp.crypto.certificates import Role

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 
 __all__ = ["AwsPrices", "aws_offers", "aws_prices"]
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from fog.hardware import GPUS, Hardware
-from fog.offer import Offer
+from fog.hardware import GPUS, Hardware, Offer
 
 __all__ = ["LOCAL_REGIONS", "local_offers"]
 

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 from fog.catalog.aws import aws_offers
 from fog.catalog.local import LOCAL_REGIONS, local_offers
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from gdp.errors import LocalError
 
 __all__ = ["PROVIDERS", "price_list", "regions_of"]

@@ -14,9 +14,8 @@ from typing import Final
 from fog.catalog.measured import measured
 from fog.catalog.prices import PROVIDERS, regions_of
 from fog.cluster import ClusterPlan, MachineRequest
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.latency.known import Latencies, Latency
-from fog.offer import Offer
 from fog.plan.choice import choose
 from fog.plan.target import Target, machines_for
 from fog.providers.provider import Provider

@@ -17,8 +17,7 @@ from fog.catalog.measured import measured
 from fog.catalog.prices import price_list, regions_of
 from fog.cli.options import SiteFile, State
 from fog.cli.views import a_console, latency_lines, ms_text
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from fog.plan.answer import Answer, Question, answer
 from fog.plan.choice import BY_BOTH, Weights
 from fog.plan.cost import HOURS_A_MONTH

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fog.cluster import MachineRequest
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from fog.plan.choice import BY_BOTH, Choice, Weights, choose
 from fog.plan.correlation import joint_over_regions
 from fog.plan.duration import duration_text

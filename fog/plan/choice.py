@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fog.cluster import MachineRequest
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from gdp.errors import LocalError
 
 __all__ = ["BY_BOTH", "Choice", "Weights", "choose"]

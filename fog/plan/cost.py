@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from fog.offer import Offer
+from fog.hardware import Offer
 
 __all__ = ["HOURS_A_MONTH", "Bill", "compared"]
 

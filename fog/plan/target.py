@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from fog.cluster import MachineRequest
-from fog.offer import Offer
+from fog.hardware import Offer
 from fog.plan.answer import assumptions
 from fog.plan.choice import Choice, choose
 from fog.plan.correlation import joint_over_regions

@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineBundle, MachineSpec
-from fog.offer import Offer
 
 __all__ = ["AccountProvider", "GatewayProvider", "Provider"]
 

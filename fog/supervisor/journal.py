@@ -16,9 +16,8 @@ from typing import Final
 
 from fog.cluster import ClusterPlan, MachineRequest
 from fog.credentials import IssuedCredentials
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineSpec, MachineState
-from fog.offer import Offer
 from fog.supervisor.core.record import Outcome, Record
 from gdp.errors import LocalError, StoreError
 from gdp.stores.transactions import TransactionFile

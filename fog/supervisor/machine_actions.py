@@ -13,9 +13,9 @@ from typing import Final
 from fog.bootstrap.bundles import node_names
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
 from fog.credentials import IssuedCredentials
+from fog.hardware import Offer
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
-from fog.offer import Offer
 from fog.plan.choice import Choice
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Final
 
 from fog.cluster import MachineRequest
-from fog.offer import Offer
+from fog.hardware import Offer
 from fog.plan.choice import Choice, choose
 from fog.supervisor.core.record import Outcome, Record
 from gdp.intervals import HOUR_S

@@ -35,7 +35,7 @@ from gdp.errors import LocalError, StoreError
 from gdp.host.processes import Process
 from gdp.host.service_notifier import service_notifier
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
-from gdp.ports.listening import listen_tcp
+from gdp.ports.tcp_server import listen_tcp
 
 __all__ = ["supervise"]
 

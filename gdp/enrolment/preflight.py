@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT
+from gdp.ports.tcp_server import listen_tcp
 from gdp.ports.tunnel.keeper_process import KeeperProcess
 
 __all__ = ["check_ports", "check_tunnels"]

@@ -31,8 +31,7 @@ from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.intervals import DAY_S
 from gdp.limits import ADDRESS_CONNECTIONS_RATE, CONNECTIONS_RATE
 from gdp.management.control_socket import short_path
-from gdp.ports.client_network import client_network
-from gdp.ports.listening import listen_tcp
+from gdp.ports.tcp_server import client_network, listen_tcp
 from gdp.token_bucket import TokenBucket, TokenBuckets
 from gdp.trust.enrolment_wire import (
     LENGTH_BYTES,

@@ -24,10 +24,9 @@ from gdp.links.relay_hello import HelloWait, hand_over
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_loop import RelayLoop
 from gdp.names import Name
-from gdp.ports.client_network import client_network
-from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tap import TapDevice, tap_name
+from gdp.ports.tcp_server import client_network, listen_tcp
 from gdp.relay.admission import ClientAdmission, verified_switch
 from gdp.relay.connection import ConnectionCounters, Limits, RelayConnection
 from gdp.sansio import Timestamps

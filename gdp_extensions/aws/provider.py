@@ -18,10 +18,9 @@ from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Final, cast
 
 from fog.catalog.prices import price_list
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec, Program
-from fog.offer import Offer
 from fog.providers.aws_config import AwsConfig
 from fog.providers.cloud_init import lines_of, user_data
 from fog.site import Site

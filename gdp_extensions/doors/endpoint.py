@@ -27,8 +27,8 @@ from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
 from gdp.intervals import FORGET_S
-from gdp.ports.listening import listen_tcp
 from gdp.ports.socket_owners import SocketOwners
+from gdp.ports.tcp_server import listen_tcp
 from gdp_extensions.doors.core.arrivals import Arrivals
 from gdp_extensions.doors.core.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
 from gdp_extensions.doors.core.hub import DoorSession, Hub

@@ -15,10 +15,9 @@ from importlib import import_module
 from types import ModuleType
 from typing import Final
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec
-from fog.offer import Offer
 from fog.providers.cloud_init import lines_of, shell_script
 from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import Site

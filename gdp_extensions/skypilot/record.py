@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineSpec, MachineState
-from fog.offer import Offer
 from gdp.errors import LocalError
 
 __all__ = ["LAUNCH", "Request", "Status", "being_made", "cluster_name", "labels_of", "machine_of"]

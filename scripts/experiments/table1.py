@@ -19,8 +19,7 @@ from report import markdown_table, print_table
 from skeleton import Options
 
 from fog.catalog.aws import aws_prices
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from fog.plan.cost import Bill, compared
 from gdp.errors import LocalError
 

@@ -10,9 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineSpec
-from fog.offer import Offer
 
 __all__ = ["MachineFile"]
 

@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import Final
 
 from fog.catalog.local import LOCAL_REGIONS, local_offers
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.host.bounded_log import last_lines
 from fog.host.bundle import install
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
-from fog.offer import Offer
 from fog.providers.local.fault_injection import hold, is_sold_out, kill
 from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.machine_handle import LocalMachine, find, list_machines

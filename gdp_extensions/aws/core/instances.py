@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineSpec, MachineState
-from fog.offer import Offer
 from gdp.errors import LocalError
 
 if TYPE_CHECKING:

@@ -11,10 +11,9 @@ import pytest
 
 from fog.cli import launch_view
 from fog.cli.launch_view import Priced, loaded_from, priced, show_plan
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.latency.known import Latency
 from fog.launch.load import Loaded
-from fog.offer import Offer
 from tests.fog.launch.test_load import LISTING, written
 from tests.pages import ROOT
 

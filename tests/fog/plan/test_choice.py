@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fog.cluster import MachineRequest
-from fog.hardware import Hardware
-from fog.offer import Offer
+from fog.hardware import Hardware, Offer
 from fog.plan.choice import Weights, choose
 from fog.plan.cost import compared
 from gdp.errors import LocalError

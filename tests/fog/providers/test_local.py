@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.host.preemption_notice import write_notice
 from fog.host.status import Status
 from fog.machine import MachineBundle, MachineSpec, MachineState
-from fog.offer import Offer
 from fog.providers.local import fault_injection
 from fog.providers.local.delay import DelayLine
 from fog.providers.local.machine_file import MachineFile

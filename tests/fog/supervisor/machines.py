@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 
 from fog.cluster import MachineRequest
 from fog.credentials import IssuedCredentials
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineSpec, MachineState
-from fog.offer import Offer
 from fog.supervisor.core.reconcile import Drain, Launch, Release, Timeouts, decide
 from fog.supervisor.core.record import Record, update_record
 from fog.supervisor.placement import place

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from fog.bootstrap.domain_members import DomainMembers
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineBundle, MachineSpec
-from fog.offer import Offer
 from fog.scaling import policy_from_keys
 from fog.site import Site, open_site
 from fog.supervisor.core.reconcile import Drain, Launch, Timeouts, decide

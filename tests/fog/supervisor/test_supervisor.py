@@ -12,9 +12,8 @@ import yaml
 
 from fog.bootstrap.domain_members import DomainMembers
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
-from fog.offer import Offer
 from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor

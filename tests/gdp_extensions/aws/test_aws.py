@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
-from fog.offer import Offer
 from fog.providers.aws_config import AwsConfig, Ssh
 from fog.providers.cloud_init import Setup
 from gdp.errors import LocalError, StoreError

@@ -19,9 +19,8 @@ from sky.utils import rich_utils
 
 from fog.bootstrap.bundles import machine_boot
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineSpec
-from fog.offer import Offer
 from fog.providers.skypilot_config import SkyPilotConfig
 from gdp.errors import GdpError
 from gdp.trust.join_token import JoinRole, JoinToken

@@ -18,9 +18,8 @@ from types import SimpleNamespace
 import pytest
 from pydantic import ValidationError
 
-from fog.hardware import Hardware
+from fog.hardware import Hardware, Offer
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
-from fog.offer import Offer
 from fog.providers.skypilot_config import SkyPilotConfig
 from gdp.errors import LocalError, StoreError
 from gdp_extensions.skypilot.provider import SkyPilotProvider

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.ports.client_network import client_network
+from gdp.ports.tcp_server import client_network
 
 
 @pytest.mark.parametrize("same", ["2001:db8:0:1::7", "2001:db8:0:1:ffff:ffff:ffff:ffff", "2001:db8:0:1::1%eth0"])
