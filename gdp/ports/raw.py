@@ -17,9 +17,10 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Final
 
+from gdp import burst
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import (
     ETHER_BYTES,
@@ -37,7 +38,7 @@ from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.plane import Port, ReceivedFrame
 from gdp.ports.sockets import (
     TrafficClass,
     attach_drop_all_filter,
@@ -66,12 +67,6 @@ _CLASSES: Final = (
     TrafficClass.GUEST,
 )  # in the order of service
 _GREETINGS: Final = Rate(500.0, burst=128.0)  # per second, and at once; each costs at most 30 us before its rejection
-
-
-@lru_cache(maxsize=4_096)  # more than the number of frequent sizes
-def _shape(size: int) -> struct.Struct:
-    """Return the struct that reads the sender's address and a frame of ``size`` bytes from a slot."""
-    return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
 def _traffic_class_of(frame: bytes) -> TrafficClass:
@@ -225,13 +220,8 @@ class RawPlane(NetdevPlane):
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
         self._came[port] += len(sizes)
-        pool, arrivals, waited = batch.pool, self._arrivals, waited_s(source) if sizes else 0.0
-        for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
-            mac, frame = _shape(size).unpack_from(pool, slot)
-            arrivals.append(ReceivedFrame(port, mac, frame, waited))
-
-    def _arrival(self, port: int, slot: int, size: int) -> ReceivedFrame:
-        return ReceivedFrame(port, *_shape(size).unpack_from(self._batch.pool, slot))
+        if sizes:
+            self._arrivals += burst.received(batch.pool, batch.slot_bytes, sizes, port, waited_s(source))
 
     def _forward_all(
         self,
@@ -294,7 +284,8 @@ class RawPlane(NetdevPlane):
             batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
             self._send(sinks, decision.hops, slot, 1)
         else:
-            self._arrivals.append(self._arrival(port, at, size))
+            slot_of_one = batch.pool[at : at + ETHER_BYTES + size]
+            self._arrivals += burst.received(slot_of_one, len(slot_of_one), [size], port, 0.0)
 
     def _send(self, sinks: Mapping[int, socket.socket], hops: Hops, first: int, count: int) -> None:
         """Send a run of slots to every hop."""
