@@ -7,23 +7,22 @@ over OpenSSL's libcrypto; ``scripts/setup.sh`` builds it where a compiler is. Te
 Attributes:
     CIPHER: the cipher of a message.
     received: makes received frames of the slots of a pool.
+    runs: finds the slots that leave together.
     VARIANT: which twins are in use, in words.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final
 
-from gdp.burst import slots
 from gdp.burst.cipher import MessageCipher
-from gdp.sansio import ReceivedFrame
+from gdp.burst.slots import received, runs
 
-__all__ = ["CIPHER", "VARIANT", "received"]
+__all__ = ["CIPHER", "VARIANT", "received", "runs"]
 
-_INTERFACE: Final = 1  # as in ``core.c``
+_INTERFACE: Final = 2  # as in ``core.c``
 
 
 def _compiled() -> Any:
@@ -36,8 +35,7 @@ def _compiled() -> Any:
 
 
 _core: Final = _compiled()
-CIPHER: type[MessageCipher] = MessageCipher if _core is None else _core.MessageCipher
-received: Callable[[bytearray, int, list[int], int, float], list[ReceivedFrame]] = (
-    slots.received if _core is None else _core.received
-)
-VARIANT: Final = "Python" if _core is None else f"compiled, {_core.LIBRARY}"
+CIPHER, VARIANT = MessageCipher, "Python"
+if _core is not None:
+    CIPHER, received, runs = _core.MessageCipher, _core.received, _core.runs
+    VARIANT = f"compiled, {_core.LIBRARY}"

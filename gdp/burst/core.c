@@ -22,13 +22,16 @@
 #include <string.h>
 
 enum {
-    INTERFACE = 1, /* raised with each change of what Python calls */
+    INTERFACE = 2, /* raised with each change of what Python calls */
     FLAGS_AT = 2,
     HOPS_AT = 3,
     LENGTH_AT = 6,
     NUMBER_AT = 8,
     PART_AT = 16,
     PARTS_AT = 20,
+    DESTINATION_AT = 32,
+    DESTINATION = 32,
+    ENDS = 64, /* destination and source */
     HEADER = 96,
     SALT = 8,
     BODY_AT = HEADER + SALT,
@@ -37,6 +40,10 @@ enum {
     MAC = 6,
     KEY = 32,
     FLAG_LAST = 0x01,
+    VERSION = 1,
+    CONTROL_FROM = 0x80,
+    HOPS_MASK = 0x7f,
+    SECOND_PATH = 0x80,
     FRAME_MAX = 65535,
 };
 
@@ -387,7 +394,54 @@ static PyObject *received(PyObject *module, PyObject *args)
     return list;
 }
 
+/* Writes the key of a frame in the forwarding table; returns 0 if it is for the node itself, or not in order. */
+static int key_of(const uint8_t *frame, Py_ssize_t size, uint8_t *key)
+{
+    uint8_t hops = frame[HOPS_AT];
+    if (frame[0] != VERSION || frame[1] >= CONTROL_FROM || (hops & HOPS_MASK) <= 1 ||
+        HEADER + (frame[LENGTH_AT] << 8 | frame[LENGTH_AT + 1]) > size)
+        return 0;
+    memcpy(key, frame + DESTINATION_AT, ENDS);
+    if (hops & SECOND_PATH)
+        key[DESTINATION - 1] ^= 1;
+    return 1;
+}
+
+static PyObject *runs(PyObject *module, PyObject *args)
+{
+    PyObject *pool, *sizes;
+    Py_ssize_t slot_bytes, first = 0, largest = 0;
+    uint8_t key[ENDS] = {0}, run_key[ENDS] = {0};
+    int has_key = 0, had_key = 0;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "YnO!:runs", &pool, &slot_bytes, &PyList_Type, &sizes))
+        return NULL;
+    Py_ssize_t count = PyList_Size(sizes);
+    if (slot_bytes < ETHER + HEADER || count > PyByteArray_Size(pool) / slot_bytes)
+        return refusal("as many slots as the pool has");
+    PyObject *found = PyList_New(0);
+    for (Py_ssize_t slot = 0; found != NULL && slot <= count; slot++) {
+        Py_ssize_t size = slot < count ? PyNumber_AsSsize_t(PyList_GetItem(sizes, slot), NULL) : 0;
+        if (slot < count)
+            has_key = key_of((const uint8_t *)PyByteArray_AsString(pool) + slot * slot_bytes + ETHER, size, key);
+        if (slot && (slot == count || !has_key || !had_key || memcmp(key, run_key, ENDS))) {
+            PyObject *run = Py_BuildValue("nny#n", first, slot - first, run_key, (Py_ssize_t)(had_key ? ENDS : 0), largest);
+            if (run == NULL || PyList_Append(found, run) < 0)
+                Py_CLEAR(found);
+            Py_XDECREF(run);
+            first = slot;
+        }
+        largest = first == slot || size > largest ? size : largest;
+        had_key = has_key;
+        memcpy(run_key, key, ENDS);
+    }
+    if (PyErr_Occurred())
+        Py_CLEAR(found);
+    return found;
+}
+
 static PyMethodDef functions[] = {
+    {"runs", runs, METH_VARARGS, "As slots.runs."},
     {"received", received, METH_VARARGS, "As slots.received."},
     {NULL, NULL, 0, NULL},
 };

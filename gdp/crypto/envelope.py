@@ -19,7 +19,6 @@ tag. A stream under a session secret (``session_seal.py``) has no signature: onl
 from __future__ import annotations
 
 import hashlib
-import struct
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol, overload
 
@@ -31,18 +30,20 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import VERSION, Flag
+from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, HOPS_AT, LENGTH_AT, NUMBER_AT, PART_AT, PARTS_AT, Header, encode
+from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 from gdp.sansio import ReceivedFrame
 
 __all__ = [
     "SALT_BYTES",
     "SEAL_BYTES",
+    "SHARED_FLAGS",
     "SIGNATURE_BYTES",
     "TAG_BYTES",
     "KeyContext",
     "MessageKeys",
+    "Opened",
     "Opener",
     "Sealed",
     "Sealer",
@@ -56,8 +57,8 @@ __all__ = [
 SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its ciphertext
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
-_COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
 _LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a microsecond each
+SHARED_FLAGS: Final = 0xFF & ~_LAST  # of all parts of a message
 _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
 
 
@@ -124,23 +125,11 @@ def fragment_capacity(mtu: int) -> int:
     return capacity
 
 
-def digest_of(header: Header, salt: bytes) -> hashlib._Hash:
+def digest_of(frame: bytes) -> hashlib._Hash:
     """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
-    return hashlib.sha256(
-        b"gdp-message-2"
-        + _COMMON.pack(
-            VERSION,
-            header.kind,
-            header.flags & ~_LAST,
-            header.epoch,
-            header.number,
-            header.parts,
-            header.incarnation,
-            header.destination,
-            header.source,
-        )
-        + salt
-    )
+    flags = bytes([frame[FLAGS_AT] & SHARED_FLAGS])
+    numbers = frame[HOPS_AT + 1 : LENGTH_AT] + frame[NUMBER_AT:PART_AT]
+    return hashlib.sha256(b"gdp-message-2" + frame[:FLAGS_AT] + flags + numbers + frame[PARTS_AT:BODY_AT])
 
 
 class Sealer:
@@ -226,7 +215,7 @@ class Sealed(Sequence[bytes]):
             self._message, self.message_bytes = b"", message.message_bytes
             self._origin = message._origin or message
         self._capacity = capacity
-        self._running = None if signer is None else digest_of(header, salt)
+        self._running = None if signer is None else digest_of(self._head)
         self._frames: list[bytes] = []
         self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
@@ -276,6 +265,10 @@ class Sealed(Sequence[bytes]):
             self._message = b""  # the frames hold all of it now
 
 
+# Plaintext; ciphertext and tag, as the signature covers them; signature of a signed last part.
+Opened = tuple[bytes, bytes, bytes]
+
+
 class Opener:
     """Opens the parts of one kind of message of one source's incarnation, under one epoch's key.
 
@@ -308,8 +301,8 @@ class Opener:
         cipher = self._cipher_of(head[HEADER_BYTES:])
         return cipher.open_run(head, length, first, count, arrivals, at, self._signature_bytes > 0)
 
-    def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
-        """Return plaintext, ciphertext and tag as the signature covers them, and the signature of a signed last part.
+    def open(self, header: Header, frame: bytes) -> Opened:
+        """Open a part.
 
         Args:
             header: of this frame, already decoded.

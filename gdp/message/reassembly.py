@@ -21,9 +21,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from gdp.burst.cipher import BODY_AT
-from gdp.crypto.envelope import Opener, digest_of, salt_of
+from gdp.crypto.envelope import SHARED_FLAGS, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header, encode
+from gdp.frame.codec import DESTINATION_AT, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
@@ -35,8 +35,7 @@ from gdp.sansio import ReceivedFrame
 __all__ = ["ALL_PARTS", "SCAN_PARTS", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
-_SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
-_URGENT = int(Flag.URGENT)
+_URGENT = int(Flag.URGENT)  # a plain number: an IntFlag's operators cost a microsecond each
 _PREPAID_BYTES = 32 << 10  # memory is reserved ahead for this many bytes of a message whose fragments come in order
 _PART_OVERHEAD_BYTES = 128  # overhead of a kept fragment, in addition to its bytes
 SCAN_PARTS = 4_096  # examined at once for what is missing: more than an honest publisher has under way
@@ -64,7 +63,6 @@ class ReassembledMessage(NamedTuple):
 class _PartialMessage:
     parts: int
     salt: bytes
-    epoch: int
     opener: Opener
     running: hashlib._Hash | None  # None: the message has no signature
     touched_s: float
@@ -179,18 +177,18 @@ class Reassembler:
             return None
         try:
             opener = self._opener_of(header.epoch)
-            plain, sealed, signature = opener.open(header, frame)
+            opened = opener.open(header, frame)
         except EnvelopeError as error:
             self.drops[error.reason] += 1
             return None
         if header.parts == 1:
-            return self._take_whole(header, salt, plain, sealed, signature, now_s)
+            return self._take_whole(header, frame, opened, now_s)
         if message is None and not self._free_space(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
         if message is None or not is_same:
-            message = self._start(header, salt, opener, now_s)
-        return self._keep(message, header, plain, sealed, signature, now_s)
+            message = self._start(header, frame, opener, now_s)
+        return self._keep(message, header, frame, opened, now_s)
 
     def drop_copy(self, header: Header, reason: DropReason, now_s: float) -> None:
         """Count a fragment that was here before: for ``reason``, or as a second copy where each may have one."""
@@ -201,12 +199,10 @@ class Reassembler:
         self.drops[DropReason.SECOND_COPY] += 1
         self.copies.handle_copy(header.number, header.part, now_s)
 
-    def _take_whole(
-        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes, now_s: float
-    ) -> ReassembledMessage | None:
-        number = header.number
+    def _take_whole(self, header: Header, frame: bytes, opened: Opened, now_s: float) -> ReassembledMessage | None:
+        number, (plain, sealed, signature) = header.number, opened
         if self._writer is not None:
-            running = digest_of(header, salt)
+            running = digest_of(frame)
             running.update(sealed)
             if not self._is_signed(signature, running):
                 return None
@@ -223,31 +219,30 @@ class Reassembler:
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return ReassembledMessage(
             number=number,
-            flags=header.flags & _SHARED_FLAGS,
+            flags=header.flags & SHARED_FLAGS,
             message=message,
             parts=1,
             hops=max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0),
             head=head,
         )
 
-    def _start(self, header: Header, salt: bytes, opener: Opener, now_s: float) -> _PartialMessage:
+    def _start(self, header: Header, frame: bytes, opener: Opener, now_s: float) -> _PartialMessage:
         """Return a new partial message; it replaces one with another number of fragments, or another salt."""
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
         return _PartialMessage(
             parts=header.parts,
-            salt=salt,
-            epoch=header.epoch,
+            salt=salt_of(frame),
             opener=opener,
-            running=None if self._writer is None else digest_of(header, salt),
+            running=None if self._writer is None else digest_of(frame),
             touched_s=now_s,
         )
 
     def _keep(
-        self, message: _PartialMessage, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
+        self, message: _PartialMessage, header: Header, frame: bytes, opened: Opened, now_s: float
     ) -> ReassembledMessage | None:
-        number = header.number
+        number, (plain, sealed, signature) = header.number, opened
         in_order = header.part == message.hashed
         cost = len(plain) + _PART_OVERHEAD_BYTES + (0 if in_order else len(sealed))
         if not self._reserve(number, cost):
@@ -267,7 +262,7 @@ class Reassembler:
         if signature:
             message.signature = signature
         if in_order:
-            message.head, message.length = encode(header) + message.salt, header.length
+            message.head, message.length = frame[:BODY_AT], header.length
             self._under_way = number
             message.append(1, plain, sealed)
             while message.early and (early := message.early.pop(message.hashed, None)) is not None:
@@ -288,7 +283,7 @@ class Reassembler:
         whole = b"".join([first[size:], *message.plain[1:]])
         return ReassembledMessage(
             number=number,
-            flags=header.flags & _SHARED_FLAGS,
+            flags=header.flags & SHARED_FLAGS,
             message=whole,
             parts=message.parts,
             hops=message.hops,

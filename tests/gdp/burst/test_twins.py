@@ -130,10 +130,32 @@ def test_both_make_the_same_received_frames(frames: list[bytes], port: int, wait
     assert {type(each) for each in by_c} <= {ReceivedFrame}
 
 
+@given(st.integers(0, 1 << 32), st.integers(0, 20))
+def test_both_find_the_same_runs(seed: int, count: int) -> None:
+    chance, slot_bytes = Random(seed), 300
+    pool, sizes = bytearray(chance.randbytes(slot_bytes * (count + 1))), list[int]()
+    for slot in range(count):
+        length = chance.randint(0, 100)
+        header = Header(
+            chance.choice([1, 1, 1, 5, 0x80]), 0, chance.choice([16, 16, 16, 144, 1, 129]), 1, length, 7, 0, 1, 9,
+            chance.choice([b"d", b"d", b"e"]) * 32, chance.choice([b"s", b"s", b"t"]) * 32,
+        )  # fmt: skip
+        frame = bytearray(encode(header) + chance.randbytes(length))
+        frame[0] = chance.choice([1, 1, 1, 1, 2])
+        pool[slot * slot_bytes + 14 : slot * slot_bytes + 14 + len(frame)] = frame
+        sizes.append(max(len(frame) + chance.choice([0, 0, 0, 0, -1, 9, -100]), 0))
+    by_python, by_c = slots.runs(pool, slot_bytes, sizes), compiled.runs(pool, slot_bytes, sizes)
+    assert by_python == by_c
+    assert [slot for first, each, *_ in by_c for slot in range(first, first + each)] == [*range(count)]
+
+
 def test_slots_that_the_pool_has_not_are_refused() -> None:
     for sizes in ([87], [-1], [0, 0, 0], [1 << 40]):
         with pytest.raises(ValueError, match="slots"):
             compiled.received(bytearray(200), 100, sizes, 0, 0.0)
+    for pool, slot_bytes, sizes in ((bytearray(200), 100, [1]), (bytearray(200), 110, [1, 1])):
+        with pytest.raises(ValueError, match="slots"):
+            compiled.runs(pool, slot_bytes, sizes)
     with pytest.raises(TypeError):
         compiled.received(bytes(200), 100, [1], 0, 0.0)
 
