@@ -42,6 +42,12 @@ def test_no_sanitizer_finds_anything_in_the_twins(tmp_path: Path) -> None:
         "ASAN_OPTIONS": "detect_leaks=0",  # the interpreter frees nothing at its end
         "PYTHONMALLOC": "malloc",
     }
-    argv = [sys.executable, "-c", _RUN, tmp_path / "core.abi3.so", ROOT / "tests/gdp/burst/test_twins.py"]
+    argv: list[str | Path] = [
+        sys.executable,
+        "-c",
+        _RUN,
+        tmp_path / "core.abi3.so",
+        ROOT / "tests/gdp/burst/test_twins.py",
+    ]
     ran = subprocess.run(argv, env=environment, cwd=ROOT, capture_output=True, text=True, check=False, timeout=600)
     assert ran.returncode == 0, ran.stdout + ran.stderr
