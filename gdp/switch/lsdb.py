@@ -57,6 +57,7 @@ class LinkStateDatabase:
 
     Attributes:
         version: rises with every change that may change a path or an identity conflict.
+        losses: rises with those by which a link, a RIB or a switch is gone.
     """
 
     def __init__(self, domain: Name) -> None:
@@ -64,7 +65,7 @@ class LinkStateDatabase:
         self._entries: dict[tuple[Name, Scope], _Entry] = {}
         self._digests: dict[bool, bytes] = {}
         self._past: dict[tuple[Name, Scope], _Past] = {}  # in order of their end
-        self.version = 0
+        self.version = self.losses = 0
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -102,6 +103,7 @@ class LinkStateDatabase:
         self._digests.clear()
         if known is None or _ways(known.state) != _ways(state):
             self.version += 1
+            self.losses += known is not None and not _reached(known.state) <= _reached(state)
         return True
 
     def expire(self, now_s: float) -> None:
@@ -110,6 +112,7 @@ class LinkStateDatabase:
         for key in late:
             self._bury(self._entries.pop(key).state, now_s)
             self.version += 1
+            self.losses += 1
         while self._past:
             key, past = next(iter(self._past.items()))
             if past.until_s > now_s:
@@ -162,3 +165,9 @@ class LinkStateDatabase:
 
 def _ways(state: LinkState) -> tuple[object, ...]:
     return state.links, state.inside, state.ribs, state.members, state.incarnation_id, state.refused, state.is_leaf
+
+
+def _reached(state: LinkState) -> set[tuple[Name, int]]:
+    """Return the links, the paths inside the domain, the RIBs and the switches that a state names."""
+    paths = {(each.name, each.key) for each in (*state.links, *state.inside)}
+    return paths | {(each.name, -1) for each in state.ribs} | {(name, -1) for name in state.members}

@@ -45,6 +45,7 @@ class PathUpdates:
         self._rib_client = rib_client
         self._spf_delay = SpfDelay()
         self._seen_version = -1
+        self._seen_losses = 0
         self._protect_at_s: float | None = None  # when alternates are computed
         self._followed_s = self._conflicts_sought_s = float("-inf")
 
@@ -54,8 +55,11 @@ class PathUpdates:
 
     def plan(self, now_s: float) -> None:
         """Schedule an update if link states have changed."""
-        if self._spf_delay.due_s is None and self._flooding.link_states.version != self._seen_version:
-            self._spf_delay.record_change(now_s)
+        link_states = self._flooding.link_states
+        is_loss = link_states.losses != self._seen_losses
+        if is_loss or (self._spf_delay.due_s is None and link_states.version != self._seen_version):
+            self._spf_delay.record_change(now_s, is_loss=is_loss)
+            self._seen_losses = link_states.losses
 
     def follow(self, now_s: float) -> None:
         """Update everything now if link states have changed."""
@@ -64,7 +68,7 @@ class PathUpdates:
         if version == self._seen_version:
             return
         self._flooding.neighbour_changed(now_s)  # our domain's interior may have changed
-        self._seen_version = self._flooding.link_states.version
+        self._seen_version, self._seen_losses = self._flooding.link_states.version, self._flooding.link_states.losses
         self._followed_s = now_s
         self._state.paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
         self._unicast.refresh(now_s)

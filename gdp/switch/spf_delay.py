@@ -1,7 +1,9 @@
 """SPF delay: when to compute paths after changes; at once in quiet times, less often while changes continue.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 8405, sections 5 and 6. The delays are shorter
-than its examples, for domains are small. Losses at this switch's own ports are handled without a delay::
+than its examples, for domains are small. Losses at this switch's own ports are handled without a delay. A loss
+elsewhere never waits the long delay, as frames vanish or circle until all switches know it; links that come and go are
+damped at their ends (``damping.py``)::
 
     QUIET --news--> SHORT_WAIT --time to learn is over--> LONG_WAIT
       ^-- hold-down ----'    ^------- hold-down ----------' (to QUIET)
@@ -11,6 +13,9 @@ from __future__ import annotations
 
 from enum import Enum
 from typing import Final
+
+from gdp.due_queue import earliest
+from gdp.intervals import NEVER_S
 
 __all__ = ["TRANSITIONS", "SpfDelay", "SpfEvent", "SpfState"]
 
@@ -63,13 +68,13 @@ class SpfDelay:
         self._learned_s = float("inf")
         self._held_down_s = float("inf")
 
-    def record_change(self, now_s: float) -> None:
-        """Record that link states have changed paths."""
+    def record_change(self, now_s: float, *, is_loss: bool = False) -> None:
+        """Record that link states have changed paths; ``is_loss``: one that was there is gone."""
         self._settle(now_s)
         if self.state is SpfState.QUIET:
             self._learned_s = now_s + TIME_TO_LEARN_S
-        if self.due_s is None:
-            self.due_s = now_s + _DELAYS_S[self.state]
+        delay_s = min(_DELAYS_S[self.state], _DELAYS_S[SpfState.SHORT_WAIT] if is_loss else NEVER_S)
+        self.due_s = earliest(self.due_s, now_s + delay_s)
         self._held_down_s = now_s + HOLD_DOWN_S
         self.state = TRANSITIONS[self.state, SpfEvent.NEWS]
 

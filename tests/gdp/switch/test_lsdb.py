@@ -32,6 +32,17 @@ def test_a_change_of_links_is_a_new_version_and_a_renewal_is_not() -> None:
     assert states.version > before
 
 
+def test_a_link_or_a_state_that_goes_is_a_loss_and_another_cost_or_a_new_link_is_none() -> None:
+    states = known(state("a", link("b")))
+    states.put(state("a", link("b", 99), sequence=2), b"", 0.0)
+    states.put(state("a", link("b"), link("c"), sequence=3), b"", 0.0)
+    assert states.losses == 0
+    states.put(state("a", link("c"), sequence=4), b"", 0.0)
+    assert states.losses == 1
+    states.expire(LINK_STATE.lease_s)
+    assert states.losses == 2
+
+
 def test_what_is_not_renewed_is_forgotten() -> None:
     states = known(state("a"))
     assert states.next_expiry() == LINK_STATE.lease_s

@@ -53,6 +53,17 @@ def test_news_while_paths_wait_to_be_computed_put_nothing_off() -> None:
     assert spf.due_s == pytest.approx(10.0 + 0.005)
 
 
+def test_a_loss_waits_no_longer_than_the_short_delay_even_behind_other_news() -> None:
+    spf = SpfDelay()
+    delay_after(spf, 10.0)
+    spf.record_change(11.0)
+    assert (spf.state, spf.due_s) == (SpfState.LONG_WAIT, pytest.approx(11.3))
+    spf.record_change(11.1, is_loss=True)
+    assert spf.due_s == pytest.approx(11.15)
+    spf.record_change(11.12, is_loss=True)
+    assert spf.due_s == pytest.approx(11.15)
+
+
 def test_a_link_that_went_once_or_twice_is_used_at_once() -> None:
     damping = Damping()
     for now_s in (0.0, 1.0, 2.0):
