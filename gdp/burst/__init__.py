@@ -22,7 +22,7 @@ from gdp.burst.slots import received, runs
 
 __all__ = ["CIPHER", "VARIANT", "received", "runs"]
 
-_INTERFACE: Final = 2  # as in ``core.c``
+_INTERFACE: Final = 3  # as in ``core.c``
 
 
 def _compiled() -> Any:

@@ -9,6 +9,7 @@ Sans-I/O. Source: NIST SP 800-38D (GCM); ``frame/spec.md`` gives each byte. From
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from itertools import islice
 from typing import Final
@@ -25,6 +26,8 @@ __all__ = ["BODY_AT", "SALT_BYTES", "TAG_BYTES", "MessageCipher"]
 SALT_BYTES: Final = 8
 TAG_BYTES: Final = 16
 BODY_AT: Final = HEADER_BYTES + SALT_BYTES  # of the ciphertext in a frame
+_LENGTH: Final = struct.Struct("!H")
+_PART: Final = struct.Struct("!I")
 _LAST: Final = int(Flag.LAST)
 
 
@@ -33,6 +36,8 @@ class MessageCipher:
 
     A *head* is the header of any part of the message, without ``Flag.LAST``, and the salt.
     """
+
+    __slots__ = ("_aead",)
 
     def __init__(self, key: bytes) -> None:
         self._aead = AESGCM(key)
@@ -46,26 +51,28 @@ class MessageCipher:
             message: whole; each part but the last two carries ``capacity`` bytes of it.
             signature_bytes: that the caller appends to the last frame; 0: the message is not signed.
         """
-        frames, payloads, encrypt, view = list[bytes](), list[bytes](), self._aead.encrypt, memoryview(message)
-        last, behind, size = int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1, head[PARTS_AT:], -1
-        nonce, additional_behind, before, additional = head[NUMBER_AT:PART_AT], head[PARTS_AT:HEADER_BYTES], b"", b""
+        frames: list[bytes] = []
+        payloads: list[bytes] = []
+        header, additional, size = bytearray(head), bytearray(), -1
+        encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1
         for part in range(first, end):
-            plain = view[part * capacity : (part + 1) * capacity]
-            if len(plain) != size or part == last:
-                size, is_last = len(plain), part == last
-                length = size + SALT_BYTES + TAG_BYTES + signature_bytes * is_last
-                before = _before(head, head[FLAGS_AT] | _LAST * is_last, length)
-                additional = before[:HOPS_AT] + before[HOPS_AT + 1 :]
-            number = part.to_bytes(4, "big")
-            payload = encrypt(nonce + number, plain, additional + number + additional_behind)
-            payloads.append(payload)
-            frames.append(b"".join((before, number, behind, payload)))
+            plain, is_last = message[part * capacity : (part + 1) * capacity], part == last
+            if len(plain) != size or is_last:
+                size = len(plain)
+                header[FLAGS_AT] = head[FLAGS_AT] | _LAST * is_last
+                _LENGTH.pack_into(header, LENGTH_AT, SALT_BYTES + size + TAG_BYTES + signature_bytes * is_last)
+                additional = header[:HOPS_AT] + header[HOPS_AT + 1 : HEADER_BYTES]
+            _PART.pack_into(header, PART_AT, part)
+            _PART.pack_into(additional, PART_AT - 1, part)
+            payloads.append(encrypt(header[NUMBER_AT:PARTS_AT], plain, additional))
+            frames.append(b"".join((header, payloads[-1])))
         return frames, b"".join(payloads) if signature_bytes else b""
 
-    def open(self, frame: bytes, end: int, /) -> bytes | None:
-        """Return the plaintext of a part whose tag ends at ``end``; None: it was altered."""
+    def open(self, frame: bytes, end: int, /) -> tuple[bytes, bytes] | None:
+        """Return plaintext, and ciphertext with tag, of a part whose tag ends at ``end``; None: it was altered."""
+        payload = frame[BODY_AT:end]
         try:
-            return self._aead.decrypt(frame[NUMBER_AT:PARTS_AT], frame[BODY_AT:end], authenticated(frame))
+            return self._aead.decrypt(frame[NUMBER_AT:PARTS_AT], payload, authenticated(frame)), payload
         except InvalidTag:
             return None
 
@@ -83,13 +90,11 @@ class MessageCipher:
         Returns:
             how many parts were opened; their plaintexts; and if wanted their ciphertexts with tags.
         """
-        plains, payloads = list[bytes](), list[bytes]()
+        plains: list[bytes] = []
+        payloads: list[bytes] = []
         decrypt, end, nonce = self._aead.decrypt, HEADER_BYTES + length, head[NUMBER_AT:PART_AT]
-        before, behind, additional_behind = (
-            _before(head, head[FLAGS_AT], length),
-            head[PARTS_AT:],
-            head[PARTS_AT:HEADER_BYTES],
-        )
+        before, behind = head[:LENGTH_AT] + _LENGTH.pack(length) + head[NUMBER_AT:PART_AT], head[PARTS_AT:]
+        additional_behind = head[PARTS_AT:HEADER_BYTES]
         additional = before[:HOPS_AT] + before[HOPS_AT + 1 :]
         for part, arrival in zip(range(first, first + count), islice(arrivals, at, None), strict=False):
             frame, number = arrival.frame, part.to_bytes(4, "big")
@@ -102,10 +107,3 @@ class MessageCipher:
                 break
             payloads.append(payload)
         return len(plains), b"".join(plains), b"".join(payloads) if wants_payloads else b""
-
-
-def _before(head: bytes, flags: int, length: int) -> bytes:
-    """Return the header before the part's number."""
-    return b"%b%c%b%b%b" % (
-        head[:FLAGS_AT], flags, head[HOPS_AT:LENGTH_AT], length.to_bytes(2, "big"), head[NUMBER_AT:PART_AT]
-    )  # fmt: skip

@@ -22,7 +22,7 @@
 #include <string.h>
 
 enum {
-    INTERFACE = 2, /* raised with each change of what Python calls */
+    INTERFACE = 3, /* raised with each change of what Python calls */
     FLAGS_AT = 2,
     HOPS_AT = 3,
     LENGTH_AT = 6,
@@ -223,18 +223,22 @@ static PyObject *cipher_open(MessageCipher *self, PyObject *args)
         return refusal("the end of a sealed part");
     if (size < end)
         Py_RETURN_NONE;
-    PyObject *plain = PyBytes_FromStringAndSize(NULL, end - BODY_AT - TAG);
-    if (plain == NULL || !take(self)) {
-        Py_XDECREF(plain);
-        return NULL;
-    }
+    PyObject *plain = PyBytes_FromStringAndSize(NULL, end - BODY_AT - TAG), *payload = NULL, *result = NULL;
+    if (plain == NULL || !take(self))
+        goto end;
     int is_open = set_direction(self, 0) &&
                   open_part(self, (const uint8_t *)frame, (int)(end - BODY_AT - TAG), (uint8_t *)PyBytes_AsString(plain));
     self->is_busy = 0;
-    if (is_open)
-        return plain;
-    Py_DECREF(plain);
-    Py_RETURN_NONE;
+    if (!is_open) {
+        Py_INCREF(Py_None);
+        result = Py_None;
+    } else if ((payload = PyBytes_FromStringAndSize(frame + BODY_AT, end - BODY_AT)) != NULL) {
+        result = PyTuple_Pack(2, plain, payload);
+    }
+end:
+    Py_XDECREF(plain);
+    Py_XDECREF(payload);
+    return result;
 }
 
 /* Collects frames as new references, from tuples whose third item is the frame; returns how many. */

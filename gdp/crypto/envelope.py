@@ -19,6 +19,7 @@ tag. A stream under a session secret (``session_seal.py``) has no signature: onl
 from __future__ import annotations
 
 import hashlib
+import struct
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol, overload
 
@@ -30,7 +31,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, HOPS_AT, LENGTH_AT, NUMBER_AT, PART_AT, PARTS_AT, Header, encode
+from gdp.frame.codec import HEADER_BYTES, Header, encode
 from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 from gdp.sansio import ReceivedFrame
@@ -58,6 +59,8 @@ SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
 _LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a microsecond each
+_SHARED: Final = struct.Struct("!2sBxH2xQ4x84s")  # of a frame: without hops left, payload length and part
+_HASHED: Final = struct.Struct("!13s2sBHQ84s")
 SHARED_FLAGS: Final = 0xFF & ~_LAST  # of all parts of a message
 _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
 
@@ -127,9 +130,8 @@ def fragment_capacity(mtu: int) -> int:
 
 def digest_of(frame: bytes) -> hashlib._Hash:
     """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
-    flags = bytes([frame[FLAGS_AT] & SHARED_FLAGS])
-    numbers = frame[HOPS_AT + 1 : LENGTH_AT] + frame[NUMBER_AT:PART_AT]
-    return hashlib.sha256(b"gdp-message-2" + frame[:FLAGS_AT] + flags + numbers + frame[PARTS_AT:BODY_AT])
+    kind, flags, epoch, number, others = _SHARED.unpack_from(frame)
+    return hashlib.sha256(_HASHED.pack(b"gdp-message-2", kind, flags & SHARED_FLAGS, epoch, number, others))
 
 
 class Sealer:
@@ -249,7 +251,8 @@ class Sealed(Sequence[bytes]):
             return self._message
         ends = [len(frame) for frame in frames]
         ends[-1] -= self._signature_bytes
-        return b"".join([self._cipher.open(frame, end) or b"" for frame, end in zip(frames, ends, strict=True)])
+        opened = [self._cipher.open(frame, end) for frame, end in zip(frames, ends, strict=True)]
+        return b"".join([each[0] for each in opened if each is not None])
 
     def _seal_until(self, end: int) -> None:
         if self._origin is not None:
@@ -318,16 +321,16 @@ class Opener:
         sealed_end = end - self._signature_bytes if is_last else end
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
-        salt, sealed = frame[HEADER_BYTES:BODY_AT], frame[BODY_AT:sealed_end]
+        salt = frame[HEADER_BYTES:BODY_AT]
         cipher = self._cipher_of(salt)
-        plain = cipher.open(frame, sealed_end)
-        if plain is None:
+        opened = cipher.open(frame, sealed_end)
+        if opened is None:
             raise EnvelopeError(DropReason.BAD_TAG)
         if header.parts > 1 and salt not in self._known:
             if len(self._known) >= _KEYS_KEPT:
                 del self._known[next(iter(self._known))]
             self._known[salt] = cipher
-        return plain, sealed, frame[sealed_end:end]
+        return *opened, frame[sealed_end:end]
 
     def _cipher_of(self, salt: bytes) -> MessageCipher:
         return self._known.get(salt) or burst.CIPHER(self._keys.of(salt))
