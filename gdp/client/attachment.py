@@ -451,7 +451,8 @@ class Attachment:
 
     def _apply_ack(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
         if ack.refused is None:
-            if not each.is_taken or ack.sequence >= each.sent_sequence:
+            # a RIB that is new acknowledges what it receives from the switch; that renews no lease
+            if not each.is_taken or (each.renewals and ack.sequence >= each.sent_sequence):
                 each.advertisement_at_s, each.renewals = now_s + renew_after_s(self._lease_s), 0
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:

@@ -9,7 +9,7 @@ from gdp.control.query import Query
 from gdp.intervals import ADVERTISEMENT
 from lab.simulation import Simulation
 from lab.topology import Attachment, ring5
-from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
+from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 
 LEASES_S = 3 * ADVERTISEMENT.lease_s
 RIBS = ["school", "school#2", "backbone", "backbone#2", "cloud", "cloud#2"]
@@ -17,9 +17,9 @@ RIBS = ["school", "school#2", "backbone", "backbone#2", "cloud", "cloud#2"]
 
 def doubled() -> Simulation:
     """Return the ring with two RIBs in each domain."""
-    ring = ring5()
+    plan = ring5()
     second = (Attachment("nuc1", "rib", "rib2"), Attachment("nuc3", "rib", "rib2"), Attachment("nuc5", "rib", "rib2"))
-    world = Simulation(topology=replace(ring, attachments=ring.attachments + second))
+    world = Simulation(topology=replace(plan, attachments=plan.attachments + second))
     assert world.run_until_attached()
     return world
 
@@ -90,3 +90,16 @@ def test_a_watch_at_one_rib_hears_what_another_took() -> None:
     assert world.network.run(1, lambda: asked.state.outbox.answers > answers)
     world.network.run(LEASES_S)
     assert asked.state.store.routes(flow.topic.name)
+
+
+def test_a_rib_that_restarts_again_and_again_lets_no_lease_end() -> None:
+    lease_s, every_s = 6.0, 0.25
+    world = ring(lease_s=lease_s, keepalive_ms=1_500)
+    flow = flowing(world)
+    count = round(3.25 * lease_s / every_s)
+    flow.stream(count, every_s, size=100)
+    for at in range(1, 12):  # it acknowledges again what its switch still has
+        world.network.call(0.28 * at * lease_s, partial(world.restart_rib, "school"))
+    attached, robot = world.switches["nuc1"].attached, world.identities[ROBOT].name
+    assert not world.network.run(3.25 * lease_s, lambda: not attached.of(robot))
+    assert flow.numbers(SERVER) == list(range(count))
