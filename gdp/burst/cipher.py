@@ -37,8 +37,6 @@ class MessageCipher:
     A *head* is the header of any part of the message, without ``Flag.LAST``, and the salt.
     """
 
-    __slots__ = ("_aead",)
-
     def __init__(self, key: bytes) -> None:
         self._aead = AESGCM(key)
 

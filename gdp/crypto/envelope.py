@@ -187,8 +187,8 @@ class Sealer:
         epoch, kind, incarnation, destination, source = self._fixed
         header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
         salt = self._random_bytes(SALT_BYTES)
-        cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
-        return Sealed(cipher=cipher, salt=salt, signer=signer, header=header, message=message, capacity=capacity)
+        cipher, head, signer = burst.CIPHER(self._keys.of(salt)), encode(header) + salt, self._signer
+        return Sealed(cipher=cipher, signer=signer, head=head, parts=parts, message=message, capacity=capacity)
 
 
 class Sealed(Sequence[bytes]):
@@ -198,17 +198,16 @@ class Sealed(Sequence[bytes]):
         self,
         *,
         cipher: MessageCipher,
-        salt: bytes,
         signer: Signer | None,
-        header: Header,
+        head: bytes,
+        parts: int,
         message: bytes | Sealed,
         capacity: int,
     ) -> None:
         self._cipher = cipher
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
-        self._head = encode(header) + salt
-        self._parts = header.parts
+        self._head, self._parts = head, parts
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
@@ -217,9 +216,9 @@ class Sealed(Sequence[bytes]):
             self._message, self.message_bytes = b"", message.message_bytes
             self._origin = message._origin or message
         self._capacity = capacity
-        self._running = None if signer is None else digest_of(self._head)
+        self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []
-        self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
+        self.size_bytes = self.message_bytes + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
         return self._parts
