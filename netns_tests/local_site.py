@@ -104,14 +104,7 @@ class Domain:
         files |= {f"proxy/{path.relative_to(keys)}": path.read_bytes() for path in keys.rglob("*") if path.is_file()}
         words = (served.to_text(), "{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
         wait = 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"'
-        member = (
-            "env",
-            f"PYTHONPATH={python_path()}",
-            "sh",
-            "-c",
-            wait,
-            "member",
-        )  # a machine has no checkout of tests
+        member = ("env", f"PYTHONPATH={python_path()}", "sh", "-c", wait, "member")  # a machine has no tests
         program = Program("proxy", (*member, "{python}", *calling(uplink_child.main, *words)[1:]), "up")
         return MachineBundle(files, (_command("switch", "gdp.cli.switch"), program))
 

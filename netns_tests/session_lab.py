@@ -58,6 +58,11 @@ def session_lab(rights: Rights, types: Mapping[str, str] | None = None) -> Itera
         yield lab
 
 
+def execute(code: str) -> None:
+    """Run a program that a test writes; a process of its own."""
+    exec(compile(code, "program", "exec"), {"__name__": "__main__"})
+
+
 def lines_of(process: LabProcess, count: int) -> Sequence[str]:
     """Return the next lines that a process prints."""
     return [process.read_line(PATIENCE_S).decode().strip() for _ in range(count)]

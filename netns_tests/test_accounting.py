@@ -95,7 +95,7 @@ def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_punted_ther
     assert (len(row.delivered), row.punted, row.drops()) == (50, 50, {})
 
 
-@pytest.mark.parametrize("end", ["c0", "c1"])
+@pytest.mark.parametrize("end", ["c0", pytest.param("c1", marks=pytest.mark.nightly)])
 def test_a_link_that_is_taken_down_under_a_stream_costs_only_what_is_counted(lay: MakeRow, end: str) -> None:
     row = lay()
     row.send(*[frame()] * 40)

@@ -290,8 +290,12 @@ def lab() -> Iterator[SessionLab]:
 
 @pytest.fixture(scope="module", params=["twisted", pytest.param("asyncio", marks=pytest.mark.nightly)])
 def roslibpy_run(request: pytest.FixtureRequest, suite: Path, lab: SessionLab) -> Run:
-    """Return the outcomes of roslibpy's tests over one of its transports."""
-    files = sorted({f"tests/{name.partition('::')[0]}" for name in ROSLIBPY})
+    """Return the outcomes of roslibpy's tests over one of its transports: those that this session selects."""
+    items = [
+        each for each in request.session.items if isinstance(each, pytest.Function) and each.module is request.module
+    ]
+    names = {str(each.callspec.params["name"]) for each in items if each.originalname == "test_roslibpy"}
+    files = sorted({f"tests/{name if names < ROSLIBPY.keys() else name.partition('::')[0]}" for name in names})
     words = ["env", f"--chdir={suite}", f"ROSLIBPY_TRANSPORT={request.param}", sys.executable, "-m", "pytest"]
     output = _output(lab, [*words, "-p", "no:cacheprovider", "-o", "addopts=", "-v", "--tb=short", *files])
     return dict(_RESULT.findall(output)), output
@@ -313,19 +317,25 @@ def _output(lab: SessionLab, command: Sequence[str]) -> str:
     return printed + tests.logged
 
 
-def _rows(suite: Mapping[str, str]) -> list[object]:
+def _rows(suite: Mapping[str, str], nightly: tuple[str, ...] = ()) -> list[object]:
+    """Return the tests of a suite as parameters; ``nightly``: how the names of those begin that others repeat."""
     return [
-        pytest.param(name, marks=[pytest.mark.xfail(reason=reason, strict=True)] if reason else [])
+        pytest.param(
+            name,
+            marks=[pytest.mark.xfail(reason=reason, strict=True)] * bool(reason)
+            + [pytest.mark.nightly] * (bool(nightly and reason) or name.startswith(nightly)),
+        )
         for name, reason in suite.items()
     ]
 
 
-@pytest.mark.parametrize("name", _rows(ROSLIBPY))
+@pytest.mark.parametrize("name", _rows(ROSLIBPY, nightly=("ros1/test_ros.py", "ros1/test_rosapi.py")))
 def test_roslibpy(roslibpy_run: Run, name: str) -> None:
     outcomes, output = roslibpy_run
     assert outcomes.get(name, "did not end") == "PASSED", output[-20_000:]
 
 
+@pytest.mark.nightly
 def test_every_test_of_roslibpy_that_connects_is_listed(roslibpy_run: Run) -> None:
     assert set(roslibpy_run[0]) == set(ROSLIBPY), roslibpy_run[1][-20_000:]
 

@@ -123,6 +123,7 @@ def boot(runs: str, image: str) -> None:
     signal.pause()
 
 
+@pytest.mark.nightly
 def test_a_machine_goes_also_when_its_creator_was_killed(image: Path, machine: LabMachine, space: Space) -> None:
     runs = machine.folder / "runs"
     child = machine.launch(calling(boot, runs, image))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,7 @@ from gdp.management.control_client import find_control_socket
 from lab.machine import GDP, LabMachine
 from lab.namespaces import Space
 from lab.process import LabProcess, until
-from netns_tests.test_rights import nodes, start_all
-
-__all__ = ["nodes"]  # a fixture
+from netns_tests.test_rights import configured, start_all
 
 PATIENCE_S = 60.0
 
@@ -29,9 +28,16 @@ pytestmark = [
 Running = dict[str, LabProcess]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LabMachine]:
+    with Space() as space, LabMachine(tmp_path_factory.mktemp("nodes")) as machine:
+        space.ip("link", "set", "lo", "up")
+        yield configured(space, machine)
+
+
+@pytest.fixture(scope="module")
 def running(nodes: LabMachine) -> Running:
-    """Running switch, RIB and recording proxy of one domain."""
+    """Running switch, RIB and recording proxy of one domain; the last test ends them."""
     return dict(zip(("switch", "rib", "proxy"), start_all(nodes), strict=True))
 
 
@@ -59,6 +65,45 @@ def a_refused_reload_says_why(nodes: LabMachine) -> None:
     code, text = gdp(nodes, "reload", "proxy")
     assert code == 1
     assert "no delegation for" in text
+
+
+def measured_links(page: ClientConnection) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the newest structure and figures of a page, once the figures show round trips and traffic."""
+    shown: dict[str, dict[str, Any]] = {}
+
+    def is_measured() -> bool:
+        message = json.loads(page.recv(PATIENCE_S))
+        shown[message["kind"]] = message
+        links = message.get("links", ()) if message["kind"] == "figures" else ()
+        return all(rtt_ms is not None for _, _, rtt_ms, _ in links) and any(there + back for there, back, _, _ in links)
+
+    until(is_measured, "the round trips of a live view", PATIENCE_S)
+    return shown["structure"], shown["figures"]
+
+
+def test_the_live_view_shows_running_nodes_that_dropped_their_rights(nodes: LabMachine, running: Running) -> None:
+    words = [word for name in running for word in ("--node", name)]
+    view = nodes.launch([*GDP, "dashboard", "--json", *words])
+    url = str(view.read(PATIENCE_S)["url"])
+    with connect(url.replace("http", "ws") + "live") as page:
+        structure, figures = measured_links(page)
+    view.finish(signal.SIGTERM)
+    assert view.code == 0
+    assert sorted(role for _, role, _, _, is_near in structure["nodes"] if is_near) == ["proxy", "rib", "switch"]
+    assert len(structure["links"]) == 2
+    assert all(rtt_ms is not None for _, _, rtt_ms, _ in figures["links"])
+    assert any(there + back > 0 for there, back, _, _ in figures["links"])
+    assert structure["names"]
+
+
+def test_the_socket_of_a_killed_node_is_replaced(nodes: LabMachine, running: Running) -> None:
+    nodes.kill(running["proxy"])
+    assert socket(nodes, "proxy").exists()
+    code, text = gdp(nodes, "status", "proxy")
+    assert (code, "no process serves this control socket" in text) == (3, True)
+    (nodes.folder / "kept" / "received.mcap").unlink(missing_ok=True)
+    running["proxy"] = nodes.start("proxy", "proxy")
+    assert gdp(nodes, "status", "proxy")[0] == 0
 
 
 def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(
@@ -92,46 +137,5 @@ def test_nodes_that_drain_end_and_leave_no_socket(nodes: LabMachine, running: Ru
         assert (code, json.loads(text)) == (0, {"state": "drained", "complete": True})
         node.output()
     assert not any(path.exists() for path in sockets)
-    assert {path.name for path in (nodes.folder / "kept").iterdir()} == {"received.mcap", "routes"}
-
-
-def test_the_socket_of_a_killed_node_is_replaced(nodes: LabMachine, running: Running) -> None:
-    nodes.kill(running["proxy"])
-    assert socket(nodes, "proxy").exists()
-    code, text = gdp(nodes, "status", "proxy")
-    assert (code, "no process serves this control socket" in text) == (3, True)
-    (nodes.folder / "kept" / "received.mcap").unlink(missing_ok=True)
-    nodes.start("proxy", "proxy")
-    assert gdp(nodes, "status", "proxy")[0] == 0
-
-
-def measured_links(page: ClientConnection) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the newest structure and figures of a page, once the figures show round trips and traffic."""
-    shown: dict[str, dict[str, Any]] = {}
-
-    def is_measured() -> bool:
-        message = json.loads(page.recv(PATIENCE_S))
-        shown[message["kind"]] = message
-        links = message.get("links", ()) if message["kind"] == "figures" else ()
-        return all(rtt_ms is not None for _, _, rtt_ms, _ in links) and any(there + back for there, back, _, _ in links)
-
-    until(is_measured, "the round trips of a live view", PATIENCE_S)
-    return shown["structure"], shown["figures"]
-
-
-def test_the_live_view_shows_running_nodes_that_dropped_their_rights(
-    space: Space, nodes: LabMachine, running: Running
-) -> None:
-    space.ip("link", "set", "lo", "up")
-    words = [word for name in running for word in ("--node", name)]
-    view = nodes.launch([*GDP, "dashboard", "--json", *words])
-    url = str(view.read(PATIENCE_S)["url"])
-    with connect(url.replace("http", "ws") + "live") as page:
-        structure, figures = measured_links(page)
-    view.finish(signal.SIGTERM)
-    assert view.code == 0
-    assert sorted(role for _, role, _, _, is_near in structure["nodes"] if is_near) == ["proxy", "rib", "switch"]
-    assert len(structure["links"]) == 2
-    assert all(rtt_ms is not None for _, _, rtt_ms, _ in figures["links"])
-    assert any(there + back > 0 for there, back, _, _ in figures["links"])
-    assert structure["names"]
+    kept = {path.name for path in (nodes.folder / "kept").iterdir()}
+    assert {each for each in kept if "-killed" not in each} == {"received.mcap", "routes"}

@@ -64,6 +64,7 @@ def make_sites(laboratory: Laboratory) -> Callable[[Access, Access], Sites]:
     return make
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("other", [Access.FULL_CONE])
 def test_a_symmetric_nat_reaches_one_that_filters_nothing(
     make_sites: Callable[[Access, Access], Sites], other: Access

@@ -24,6 +24,7 @@ from tests.gdp_extensions.dissector.tshark import assert_same, needs_tshark, sho
 pytestmark = pytest.mark.netns
 
 
+@pytest.mark.nightly
 @needs_tshark
 @pytest.mark.momentary(FAST)
 def test_wireshark_shows_of_each_captured_frame_what_scapy_shows_and_each_message_to_the_reader(tmp_path: Path) -> None:

@@ -46,6 +46,7 @@ def line_with(words: Sequence[str], process: subprocess.Popen[str]) -> str:
     raise AssertionError(f"no line with {words}")
 
 
+@pytest.mark.nightly
 def test_no_request_fails_while_one_machine_is_preempted_and_the_other_one_killed() -> None:
     options = ("--calm", 0.5, "--notice", 4, "--json")
     ended = subprocess.run(command(*options), capture_output=True, text=True, timeout=_PATIENCE_S, check=False)

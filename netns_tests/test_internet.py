@@ -49,7 +49,15 @@ def test_a_nat_maps_a_socket_to_one_endpoint_unless_it_is_symmetric(
     assert len(set(seen)) in (1, 3)
 
 
-@pytest.mark.parametrize("access", NATS, ids=lambda each: each.value)
+@pytest.mark.parametrize(
+    "access",
+    [
+        Access.FULL_CONE,
+        Access.SYMMETRIC,
+        *(pytest.param(each, marks=pytest.mark.nightly) for each in (Access.PORT_RESTRICTED, Access.DOUBLE_NAT)),
+    ],
+    ids=lambda each: each.value,
+)
 def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
     laboratory: Laboratory, borders: tuple[Host, Host], access: Access
 ) -> None:

@@ -147,8 +147,14 @@ def test_the_filter_of_a_killed_switch_forwards_no_more_and_the_next_run_replace
     assert not any(map(has_clsact, ports))
 
 
-@pytest.mark.parametrize("clsact", [False, True], ids=["link", "filter"])
-@pytest.mark.parametrize(("first", "words"), [("link", "a live switch"), ("filter", "live process {pid}")])
+@pytest.mark.parametrize(
+    ("first", "words", "clsact"),
+    [
+        pytest.param(first, words, clsact, marks=[pytest.mark.nightly] * (clsact == (first == "link")))
+        for first, words in (("link", "a live switch"), ("filter", "live process {pid}"))
+        for clsact in (False, True)
+    ],
+)
 def test_a_device_that_a_live_switch_has_is_refused(
     machine: LabMachine, ports: list[str], first: str, words: str, clsact: bool
 ) -> None:

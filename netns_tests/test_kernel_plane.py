@@ -6,7 +6,7 @@ import socket
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyroute2 import IPRoute
 
@@ -171,21 +171,27 @@ def test_an_idle_poll_asks_no_device(make_kernel: MakeKernel, monkeypatch: pytes
 GROUPS = st.lists(st.sampled_from([TO_WIDE, TO_NARROW, TO_ABSENT]), min_size=2, max_size=6).map(tuple)
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(hops=GROUPS, size=st.sampled_from([0, 604, 605, 1404]), hops_left=st.sampled_from([2, 64, 127]))
-def test_generated_groups_copy_as_the_reference_says(
-    make_kernel: MakeKernel, ends: dict[int, socket.socket], hops: Hops, size: int, hops_left: int
-) -> None:
-    plane = make_kernel(filled({ONE: hops}))
-    given = frame(ONE, bytes(size), hops_left=hops_left)
-    said = decide(given, {ONE: hops}, MTUS)
-    assert isinstance(said, Forward)
-    ends[IN].send(given)
-    settle(plane, 1)
-    for port in (WIDE, NARROW):
-        assert waiting(ends[port]) == [rewrite(given, macs) for to, macs in said.hops if to == port]
-    assert [plane.counters.drops[reason] for reason in DropReason] == [said.lost.count(reason) for reason in DropReason]
-    plane.close()
+def test_generated_groups_copy_as_the_reference_says(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+    table = filled()
+    plane = make_kernel(table)
+
+    @settings(deadline=None, max_examples=40)
+    @given(hops=GROUPS, size=st.sampled_from([0, 604, 605, 1404]), hops_left=st.sampled_from([2, 64, 127]))
+    def check(hops: Hops, size: int, hops_left: int) -> None:
+        table.install(ONE, hops, float("inf"))
+        before = plane.counters
+        taken, drops = before.frames_in, list(before.drops)
+        given = frame(ONE, bytes(size), hops_left=hops_left)
+        said = decide(given, {ONE: hops}, MTUS)
+        assert isinstance(said, Forward)
+        ends[IN].send(given)
+        settle(plane, taken + 1)
+        for port in (WIDE, NARROW):
+            assert waiting(ends[port]) == [rewrite(given, macs) for to, macs in said.hops if to == port]
+        lost = [after - former for after, former in zip(plane.counters.drops, drops, strict=True)]
+        assert lost == [said.lost.count(reason) for reason in DropReason]
+
+    check()
 
 
 @pytest.mark.parametrize(("branches", "by_kernel"), [(BRANCHES_MAX, 1), (BRANCHES_MAX + 1, 0)])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 
+from lab.machine import gdp as gdp_command
 from lab.process import until
 from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
@@ -22,6 +24,7 @@ pytestmark = pytest.mark.netns
 
 STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"
 TIMEOUT_S = 1.0
+PREFIX = "robot1"
 CROSSINGS = (
     Crossing("/odom", "nav_msgs/msg/Odometry", "a", "one"),
     Crossing("/image", "sensor_msgs/msg/Image", "one", "a"),
@@ -35,6 +38,8 @@ CROSSINGS = (
     Crossing("/statics", "geometry_msgs/msg/TransformStamped", "a", "b"),
     Crossing("/twice", STRING, "a", "b twin"),
     Crossing("/twice_back", STRING, "b twin", "a"),
+    Crossing("/leaving", SET_BOOL, "a", "b", "service"),
+    Crossing("/prefixed", STRING, "a", "b", options={"prefix": PREFIX}),
     *(Crossing(f"/churn_{at}", STRING, "a", "b") for at in range(10)),
 )
 _ROS2 = """
@@ -303,6 +308,45 @@ def test_what_comes_and_goes_leaves_memory_and_descriptors_where_they_were(a: Pe
     for (descriptors, memory_kib), (more_descriptors, more_kib) in zip(before, after, strict=True):
         assert abs(more_descriptors - descriptors) <= 4
         assert more_kib - memory_kib <= 4_096
+
+
+def gdp(pair: Pair, label: str, *words: str) -> list[Mapping[str, object]]:
+    """Return what a command about a running proxy prints as JSON, a line each."""
+    printed = gdp_command(*words, "--config", pair.folder / f"proxy-{label}.yaml", "--json")
+    return [json.loads(line) for line in printed.splitlines()]
+
+
+def test_a_prefixed_topic_crosses_is_watched_and_is_denied_by_command(a: Peer, b: Peer, pair: Pair) -> None:
+    b.tell("read(String, '/prefixed')")
+
+    def arrives() -> object:
+        return a.tell("say('/prefixed', 'hello')") or b.tell("len(heard['/prefixed'])")
+
+    until(arrives, "/prefixed at the station")
+    (event,) = gdp(pair, "b", "watch", f"/{PREFIX}/*", "--count", "1")
+    assert (event["event"], event["role"], event["name"]) == ("appears", "publisher", f"/{PREFIX}/prefixed")
+    assert gdp(pair, "a", "rule", "add", "deny", "/prefixed")[0]["applied"] == "now"
+    until(lambda: not gdp(pair, "b", "watch", f"/{PREFIX}/*", "--for", "0"), "the publisher goes")
+    assert gdp(pair, "a", "rule", "remove", "deny", "/prefixed")[0]["applied"] == "now"
+    b.tell("!heard['/prefixed'].clear()")
+    until(arrives, "/prefixed at the station again")
+
+
+def test_a_proxy_that_leaves_answers_what_is_under_way_and_ends(a: Peer, b: Peer, pair: Pair) -> None:
+    a.tell(
+        "!asked = []\n"
+        "def answered(request, response):\n"
+        " asked.append(1); __import__('time').sleep(1); response.success, response.message = True, 'done'\n"
+        " return response\n"
+        "leaving = node.create_service(SetBool, '/leaving', answered)"
+    )
+    b.tell("!leaving = node.create_client(SetBool, '/leaving')")
+    b.waits_for("leaving.service_is_ready()", True)
+    b.tell("!left = ask(leaving, SetBool.Request(data=True))")
+    a.waits_for("len(asked)", 1)
+    pair.proxy("a").end(signal.SIGUSR1)  # and wait for its end
+    b.waits_for("left", [[True, "done"]])
+    assert "leaving" in pair.proxy("a").said
 
 
 def test_what_crossed_still_does_when_three_leases_are_over(a: Peer, b: Peer, pair: Pair) -> None:

@@ -111,6 +111,7 @@ def test_a_type_that_the_far_machine_has_not(pair: Pair, a: Peer, b: Peer) -> No
     flows(a, b)
 
 
+@pytest.mark.nightly
 def test_definitions_that_differ(pair: Pair, a: Peer, b: Peer) -> None:
     one = node_of(pair, "one")
     a.tell("read(Point32, '/corner')")
@@ -169,7 +170,7 @@ def failures(proxy: Proxy) -> int:
     return sum(map(proxy.faults, ("refused", "timed-out", "no-server")))
 
 
-@pytest.mark.parametrize("kill", [False, True])
+@pytest.mark.parametrize("kill", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_a_server_that_leaves_or_dies_while_it_is_asked(pair: Pair, a: Peer, b: Peer, kill: bool) -> None:
     server = node_of(pair, "a", f"server_{kill}".lower())
     server.tell("!" + _SERVER)
@@ -226,6 +227,7 @@ def test_a_master_that_restarts(pair: Pair, a: Peer, b: Peer) -> None:
     until(lambda: a.tell("pulse.publish(String())") or late.tell("len(heard['/pulse'])"), "/pulse after the restart")
 
 
+@pytest.mark.nightly
 def test_what_crossed_still_does_when_three_leases_are_over(pair: Pair, a: Peer, b: Peer) -> None:
     pair.outlive()
     flows(a, b)

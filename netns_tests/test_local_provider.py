@@ -132,7 +132,7 @@ def test_a_frozen_machine_is_taken_at_the_moment_of_its_notice_too(provider: Loc
     until(lambda: machine_of(provider, machine).state is MachineState.GONE, "taken")
 
 
-@pytest.fixture(params=["with cgroups", "without"])
+@pytest.fixture(params=["with cgroups", pytest.param("without", marks=pytest.mark.nightly)])
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also let a test run as it does where cgroups may not be written."""
     if request.param == "without":

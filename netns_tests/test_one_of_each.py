@@ -93,6 +93,7 @@ def test_the_same_identity_is_refused_in_another_network_namespace_and_from_a_co
     refused(second, "error: this switch already runs, pid")
 
 
+@pytest.mark.nightly
 def test_of_two_switches_with_one_identity_on_two_hosts_the_older_one_stays_and_both_say_so(
     space: Space, start: Start
 ) -> None:
@@ -125,7 +126,10 @@ def test_a_second_proxy_is_refused_and_a_killed_one_can_be_started_at_once(space
 
 
 def test_a_proxy_says_that_its_device_comes_with_a_switch(space: Space, start: Start) -> None:
-    says(start("robot", "proxy"), "error: proxy0: no such device; start gdp-switch with attach: [proxy0] first")
+    says(
+        start("robot", "proxy", "--await-iface", "0.2"),
+        "error: proxy0: no such device; start gdp-switch with attach: [proxy0] first",
+    )
 
 
 def test_a_switch_reports_that_its_link_is_down_and_then_that_no_neighbour_answers(space: Space, start: Start) -> None:
@@ -139,6 +143,7 @@ def test_a_switch_reports_that_its_link_is_down_and_then_that_no_neighbour_answe
     assert sum("link down" in line for line in switch.logged.splitlines()) == 1
 
 
+@pytest.mark.nightly
 def test_a_proxy_without_a_rib_says_so_and_is_attached_when_there_is_one(space: Space, start: Start) -> None:
     space.veth("eth0", "far0", *_MACS)
     says(start("robot", "switch"), " is up")
@@ -148,6 +153,7 @@ def test_a_proxy_without_a_rib_says_so_and_is_attached_when_there_is_one(space: 
     says(proxy, '"ready"')
 
 
+@pytest.mark.nightly
 def test_switches_of_two_domains_that_do_not_trust_each_other_say_so(space: Space, start: Start) -> None:
     space.veth("eth0", "far0", *_MACS)
     with pytest.raises(SystemExit):

@@ -80,7 +80,7 @@ def pair(laboratory: Laboratory) -> Pair:
     return made
 
 
-@pytest.mark.parametrize("label", ["border", "robot"])
+@pytest.mark.parametrize("label", [pytest.param("border", marks=pytest.mark.nightly), "robot"])
 def test_a_tunnel_with_a_killed_end_works_again_with_a_new_key(pair: Pair, label: str) -> None:
     before = pair.key(pair.border)
     host = pair.border if label == "border" else pair.robot

@@ -19,7 +19,7 @@ _TOPIC = "/camera/image"
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(CABLE, marks=pytest.mark.nightly, id="cable"), pytest.param(TUTORIAL, id="tutorial")]
+    "page", [pytest.param(CABLE, id="cable"), pytest.param(TUTORIAL, marks=pytest.mark.nightly, id="tutorial")]
 )
 def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_page(
     page: list[Block], space: Space, tmp_path: Path

@@ -87,7 +87,6 @@ def test_a_group_without_machines_stands_until_it_is_closed(provider: LocalProvi
     assert [each.run for each in provider.runs.all()] == [network.run]
 
 
-@pytest.mark.nightly
 def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> None:
     first, second = (provider.create(spec(name), ticking()) for name in ("m1", "m2"))
     provider.attach_uplink(first)
@@ -159,6 +158,7 @@ def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
     assert not left_of(made)
 
 
+@pytest.mark.nightly
 @needs_ros2
 def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) -> None:
     fog.run("launch", str(ECHO), "--gateway", "replica", "--detach")

@@ -50,9 +50,8 @@ def end(node: LabProcess) -> int | None:
     return node.code
 
 
-@pytest.fixture
-def nodes(space: Space, machine: LabMachine) -> LabMachine:
-    """LabMachine with the files of a switch, a RIB and a recording proxy; a link p0 to q0."""
+def configured(space: Space, machine: LabMachine) -> LabMachine:
+    """Return the machine with the files of a switch, a RIB and a recording proxy; a link p0 to q0."""
     make_nodes(machine.folder, {each.value: each for each in ROLES}, {"proxy": {"/a": [Right.READ]}}, TYPES)
     for folder in ("kept", "revoked"):
         (machine.folder / folder).mkdir()
@@ -64,6 +63,11 @@ def nodes(space: Space, machine: LabMachine) -> LabMachine:
     machine.write("proxy", "proxy", iface="proxy0", **places, **{"import": [rule]})
     space.veth("p0", "q0", bytes.fromhex("02000000aa01"), bytes.fromhex("02000000aa02"))
     return machine
+
+
+@pytest.fixture
+def nodes(space: Space, machine: LabMachine) -> LabMachine:
+    return configured(space, machine)
 
 
 def start_all(machine: LabMachine) -> tuple[LabProcess, LabProcess, LabProcess]:

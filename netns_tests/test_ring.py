@@ -1,10 +1,8 @@
-"""Whole ring demonstration on real sockets: recordings, links that fail, an eavesdropper, and abrupt ends."""
+"""Whole ring demonstration on real sockets: recordings, links that fail, and an eavesdropper."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -17,9 +15,6 @@ import pytest
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.errors import LocalError
-from gdp.host.cgroups import Cgroup
-from gdp.host.run_registry import RunRegistry
 from gdp.stores.issue import make_node
 from lab.process import calling
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
@@ -110,6 +105,7 @@ def test_every_encoding_crosses(demo: Path, tmp_path: Path, encoding: str) -> No
     assert settings["encoding"] == encoding
 
 
+@pytest.mark.nightly
 @pytest.mark.momentary(FAST)
 def test_a_ros_1_recording_comes_out_as_a_ros_1_bag(tmp_path: Path) -> None:
     crossed(tmp_path, make_demo(tmp_path, 0.3, "--ros1"), "--rate", 0, "--out", tmp_path)
@@ -131,15 +127,21 @@ def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
     crossed(tmp_path, make_demo(tmp_path, 0.1, "--without-images"), "--data-plane", "scapy")
 
 
+@pytest.mark.nightly
 def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer: Path, tmp_path: Path) -> None:
     result = crossed(tmp_path, longer, *LASTING, "--cut", "nuc2-nuc3@2")
     (imu,) = (row for row in topics(result) if row["topic"] == "/imu")
     assert imu["hops_seen"] in ([5, 2], [2, 5])
 
 
-def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, tmp_path: Path) -> None:
-    faults = ["--cut", "nuc1-nuc2@1-3", "--kill", "rib:school@2", "--roam", "robot:nuc2@4.5", "--kill", "switch:nuc1@5"]
-    crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
+def test_what_fails_and_moves_one_after_the_other_costs_no_message(tmp_path: Path) -> None:
+    faults = ["--cut", "nuc1-nuc2@1-4", "--kill", "rib:school@2", "--roam", "robot:nuc2@5", "--kill", "switch:nuc1@6"]
+    words = ["--seconds", 10, "--lease", LEASE_S, *faults, "--out", tmp_path]
+    result = crossed(tmp_path, make_demo(tmp_path, 1, "--ros1"), *words)
+    (imu,) = (row for row in topics(result) if row["topic"] == "/imu")
+    assert {2, 5} <= set(imu["hops_seen"])  # type: ignore[call-overload]  # over the cut link, and by the other way
+    with BagReader(tmp_path / "recording.bag") as received:
+        assert {channel.ros for channel in received.channels} == {1}
 
 
 def run_ordered(least: str, *arguments: str) -> None:
@@ -156,9 +158,8 @@ def run_ordered(least: str, *arguments: str) -> None:
         cli.main()
 
 
-@pytest.mark.parametrize(
-    "least", ["backbone", *(pytest.param(each, marks=pytest.mark.nightly) for each in ("school", "cloud"))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("least", ["backbone", "school", "cloud"])
 def test_every_rib_dies_one_after_the_other_and_no_message_is_lost_whichever_has_the_least_name(
     least: str, demo: Path, tmp_path: Path
 ) -> None:
@@ -207,13 +208,18 @@ def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["/nowhere/my.bag"], "no such recording: /nowhere/my.bag"),
         ([__file__], "cannot be read: neither a ROS 1 bag nor MCAP nor sqlite3"),
-        (["--cut", "nuc1-nuc3@1"], "no link nuc1-nuc3"),
-        (["--kill", "switch:nuc1@1"], "with switch nuc1 dead, robot has no switch"),
-        (["--roam", "cat:nuc2@1"], "no proxy cat"),
         (["--encoding", "xml"], "--encoding is one of json, cbor, cdr, not 'xml'"),
-        (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
+        *(
+            pytest.param(words, complaint, marks=pytest.mark.nightly)
+            for words, complaint in (
+                (["/nowhere/my.bag"], "no such recording: /nowhere/my.bag"),
+                (["--cut", "nuc1-nuc3@1"], "no link nuc1-nuc3"),
+                (["--kill", "switch:nuc1@1"], "with switch nuc1 dead, robot has no switch"),
+                (["--roam", "cat:nuc2@1"], "no proxy cat"),
+                (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
+            )
+        ),
     ],
 )
 def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
@@ -222,89 +228,9 @@ def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str]
     assert complaint in ended.stderr
 
 
-def started(demo: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
-    """Start a run and wait until traffic flows; return it and its id."""
-    process = subprocess.Popen(command(demo, *more), stderr=subprocess.PIPE, text=True, cwd=PROJECT)
-    run = ""
-    assert process.stderr is not None
-    for line in process.stderr:
-        if " run " in line and ": five" in line:
-            run = line.split(" run ")[1].split(":")[0]
-        if "replaying" in line:
-            return process, run
-    raise AssertionError("the ring ended before it replayed")
-
-
 def left_of(run: str) -> list[str]:
     """Return the remains of a run: records, namespaces, files, processes."""
     places = [Path("/run/gdp"), Path("/run/netns"), Path(tempfile.gettempdir())]
     files = [str(path) for place in places if place.is_dir() for path in place.iterdir() if run in path.name]
     commands = [path / "cmdline" for path in Path("/proc").iterdir() if path.name.isdigit()]
     return files + [str(path) for path in commands if path.exists() and run in path.read_text(errors="replace")]
-
-
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.nightly)]
-)
-def test_an_interrupted_run_leaves_nothing(longer: Path, number: signal.Signals, code: int) -> None:
-    process, run = started(longer)
-    with process:
-        process.send_signal(number)
-        assert process.wait(30) == code
-    assert left_of(run) == []
-
-
-@pytest.mark.momentary(FAST)
-def test_what_a_killed_run_left_is_gone_with_the_next(longer: Path, demo: Path, tmp_path: Path) -> None:
-    process, run = started(longer)
-    with process:
-        process.kill()
-    assert left_of(run) != []
-    crossed(tmp_path, demo, "--rate", 0)
-    assert left_of(run) == []
-
-
-@pytest.mark.momentary(FAST)
-def test_machines_have_their_cores_by_control_groups_which_the_next_run_removes(
-    longer: Path, demo: Path, tmp_path: Path
-) -> None:
-    probe = Cgroup(f"gdp-test-{os.getpid()}")
-    try:
-        probe.make()
-        probe.share_cpu(1)
-    except LocalError as error:
-        pytest.skip(f"no control groups with weights here: {error}")
-    finally:
-        probe.remove()
-    process, run = started(longer, "--cores")
-    members = [path.read_text().split() for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/cgroup.procs")]
-    with process:
-        process.kill()
-    assert members
-    assert all(members)
-    weights = {
-        path.parent.name.removeprefix(f"gdp-{run}-"): int(path.read_text())
-        for pattern in ("cpu.weight", "cpu.shares")
-        for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/{pattern}")
-    }
-    assert weights.keys() == {f"nuc{number}" for number in range(1, 6)}
-    assert {node: weight / weights["nuc1"] for node, weight in weights.items() if node != "nuc1"} == dict.fromkeys(
-        ("nuc2", "nuc3", "nuc4", "nuc5"), 2.0
-    )
-    result = crossed(tmp_path, demo, "--rate", 0, "--cores")
-    settings = result["settings"]
-    assert isinstance(settings, dict)
-    assert settings["cores"] == {"nuc1": 2, "nuc2": 4, "nuc3": 4, "nuc4": 4, "nuc5": 4}
-    assert list(Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*")) == []
-
-
-def test_a_kept_ring_stands_until_it_is_taken_down(demo: Path) -> None:
-    ended = ring(demo, "--rate", 0, "--keep")
-    assert ended.returncode == 0, ended.stderr
-    run = ended.stderr.split("The ring of run ")[1].split(" ")[0]
-    records = RunRegistry()
-    assert run not in records.sweep()
-    assert left_of(run) != []
-    down = ring("--down")
-    assert run in down.stderr
-    assert left_of(run) == []

@@ -130,10 +130,15 @@ def test_an_interrupted_live_run_leaves_nothing() -> None:
     ("arguments", "complaint"),
     [
         (["--live", "ros3"], "--live is one of ros2, ros1, mixed, not 'ros3'"),
-        (["--live", "--rate", "0"], "--live is without a recording"),
-        (["--live", "--camera-hz", "0"], "--camera-hz is 0.1 to 120, not 0"),
-        (["--camera-hz", "5"], "--camera-hz is for --live"),
-        ([__file__, "--live"], "--live is without a recording"),
+        *(
+            pytest.param(words, complaint, marks=pytest.mark.nightly)
+            for words, complaint in (
+                (["--live", "--rate", "0"], "--live is without a recording"),
+                (["--live", "--camera-hz", "0"], "--camera-hz is 0.1 to 120, not 0"),
+                (["--camera-hz", "5"], "--camera-hz is for --live"),
+                ([__file__, "--live"], "--live is without a recording"),
+            )
+        ),
     ],
 )
 def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:

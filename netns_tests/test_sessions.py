@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Iterator
 
 import pytest
 
 from gdp.trust.right import Right
-from netns_tests.session_lab import SessionLab, session_lab
+from lab.process import calling
+from netns_tests.session_lab import SessionLab, execute, session_lab
 
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
     pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
@@ -31,7 +31,7 @@ def lab() -> Iterator[SessionLab]:
 def run(lab: SessionLab, code: str) -> list[str]:
     """Run a program of both nodes to its end and return the lines it printed."""
     head = "import asyncio, threading, time, gdp\n"
-    return lab.output(sys.executable, "-c", head + code).splitlines()
+    return lab.output(*calling(execute, head + code)).splitlines()
 
 
 def test_threads_that_publish_and_receive_at_once_lose_nothing(lab: SessionLab) -> None:

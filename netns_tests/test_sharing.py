@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,7 +48,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 latched = node.create_publisher(
     String, '/robot_description', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
 latched.publish(String(data='a robot'))
-clock = node.create_publisher(String, '/clock', QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+quick = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+volatile = [node.create_publisher(String, topic, quick) for topic in ('/scan', '/clock')]
 """
 _LISTENER = """
 from std_msgs.msg import String
@@ -119,10 +119,11 @@ class Site:
         until(lambda: len(self.heard(topic)) > more_than, topic, PATIENCE_S)
 
 
-@pytest.fixture
-def site(space: Space, tmp_path: Path) -> Iterator[Site]:
-    space.ip("link", "set", "lo", "up")
-    with LabMachine(tmp_path, environment=CONFINED) as machine, ExitStack() as stack:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    folder = tmp_path_factory.mktemp("site")
+    with Space() as space, LabMachine(folder, environment=CONFINED) as machine, ExitStack() as stack:
+        space.ip("link", "set", "lo", "up")
         yield Site(machine, stack)
 
 
@@ -155,7 +156,7 @@ def test_topics_are_shared_and_taken_back_while_another_flows_without_a_loss(sit
 def test_the_far_graph_shows_a_publishers_qos_before_any_reader_and_the_first_latched_one_matches(site: Site) -> None:
     for topic, qos in (
         ("/robot_description", ("RELIABLE", "TRANSIENT_LOCAL")),
-        ("/clock", ("BEST_EFFORT", "VOLATILE")),
+        ("/scan", ("BEST_EFFORT", "VOLATILE")),
     ):
         assert site.gdp("import", "server", topic, "--from", "robot")["is_running"] is True
         assert site.gdp("expose", "robot", topic, "--to", "server", "--wait", str(PATIENCE_S))["delegated"]
@@ -171,14 +172,18 @@ def test_a_name_that_its_machine_no_longer_exposes_leaves_the_far_graph_and_come
         names = site.machine.status("server/proxy")
         return {each["local"] for each in names["liveliness"] if each["side"] == "import"}
 
+    def state() -> object:
+        (offer,) = (each for each in site.gdp("import", "server", "--list")["offers"] if each["name"] == topic)
+        return offer["state"]
+
     topic, expose = "/clock", ("expose", "robot", "/clock", "--to", "server", "--wait", str(PATIENCE_S))
     assert site.gdp("import", "server", topic)["is_running"] is True
     for _ in range(2):
         assert site.gdp(*expose)["delegated"]
-        assert site.gdp("import", "server", "--list")["offers"][0]["state"] == "used"
+        assert state() == "used"
         site.listener.waits_for(f"offered('{topic}')", [["BEST_EFFORT", "VOLATILE"]])
         assert topic in imported()
         assert site.gdp("expose", "robot", topic, "--remove")["problems"] == []
-        assert site.gdp("import", "server", "--list")["offers"][0]["state"] == "withdrawn: robot no longer exposes it"
+        assert state() == "withdrawn: robot no longer exposes it"
         site.listener.waits_for(f"offered('{topic}')", [])
         assert topic not in imported()

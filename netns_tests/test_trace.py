@@ -23,6 +23,7 @@ from gdp.management.control_client import NodeConnection, find_control_socket
 from lab.machine import GDP, gdp
 from netns_tests.test_fog_demo import command as fog_command
 from netns_tests.test_ring import command as ring_command
+from netns_tests.test_ring import make_demo
 from tests.pages import ROOT
 
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("a request and its reply take milliseconds")]
@@ -69,9 +70,10 @@ def labels(path: Mapping[str, object]) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def ring() -> Iterator[Path]:
+def ring(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Run the ring with a recording, and return the folder of its nodes."""
-    with running(ring_command("--seconds", RING_S), lambda line: "msg/s" in line) as process:
+    demo = make_demo(tmp_path_factory.mktemp("demo"), 1)
+    with running(ring_command(demo, "--seconds", RING_S), lambda line: "msg/s" in line) as process:
         (run,) = (each for each in RunRegistry().all() if each.owner.pid == process.pid)
         yield Path(run.files[0]) / "nodes"
 

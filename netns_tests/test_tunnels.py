@@ -90,7 +90,13 @@ def test_a_link_sends_nothing_by_itself(sites: tuple[Site, Site], ends: Ends) ->
     assert {frame[12:14].hex() for frame in heard} == {"88b5"}
 
 
-@pytest.mark.parametrize("is_dialler", [False, True], ids=["the end that answers", "the end that dials"])
+@pytest.mark.parametrize(
+    "is_dialler",
+    [
+        pytest.param(False, id="the end that answers", marks=pytest.mark.nightly),
+        pytest.param(True, id="the end that dials"),
+    ],
+)
 def test_a_session_survives_a_change_of_address(sites: tuple[Site, Site], ends: Ends, is_dialler: bool) -> None:
     one, two = sites[0].frames(), sites[1].frames()
     until(crosses(one, two), *ends)

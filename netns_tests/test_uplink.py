@@ -2,7 +2,7 @@
 
 ::
 
-    [robot] ---- [gateway, RIB] ---- [r0]  [r1]  [r2]  [r3]           one replica at each of r0 to r3
+    [robot] ---- [gateway, RIB] ---- [r0]  [r1]  [r2]           one replica at each of r0 to r2
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from netns_tests import uplink_child
 
 pytestmark = pytest.mark.netns
 
-REPLICAS: Final = ("r0", "r1", "r2", "r3")
+REPLICAS: Final = ("r0", "r1", "r2")
 PATIENCE_S: Final = 60.0
-REQUESTS, BYTES = 200, 10_000
+REQUESTS, BYTES = 100, 10_000
 PARTS, MTU_BYTES, OVERHEAD_BYTES = 8, 1_500, 14 + 96  # Ethernet and our header, in each part
 SERVICE: Final = Metadata({"kind": "service", "name": "/plan", "type": "std_srvs/srv/SetBool"})
 TOPOLOGY: Final = Topology(
@@ -74,7 +74,7 @@ class Field:
         root = credentials.domain("field") / ROOT_CERTIFICATE
         where = (name, credentials.identity(Role.PROXY, switch), root, "member")
         argv = calling(uplink_child.main, *where, right.value, *load)
-        self._starting.append(self._machines[switch].launch(argv, f"member-{switch}", has_orders=True))
+        self._starting.append(self._machines[switch].launch(argv, f"member-{switch}", has_orders=right is Right.CALL))
         return self._starting[-1]
 
     def sent_bytes(self) -> int:
@@ -104,7 +104,7 @@ def test_one_copy_of_a_request_leaves_the_robot_whatever_the_number_of_replicas(
     robot = field.member("robot", Right.CALL, REQUESTS, BYTES)
     sent: dict[int, int] = {}
     started = 0
-    for replicas in (1, 2, 4):
+    for replicas in (1, 3):
         for name in REPLICAS[started:replicas]:
             field.member(name, Right.SERVE)
         field.wait()
@@ -116,6 +116,3 @@ def test_one_copy_of_a_request_leaves_the_robot_whatever_the_number_of_replicas(
     once = REQUESTS * (BYTES + PARTS * OVERHEAD_BYTES)
     assert all(once < each < 1.15 * once for each in sent.values()), sent
     assert max(sent.values()) < 1.05 * min(sent.values()), sent
-    before = field.sent_bytes()
-    tell(robot, "ask")
-    assert field.sent_bytes() - before < 1.15 * once

@@ -115,7 +115,7 @@ def test_a_machine_that_does_not_reach_the_border_does_not_join(site: Field) -> 
     assert "check the network, and that TCP to it is let through" in text
 
 
-@pytest.mark.parametrize("command", ["join", "create"])
+@pytest.mark.parametrize("command", ["join", pytest.param("create", marks=pytest.mark.nightly)])
 def test_on_a_full_disk_no_directory_is_left_and_no_token_used(site: Field, command: str) -> None:
     words = JOIN if command == "join" else "gdp domain create lab --public 192.0.2.1 --listen 51821 --relay-port 0"
     small = "mount -t tmpfs -o size=512k tmpfs /var/lib && {}; code=$?; ls -A /var/lib/gdp; exit $code"
@@ -127,8 +127,10 @@ def test_on_a_full_disk_no_directory_is_left_and_no_token_used(site: Field, comm
 @pytest.mark.parametrize(
     ("bound", "text"),
     [
-        ("create_server(('', 51820))", "TCP port 51820 is in use"),
-        ("create_server(('', 443))", "TCP port 443 is in use"),
+        *(
+            pytest.param(f"create_server(('', {port}))", f"TCP port {port} is in use", marks=pytest.mark.nightly)
+            for port in (51_820, 443)
+        ),
         ("socket(type=socket.SOCK_DGRAM); bound.bind(('', 51820))", "UDP port 51820 is in use"),
     ],
 )

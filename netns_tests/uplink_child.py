@@ -1,8 +1,7 @@
 """Participant without ROS in a process of its own: a replica that takes requests, or the robot that calls.
 
 The robot reads commands on standard input, each a line of JSON: ``{"word": ...}``. A number: it prints ``met`` when it
-has this many peers. ``go``: it prints ``done`` when all peers have confirmed its requests. ``ask``: the same with
-requests to one peer.
+has this many peers. ``go``: it prints ``done`` when all peers have confirmed its requests.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from gdp.client.participant import Topic
@@ -39,21 +37,10 @@ class Robot:
 
     def publish(self) -> None:
         """Call all peers; return when all have confirmed."""
-        for _ in self._paced():
-            self._stream.publish(self._body)
-        assert self._runtime.run(self._stream.is_acknowledged, time.monotonic() + PATIENCE_S)
-
-    def ask(self) -> None:
-        """Call one peer; return when the request has left."""
-        server = self._member.services.peers(self._service)[0]
-        for _ in self._paced():
-            self._member.services.send_request(self._service, server, self._body)
-        self._runtime.run(lambda: False, time.monotonic() + 0.2)
-
-    def _paced(self) -> Iterator[None]:
         for _ in range(self._requests):
-            yield
+            self._stream.publish(self._body)
             self._runtime.run(lambda: False, time.monotonic() + GAP_S)
+        assert self._runtime.run(self._stream.is_acknowledged, time.monotonic() + PATIENCE_S)
 
 
 def main(service: str, identity_at: str, root: str, device: str, role: str, *load: str) -> None:
@@ -74,8 +61,6 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
     while end.runtime.run(lambda: bool(heard)) and (word := heard.pop()):
         if word == "go":
             robot.publish()
-        elif word == "ask":
-            robot.ask()
         else:
             robot.meet(int(str(word)))
         print("done", flush=True)

@@ -16,17 +16,19 @@ usage() { sed -n '2,8s/^# \{0,1\}//p' "${BASH_SOURCE[0]}" >&2; exit 2; }
 nodes=6
 
 stop() {
-    local at pid
+    local at pid ended=()
     for ((at = 1; at <= nodes; at++)); do
         [[ -f "$dir/$at/server.pid" ]] || continue
         pid=$(<"$dir/$at/server.pid")
         # the process id may belong to another process by now: a server of this script runs in its own folder
         if [[ "$(readlink "/proc/$pid/cwd" 2>/dev/null)" == "$dir/$at" ]]; then
-            kill "$pid"
-            while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done
+            kill "$pid" && ended+=("$pid")
         fi
-        rm -f "$dir/$at/server.pid"
     done
+    for pid in "${ended[@]}"; do  # all at once: a primary would wait ten seconds for a replica that lags
+        while kill -0 "$pid" 2>/dev/null; do sleep 0.05; done
+    done
+    rm -f "$dir"/*/server.pid
 }
 
 [[ $# -ge 1 ]] || usage

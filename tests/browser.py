@@ -15,7 +15,7 @@ import pytest
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
-__all__ = ["ARTEFACTS", "console_errors", "needs_browser", "open_browser", "save_picture"]
+__all__ = ["ARTEFACTS", "console_errors", "needs_browser", "open_browser", "prefer_scheme", "save_picture"]
 
 ARTEFACTS = Path(os.environ.get("GDP_ARTEFACTS", Path(__file__).resolve().parents[1] / "artefacts"))
 
@@ -26,12 +26,8 @@ needs_browser = pytest.mark.skipif(
 
 
 @contextlib.contextmanager
-def open_browser(width: int = 1_440, height: int = 900, *, is_dark: bool = False) -> Iterator[Chrome]:
-    """Yield a headless browser with a fresh profile.
-
-    Args:
-        is_dark: what the page learns as the user's preference.
-    """
+def open_browser(width: int = 1_440, height: int = 900) -> Iterator[Chrome]:
+    """Yield a headless browser with a fresh profile."""
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -42,8 +38,6 @@ def open_browser(width: int = 1_440, height: int = 900, *, is_dark: bool = False
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver") or ""))
     try:
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}]
-        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
         driver.execute_cdp_cmd(
             "Emulation.setDeviceMetricsOverride",
             {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
@@ -51,6 +45,12 @@ def open_browser(width: int = 1_440, height: int = 900, *, is_dark: bool = False
         yield driver
     finally:
         driver.quit()
+
+
+def prefer_scheme(driver: Chrome, *, is_dark: bool) -> None:
+    """Let pages learn that the user prefers dark or light colours."""
+    scheme = [{"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}]
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
 
 
 def console_errors(driver: Chrome) -> list[str]:

@@ -62,18 +62,20 @@ class RibHost:
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames."""
         self._now_s = now.mono_s
+        fragments = 0  # whose statement is not complete
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
-                statements += self._receive_statement(arrival, now)
+                fragments += not self._receive_frame(arrival, statements, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not end the RIB
                 self.rib.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
-        self.rib.receive_all(statements, now)
-        self._record_connection(now)
-        self._post()
+        if fragments < len(arrivals):
+            self.rib.receive_all(statements, now)
+            self._record_connection(now)
+            self._post()
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Update the state of a port's link."""
@@ -111,35 +113,33 @@ class RibHost:
     def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
 
-    def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
-        """Return the statement for the RIB that a frame completes, with its sender."""
+    def _receive_frame(self, arrival: ReceivedFrame, statements: list[tuple[bytes, Name]], now: Timestamps) -> bool:
+        """Add the statement for the RIB that a frame completes, with its sender; return False if it completes none."""
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:
                 self._handle_revocation(statement, now)
-            return []
+            return True
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
         if header.kind in (Kind.DIAGNOSTIC_REQUEST, Kind.DIAGNOSTIC_REPLY):
             self.diagnostics.receive(header, arrival, now)
-            return []
+            return True
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-        wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
-        if wire is None:
-            return []
+        if (wire := self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)) is None:
+            return False
         sender = Name(header.source)
-        opened = self._channels.receive(wire, sender, now)
-        if opened is None:
-            return []
+        if (opened := self._channels.receive(wire, sender, now)) is None:
+            return True
         if not opened.is_fresh and parse(opened.wire).type is not StatementType.PRESENCE:
             raise FrameError(DropReason.NO_CHANNEL, "a statement that may be a recorded one")
-        return [(opened.wire, sender)]
+        statements.append((opened.wire, sender))
+        return True
 
     def _handle_revocation(self, statement: Statement, now: Timestamps) -> None:
-        switch = self.attachment.switch
-        if switch is not None:
+        if (switch := self.attachment.switch) is not None:
             self.rib.revoke(statement.wire, switch.name, now)
             self.attachment.hello_protocol.recheck(Revocation.read(statement).fingerprint, now)
 

@@ -306,7 +306,7 @@ def run_seed(seed: int, options: Options) -> list[str]:
     )
     kinds = [SHORT[name] for name in options.only] if options.only else None
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
-    faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
+    faults = make_schedule(plan, seed, options.seconds, kinds=kinds, has_store=bool(in_store))
     more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
     begun_s = time.monotonic()
     with (
@@ -404,7 +404,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, action="append", help="a run of this seed; may be repeated (default: 1)")
     parser.add_argument("--hours", type=float, help="seed after seed, from the first on, for so long")
     parser.add_argument("--switches", type=int, default=14, help="12 to 20 (default: %(default)s)")
-    parser.add_argument("--pace-s", type=float, default=2.0, help="mean time between faults (%(default)s)")
     parser.add_argument(
         "--rate", type=float, default=1.0, help="factor on all rates of messages (default: %(default)s)"
     )

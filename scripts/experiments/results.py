@@ -273,6 +273,7 @@ def _interval(
     """Return the 95 % interval of the ratio of a figure of two samples, by resampling both."""
     chance = np.random.default_rng(_SEED)
     a, b = np.asarray(one), np.asarray(two)
-    ratios = [of(list(chance.choice(a, len(a)))) / of(list(chance.choice(b, len(b)))) for _ in range(_RESAMPLES)]
+    draws = ((chance.choice(a, len(a)).tolist(), chance.choice(b, len(b)).tolist()) for _ in range(_RESAMPLES))
+    ratios = [of(mine) / of(other) for mine, other in draws]
     low, high = np.quantile(ratios, (0.025, 0.975))
     return float(low), float(high)

@@ -7,7 +7,6 @@ nothing stays. Each command runs in a shell of its own, as in several terminals.
 from __future__ import annotations
 
 import re
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,8 +62,8 @@ class FreshMachine(LabMachine):
         Args:
             answer: what the command gets when it asks; empty: nothing.
         """
-        answered = f" <<< {shlex.quote(answer)}" if answer else ""
         path = f"{Path(sys.executable).parent}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
         environment = ["LANG=C.UTF-8", f"PATH={path}", f"PYTHONPATH={ROOT}", f"HOME={_HOME}"]
-        argv = ["env", "-i", *environment, "bash", "-c", f"exec {command}{answered}"]
-        return self.launch(argv, f"{self.host.label}-{len(self.running)}", heard=False)
+        argv = ["env", "-i", *environment, "bash", "-c", f"exec {command}"]
+        typed = self.launch(argv, f"{self.host.label}-{len(self.running)}", heard=False, has_orders=bool(answer))
+        return typed.answer(answer) if answer else typed

@@ -25,9 +25,10 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
+from lab.dds import UDP_PROFILE
 from lab.process import LabProcess
 from proxy.endpoints.ros1.install import rospy_folder
-from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph
+from ring.live_plan import MASTER_PORT, Graph
 
 _PATIENCE_S: Final = 60.0
 _DOMAIN: Final = 42
@@ -55,7 +56,7 @@ class _Stage(Stage):
             _Flow("/commands", "talker", "/chatter", self.cloud, self.drone),
         )
         profiles = self._folder / "fast_dds.xml"
-        profiles.write_text(FAST_DDS_PROFILES.replace("<type>UDPv4</type>", _ON_LOOPBACK))
+        profiles.write_text(UDP_PROFILE.replace("<type>UDPv4</type>", _ON_LOOPBACK))
         self.graphs = {self.drone.label: Graph(2, _DOMAIN), self.cloud.label: Graph(1, 0)}
         for label, graph in self.graphs.items():
             self._laboratory.hosts[label].environment = dict(graph.environment(self._folder / "ros-logs", profiles))

@@ -24,6 +24,7 @@ _PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
  </rtps></participant>
 </profiles></dds>
 """
+UDP_PROFILE: Final = _PROFILE.format(descriptors=_UDP, transports="<transport_id>udp</transport_id>")
 
 
 def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -> list[str]:
@@ -36,11 +37,8 @@ def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -
         shared_memory: whether processes of one machine use it; they use UDP otherwise.
     """
     profile = folder / f"dds-{'shm' if shared_memory else 'udp'}.xml"
-    transports = ("shm", "udp") if shared_memory else ("udp",)
-    text = _PROFILE.format(
-        descriptors=_SHM + _UDP if shared_memory else _UDP,
-        transports="".join(f"<transport_id>{each}</transport_id>" for each in transports),
-    )
+    transports = "<transport_id>shm</transport_id><transport_id>udp</transport_id>"
+    text = _PROFILE.format(descriptors=_SHM + _UDP, transports=transports) if shared_memory else UDP_PROFILE
     profile.write_text(text, encoding="utf-8")
     return [
         f"ROS_DOMAIN_ID={domain}",

@@ -23,6 +23,7 @@ from gdp.switch.table import Table
 _STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
 _SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
+_QUIET: Final = object()  # result of an event in which no core was called
 
 Tap = Callable[[float, str, str, bytes], None]
 
@@ -103,7 +104,7 @@ class SimNetwork:
     def __init__(self, seed: int = 1) -> None:
         self._random = random.Random(seed)
         self._nodes: dict[str, _Node] = {}
-        self._events: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._events: list[tuple[float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = 0
         self._now_s = 1_000.0
         self.taps: list[Tap] = []
@@ -191,7 +192,7 @@ class SimNetwork:
         self._settle(name)
 
     def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let time pass; return whether ``until`` came true (True without one).
+        """Let time pass; return whether ``until`` came true (True without one), after an event that called a core.
 
         Raises:
             LocalError: a core's timer is due repeatedly in one instant, which would be an endless loop on a real clock.
@@ -202,8 +203,7 @@ class SimNetwork:
         while self._events and self._events[0][0] <= end_s:
             at_s, _, action, arguments = heapq.heappop(self._events)
             self._now_s = max(self._now_s, at_s)
-            action(*arguments)
-            if until is not None and until():
+            if action(*arguments) is not _QUIET and until is not None and until():
                 return True
         self._now_s = end_s
         return until is None
@@ -229,7 +229,7 @@ class SimNetwork:
         self._count += 1
         return b"\x02" + self._count.to_bytes(5, "big")
 
-    def _push(self, at_s: float, action: Callable[..., None], *arguments: object) -> None:
+    def _push(self, at_s: float, action: Callable[..., object], *arguments: object) -> None:
         self._count += 1
         heapq.heappush(self._events, (at_s, self._count, action, arguments))
 
@@ -242,14 +242,13 @@ class SimNetwork:
         node.timer_s = max(due_s, self._now_s)
         self._push(node.timer_s, self._timer, name, node)
 
-    def _timer(self, name: str, node: _Node) -> None:
-        if self._nodes[name] is not node or not node.is_alive:
-            return
-        if node.timer_s is None or node.timer_s > self._now_s:
-            return
+    def _timer(self, name: str, node: _Node) -> object:
+        is_present = self._nodes[name] is node and node.is_alive
+        if not is_present or node.timer_s is None or node.timer_s > self._now_s:
+            return _QUIET
         node.timer_s = None
         if node.stalled is not None:
-            return
+            return _QUIET
         node.fired = node.fired + 1 if node.fired_s == self._now_s else 1
         node.fired_s = self._now_s
         if node.fired > _SAME_INSTANT_MAX:
@@ -257,6 +256,7 @@ class SimNetwork:
         if node.due_s is not None and node.due_s <= self._now_s + 1e-9:
             node.machine.handle_timer(Timestamps(self._now_s + 1e-6, EPOCH_UNIX_S + self._now_s))
         self._settle(name)
+        return None
 
     def _settle(self, name: str) -> None:
         node = self._nodes[name]
@@ -288,29 +288,29 @@ class SimNetwork:
             left_s = sim_link.leaves_s(far.mac, len(frame), self._now_s)
             self._push(left_s + delay_s, self._arrive, sim_link, far, frame)
 
-    def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> None:
-        if sim_link.is_up:
-            self._deliver(end, frame)
+    def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> object:
+        return self._deliver(end, frame) if sim_link.is_up else _QUIET
 
-    def _deliver(self, end: _End, frame: bytes) -> None:
+    def _deliver(self, end: _End, frame: bytes) -> object:
         node = self._nodes[end.node]
         if not node.is_alive or frame[:6] not in (end.mac, BROADCAST):
-            return
+            return _QUIET
         if node.stalled is not None:
             if len(node.stalled) < _STALLED_MAX:
                 node.stalled.append((end, frame))
-            return
+            return _QUIET
         node.came[end.port] += 1
         if node.table is not None:
             mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
             decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
-                return
+                return _QUIET
             if isinstance(decision, Forward):
                 self.drops.update(decision.lost)
                 for port, macs in decision.hops:
                     self._send(node.ports[port], rewrite(frame, macs))
-                return
+                return _QUIET
         node.machine.receive([ReceivedFrame(end.port, frame[6:12], frame[ETHER_BYTES:])], self.now)
         self._settle(end.node)
+        return None

@@ -142,6 +142,14 @@ class LabProcess:
             os.killpg(self.pid, signal.SIGKILL)
         self.reap()
 
+    def answer(self: _ProcessT, text: str) -> _ProcessT:
+        """Give it a line, and nothing after it; return it."""
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError), self._process.stdin as file:  # it may not ask
+            file.write(text.encode() + b"\n")
+        self._process.stdin = None
+        return self
+
     def close_orders(self) -> None:
         """Give no more commands; a process that reads them gets a moment to end by itself."""
         if self._process.stdin is not None:

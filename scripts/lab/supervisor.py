@@ -93,8 +93,8 @@ class Supervisor:
             if is_over():
                 return True
             wait_s = min(end_s - time.monotonic(), self._check(), self.meanwhile())
-            if time.monotonic() >= end_s:
-                return False
+            if time.monotonic() >= end_s or is_over():
+                return is_over()
             heard = [each for each in {*sources, *self._starting} if not each.is_silent]
             descriptors = [*(each.fileno() for each in heard), *self._required.values()]
             readable(descriptors, max(wait_s, 0.0) if wait_s < math.inf else None)

@@ -3,8 +3,8 @@
 I/O; Linux. An import of ``gdp-switch`` costs about half a second of processor time, a fork some milliseconds. ``Popen``
 is ``subprocess.Popen`` with the same command lines: where a line starts one of the project's own programs, the zygote
 forks it, otherwise it is executed. The forked process is a child of the caller, so that waiting, signals, process
-groups and ``/proc/PID/cmdline`` are the same. Coverage, other settings of the interpreter, another mount namespace or
-another copy of the project mean the real program.
+groups and ``/proc/PID/cmdline`` are the same. Coverage, other settings of the interpreter or another copy of the
+project mean the real program. So do namespaces other than by ``nsenter``, and a shell that does more than start it.
 
     zygote.install()
     process = subprocess.Popen([sys.executable, "-m", "gdp.cli.switch", "--help"])
@@ -19,13 +19,15 @@ import ctypes
 import fcntl
 import functools
 import gc
-import importlib
 import importlib.metadata
 import io
 import json
 import os
+import re
 import resource
 import runpy
+import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -44,15 +46,18 @@ _PRELOADED: Final = (
     "gdp.cli.relay",
     "proxy.cli.proxy",
     "proxy.cli.replay",
+    "proxy.recordings.child",
     "fog.cli.app",
-    "lab.namespaces",
-    "pyroute2.netns",
+    "ring.cli",
 )
-_STARTERS: Final = ("fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo")  # these start many programs
+# These start programs that a zygote forks.
+_STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
+_PLAIN: Final = re.compile(r"(?:[\w ./:,=@+%-]|'[^']*')+")  # a shell takes it for words
+_DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
-_SPACES: Final = ("cgroup", "ipc", "mnt", "pid", "user", "uts")
+_SPACES: Final = ("ipc", "mnt", "pid", "user", "uts")
 _LIMITS: Final = tuple(value for name, value in vars(resource).items() if name.startswith("RLIMIT_"))
 _REQUEST_BYTES: Final = 1 << 18
 _FIRST_FD: Final = 512  # received descriptors wait above this number until each has its own
@@ -63,40 +68,51 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What to run in a forked process; ``module`` as by ``python -m``, or else ``file`` as a script."""
+    """What to run in a forked process: ``module`` as by ``-m``, ``code`` as by ``-c``, or ``file`` as a script."""
 
     argv: list[str]
     module: str = ""
+    code: str = ""
     file: str = ""
-    netns: str = ""
+    spaces: tuple[str, ...] = ()
     pdeathsig: int = 0
+    is_bare: bool = False
     environment: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def from_argv(cls, argv: Sequence[str]) -> Program | None:
-        """Return the project's program that a command line starts; None: it starts something else."""
+    def from_argv(cls, argv: Sequence[str], path: str = "") -> Program | None:
+        """Return the project's program that a command line starts; None: another. ``path``: of commands."""
         words = [os.fspath(each) for each in argv]
-        netns, pdeathsig, environment = "", 0, []
+        spaces, pdeathsig, is_bare, environment = list[str](), 0, False, dict[str, str]()
         while words:
-            if words[0] == "nsenter" and len(words) > 2 and words[1].startswith("--net="):
-                netns, words = words[1].removeprefix("--net="), words[2:]
+            if words[0] == "nsenter" and len(words) > 2 and words[1].startswith(("--net=", "--mount=")):
+                spaces, words = [*spaces, words[1].partition("=")[2]], words[2:]
             elif words[:3] == ["setpriv", "--pdeathsig", "KILL"]:
                 pdeathsig, words = signal.SIGKILL, words[3:]
+            elif words[:2] == ["env", "-i"]:
+                is_bare, environment, words = True, {}, ["env", *words[2:]]
             elif words[0] == "env" and len(words) > 1 and not words[1].startswith("-"):
                 words = words[1:]
                 while words and "=" in words[0]:
                     name, _, value = words.pop(0).partition("=")
-                    environment.append((name, value))
+                    environment[name] = value
+            elif words[:-1] in (["bash", "-c"], ["bash", "-ec"]) and _PLAIN.fullmatch(words[-1]):
+                words = shlex.split(words[-1].removeprefix("exec "))
+                break
             else:
                 break
             words = words[1:] if words[:1] == ["--"] else words
+        words[:1] = [shutil.which(each, path=environment.get("PATH", path)) or each for each in words[:1]]
         if not words or Path(words[0]).parent != Path(sys.executable).parent:
             return None
-        program = cls(words, netns=netns, pdeathsig=pdeathsig, environment=tuple(environment))
+        values = tuple(environment.items())
+        program = cls(words, spaces=tuple(spaces), pdeathsig=pdeathsig, is_bare=is_bare, environment=values)
         if not Path(words[0]).name.startswith("python"):
             return replace(program, file=words[0]) if Path(words[0]).name in _scripts() else None
         if words[1:2] == ["-m"] and len(words) > 2 and words[2].partition(".")[0] in _PACKAGES:
             return replace(program, module=words[2])
+        if words[1:2] == ["-c"] and len(words) > 2 and _DECODER in words[2].splitlines():
+            return replace(program, code=words[2])
         if len(words) > 1 and words[1].endswith(".py") and Path(words[1]).resolve().is_relative_to(ROOT):
             return replace(program, file=words[1])
         return None
@@ -104,7 +120,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One program with what its process inherits.
+    """One program with what its process inherits. ``groups``: control groups that are not the zygote's.
 
     Descriptors travel with it: 0 to 2, the namespace, a pipe that is closed when the program begins, then ``fds``.
     """
@@ -114,6 +130,7 @@ class Request:
     cwd: str
     environment: dict[str, str]
     limits: list[list[int]]
+    groups: list[str]
     fds: list[int]
     new_session: bool
     umask: int
@@ -137,14 +154,15 @@ class Zygote:
         self.pid = pid
         self._link = link
         self._lock = threading.Lock()
-        self._place = _place()
+        self._place, self.groups = _place(), _groups()
         self._settings = _settings(os.environ)
 
     @classmethod
-    def start(cls) -> Zygote:
+    def start(cls, modules: Sequence[str] = _PRELOADED) -> Zygote:
         """Start a zygote: in an interpreter of its own, or as a fork of a process that a zygote has forked.
 
-        Call this before there are threads. In the new process it does not return.
+        Call this before there are threads. In the new process it does not return. ``modules``: what one in an
+        interpreter of its own imports, in this order.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -157,8 +175,10 @@ class Zygote:
                     sys.exit()
                 return cls(pid, ours)
             environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+            environment["OPENBLAS_NUM_THREADS"] = "1"  # a fork has no other threads
             theirs.set_inheritable(True)
             words = [sys.executable, __file__, str(theirs.fileno()), _PLACE_OF_NAME]
+            ours.send(json.dumps(modules).encode())
             return cls(os.posix_spawn(sys.executable, words, environment), ours)
 
     def fork(self, request: Request, descriptors: Sequence[int]) -> int:
@@ -177,14 +197,19 @@ class Zygote:
 
     def can_run(self, program: Program, environment: Mapping[str, str], cwd: Path) -> bool:
         """Return whether a forked process is the same as an executed one would be."""
-        if _settings(environment) != self._settings:
+        if _settings(environment) != ({} if program.is_bare else self._settings):  # an interpreter adds some by itself
             return False
         first = Path(program.file).parent if program.file else cwd
         folders = [first, *map(Path, filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))]
-        return self._place == _place() and not any(
-            (each / "sitecustomize.py").exists()
-            or ((each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp"))
-            for each in folders
+        are_ours = all(each.startswith("gdp-") for each in _groups() - self.groups)  # directly below the roots
+        return (
+            are_ours
+            and self._place == _place()
+            and not any(
+                (each / "sitecustomize.py").exists()
+                or ((each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp"))
+                for each in folders
+            )
         )
 
     def close(self) -> None:
@@ -242,18 +267,18 @@ class Popen(subprocess.Popen):  # type: ignore[type-arg]
 
     def _request(self, args: Any, pass_fds: Any, cwd: Any, env: Any, new_session: bool, umask: int) -> Request | None:
         """Return what to ask of the zygote; None: a forked process would be another than an executed one."""
-        program = None if self.zygote is None else Program.from_argv(args)
+        given = os.environ if env is None else env
+        program = None if self.zygote is None else Program.from_argv(args, given.get("PATH", ""))
         if self.zygote is None or program is None:
             return None
-        environment = {**(os.environ if env is None else env), **dict(program.environment)}
+        environment = {**({} if program.is_bare else given), **dict(program.environment)}
         environment = {os.fsdecode(name): os.fsdecode(value) for name, value in environment.items()}
         folder = Path(os.getcwd() if cwd is None else os.fspath(cwd)).absolute()
         if not folder.is_dir() or not self.zygote.can_run(program, environment, folder):
             return None
         limits = [list(resource.getrlimit(each)) for each in _LIMITS]
-        return Request(
-            asdict(program), os.getpid(), str(folder), environment, limits, sorted(pass_fds), new_session, umask
-        )
+        groups, fds = sorted(_groups() - self.zygote.groups), sorted(pass_fds)
+        return Request(asdict(program), os.getpid(), str(folder), environment, limits, groups, fds, new_session, umask)
 
 
 def main() -> None:
@@ -261,7 +286,8 @@ def main() -> None:
     path = sys.path[1:]
     sys.path[:1] = [str(ROOT), str(ROOT / "scripts")]  # of this copy, also where the interpreter has another installed
     link = socket.socket(fileno=int(sys.argv[1]))
-    for module in _PRELOADED:
+    sys.modules["lab.zygote"] = sys.modules["__main__"]  # so that a program keeps the zygote that it was given
+    for module in json.loads(link.recv(_REQUEST_BYTES)):
         importlib.import_module(module)
     started = dict(entry.partition("=")[::2] for entry in Path("/proc/self/environ").read_text().split("\0") if entry)
     added = {name: value for name, value in os.environ.items() if name not in started}
@@ -275,7 +301,8 @@ def _live(link: socket.socket, birth: _Birth) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the programs
     if (program := _serve(link, birth)) is not None:
         _born[:] = [birth]
-        if program.module.partition(".")[0] in _STARTERS or program.module in _STARTERS:
+        command = program.argv[3 if program.module else 1 :][:1]
+        if {program.module, program.module.partition(".")[0], *command} & _STARTERS:  # it starts many programs
             install()
         _run(program)
 
@@ -306,9 +333,11 @@ def _serve(link: socket.socket, birth: _Birth) -> Program | None:
 
 def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Program:
     """Take over what the process inherits, and return its program."""
-    from pyroute2 import netns  # the zygote has loaded it
+    from gdp.host.cgroups import Cgroup  # the zygote has loaded it
 
     program = Program(**request.program)
+    for group in request.groups:
+        Cgroup(group).add(os.getpid())
     if request.new_session:
         os.setsid()
     if request.umask >= 0:
@@ -318,11 +347,11 @@ def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Prog
     space = waiting[3]
     for number, each in zip([0, 1, 2, *request.fds], [*waiting[:3], *waiting[5:]], strict=True):
         os.dup2(each, number, inheritable=True)
-    netns.setns(space)
+    _enter(space)
     os.chdir(request.cwd)
-    if program.netns:
-        with open(program.netns, "rb") as file:
-            netns.setns(file.fileno())
+    for path in program.spaces:
+        with open(path, "rb") as file:
+            _enter(file.fileno())
     for which, limits in zip(_LIMITS, request.limits, strict=True):
         if list(resource.getrlimit(which)) != limits:
             resource.setrlimit(which, (limits[0], limits[1]))
@@ -332,7 +361,7 @@ def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Prog
             os._exit(128 + program.pdeathsig)
     os.environ.clear()
     os.environ.update({**birth.added, **request.environment})
-    first = str(Path(program.file).resolve().parent) if program.file else request.cwd
+    first = str(Path(program.file).resolve().parent) if program.file else "" if program.code else os.getcwd()
     paths = filter(None, request.environment.get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = [first, *paths, *birth.path]
     _show(program.argv, request.environment)
@@ -347,6 +376,10 @@ def _run(program: Program) -> None:
         sys.argv = [program.module, *program.argv[3:]]
         sys.modules.pop(program.module, None)  # as a fresh interpreter, which runs it once, as __main__
         runpy.run_module(program.module, run_name="__main__", alter_sys=True)
+        return
+    if program.code:
+        sys.argv = program.argv[1:2] + program.argv[3:]
+        exec(compile(program.code, "<string>", "exec"), {"__name__": "__main__"})
         return
     sys.argv = program.argv[program.argv.index(program.file) :]
     runpy.run_path(program.file, run_name="__main__")
@@ -363,6 +396,11 @@ def _open_streams(*, is_unbuffered: bool) -> None:
         stream = io.TextIOWrapper(raw, encoding="utf-8", errors=errors, write_through=True)
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
+
+
+def _enter(space: int) -> None:
+    if _LIBC.setns(space, 0):
+        raise OSError(ctypes.get_errno(), "setns")
 
 
 def _prctl(option: int, value: int) -> None:
@@ -388,7 +426,12 @@ def _settings(environment: Mapping[str, str]) -> dict[str, str]:
 
 def _place() -> list[str]:
     """Return what a forked process inherits from the zygote rather than from its caller."""
-    return [Path("/proc/self/cgroup").read_text(), *(os.readlink(f"/proc/self/ns/{each}") for each in _SPACES)]
+    return [os.readlink(f"/proc/self/ns/{each}") for each in _SPACES]
+
+
+def _groups() -> set[str]:
+    """Return the names of this process's control groups."""
+    return {line.rpartition("/")[2] for line in Path("/proc/self/cgroup").read_text().splitlines()}
 
 
 @functools.cache

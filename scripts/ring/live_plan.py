@@ -16,26 +16,6 @@ from ring.options import Live
 
 MASTER_PORT: Final = 11_311
 AUTHOR: Final = "ring"
-# A picture arrives as fifteen datagrams at once, which exceeds Linux's default receive buffer.
-FAST_DDS_PROFILES: Final = """\
-<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <transport_descriptors>
-    <transport_descriptor>
-      <transport_id>udp</transport_id>
-      <type>UDPv4</type>
-      <receiveBufferSize>4194304</receiveBufferSize>
-      <sendBufferSize>4194304</sendBufferSize>
-    </transport_descriptor>
-  </transport_descriptors>
-  <participant profile_name="udp" is_default_profile="true">
-    <rtps>
-      <userTransports><transport_id>udp</transport_id></userTransports>
-      <useBuiltinTransports>false</useBuiltinTransports>
-    </rtps>
-  </participant>
-</profiles>
-"""
 _DOMAINS: Final = 100  # above that, a domain's ports are in Linux's ephemeral range
 
 

@@ -13,11 +13,12 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.credentials import Side
+from lab.dds import UDP_PROFILE
 from lab.process import Event, LabProcess
 from lab.supervisor import Supervisor, failed
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
-from ring.live_plan import FAST_DDS_PROFILES, MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
+from ring.live_plan import MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
 from ring.nodes.content import LAMP
 from ring.options import Live, Options
 from ring.overlay import Injection, Overlay
@@ -155,7 +156,7 @@ class LiveRing:
         self._run = run
         self._reporter = reporter
         self._profiles = run.directory / "fast-dds.xml"
-        self._profiles.write_text(FAST_DDS_PROFILES, encoding="utf-8")
+        self._profiles.write_text(UDP_PROFILE, encoding="utf-8")
         self.overlay = Overlay(options, run, reporter)
         self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
         self._proxies: list[LabProcess] = []

@@ -28,6 +28,7 @@ from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of
 
 HOUR_S = 3_600.0
+OTHER_RESTARTS = (("nuc2", 0.0), ("nuc2", HOUR_S), ("nuc4", -HOUR_S), ("nuc4", 0.0))
 _M = TypeVar("_M")
 
 
@@ -76,8 +77,14 @@ def flows_within(flow: Flow, seconds: float) -> bool:
 
 
 @pytest.mark.momentary("how soon a flow goes on is the question")
-@pytest.mark.parametrize("by_s", [-HOUR_S, 0.0, HOUR_S])
-@pytest.mark.parametrize("switch", ["nuc2", "nuc4"])
+@pytest.mark.parametrize(
+    ("switch", "by_s"),
+    [
+        ("nuc2", -HOUR_S),
+        ("nuc4", HOUR_S),
+        *(pytest.param(*each, marks=pytest.mark.nightly) for each in OTHER_RESTARTS),
+    ],
+)
 def test_a30_a_switch_that_restarts_with_its_clock_an_hour_off_is_heard_at_once(switch: str, by_s: float) -> None:
     world = ring()
     flow = flowing(world)

@@ -272,6 +272,7 @@ def test_y07_an_error_about_a_local_message_ends_that_message_only(
 ) -> None:
     sites = Sites(tmp_path)
     robot, _, chatter, other = _chatting(sites)
+    sites.run(1)  # until both topics are described
     with monkeypatch.context() as patch:
         patch.setattr("proxy.bridge.exposed_topic.ExposedTopic.handle_event", _fault)
         _say(sites, robot, "/chatter", "lost")

@@ -13,6 +13,7 @@ from urllib.request import urlopen
 
 import pytest
 
+from gdp.telemetry import scraping
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Sources
 
@@ -54,13 +55,16 @@ def test_a50_silent_connections_take_neither_threads_nor_descriptors(port: int) 
         assert descriptors() - before <= MANY + 4
 
 
-def test_a50_a_silent_connection_ends_by_itself(port: int) -> None:
+def test_a50_a_silent_connection_ends_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scraping, "CONNECT_S", 0.5)
+    metrics = Metrics(Sources(frames=lambda: {"in": 3}))
+    port = metrics.serve(0)
     with socket.create_connection(("127.0.0.1", port), 10) as peer:
         peer.sendall(b"GET /met")
-        begun_s = time.monotonic()
+        assert not is_closed(peer, 0.2)
         assert is_closed(peer, 10.0)
-        assert time.monotonic() - begun_s < 8.0
     assert b"gdp_frames_total" in scraped(port)
+    metrics.close()
 
 
 def test_a50_an_endless_request_is_cut_off(port: int) -> None:
@@ -74,14 +78,14 @@ def test_a50_an_endless_request_is_cut_off(port: int) -> None:
 def test_a50_a_flood_of_connections_leaves_the_node_its_processor_time(port: int) -> None:
     child = os.fork()
     if not child:
-        end_s = time.monotonic() + 2.0
+        end_s = time.monotonic() + 1.0
         while time.monotonic() < end_s:
             with contextlib.suppress(OSError):
                 socket.create_connection(("127.0.0.1", port), 1).close()
         os._exit(0)
     begun_s = time.process_time()
     os.waitpid(child, 0)
-    assert time.process_time() - begun_s < 1.0  # of 2 s: half a core would be the server's
+    assert time.process_time() - begun_s < 0.5  # of 1 s: half a core would be the server's
 
 
 def test_a50_what_is_no_scrape_is_answered_and_closed(port: int) -> None:

@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
 from lab.process import until
+from lab.zygote import Popen
 from proxy.cli import replay
 from proxy.config.config import ProxyConfig
 from proxy.recordings.limits import BagLimits
@@ -45,6 +46,12 @@ def recording(path: Path, count: int = 3, size: int = 100) -> Path:
         for number in range(count):
             bag.write(handle, number, b"\0\1\0\0" + bytes(size))
     return path
+
+
+@pytest.fixture
+def executed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Execute decoders: a forked one has memory of its zygote, which no limit counts."""
+    monkeypatch.setattr(Popen, "zygote", None)
 
 
 def child_of(process: int) -> int:
@@ -310,6 +317,7 @@ def test_b02_words_of_a_decoder_are_printed_without_control_characters(
 # --- cost of a recording
 
 
+@pytest.mark.usefixtures("executed")
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 def test_b03_a_recording_that_needs_too_much_memory_is_named(tmp_path: Path, kind: str) -> None:
     make, compression = (mcap, "zstd") if kind == "mcap" else (ros1, "lz4")
@@ -328,6 +336,7 @@ def test_b03_a_recording_that_needs_too_much_time_is_named(tmp_path: Path) -> No
     assert failure.value.limit == "cpu"
 
 
+@pytest.mark.usefixtures("executed")
 def test_a28_a_bomb_does_not_reach_the_process_that_replays(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", "zstd", packed("zstd", BOMB_BYTES), BOMB_BYTES)
     with contextlib.suppress(GdpError), BagReader(path) as bag:
@@ -395,6 +404,7 @@ def test_b05_who_waits_for_a_decoder_may_stop(tmp_path: Path) -> None:
         assert not list(bag.messages())
 
 
+@pytest.mark.usefixtures("executed")
 @pytest.mark.parametrize("is_refused", [False, True])
 def test_b05_gdp_replay_says_so_in_one_line_and_exits_with_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_refused: bool
@@ -445,9 +455,19 @@ def holder(path: Path, how: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
             process.kill()
 
 
-@pytest.mark.parametrize("how", ["free", "confined"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-@pytest.mark.parametrize("is_stopped", [False, True])
+@pytest.mark.parametrize(
+    ("how", "number", "is_stopped"),
+    [
+        ("free", signal.SIGINT, False),
+        ("free", signal.SIGKILL, True),
+        ("confined", signal.SIGKILL, False),
+        ("confined", signal.SIGINT, True),
+        pytest.param("free", signal.SIGINT, True, marks=pytest.mark.nightly),
+        pytest.param("free", signal.SIGKILL, False, marks=pytest.mark.nightly),
+        pytest.param("confined", signal.SIGKILL, True, marks=pytest.mark.nightly),
+        pytest.param("confined", signal.SIGINT, False, marks=pytest.mark.nightly),
+    ],
+)
 def test_b06_no_decoder_outlives_the_process_that_started_it(
     tmp_path: Path, how: str, number: int, is_stopped: bool
 ) -> None:

@@ -19,7 +19,7 @@ _BLOCKS = blocks(ROOT / "docs/contributing/first-change.md")
 
 def _run_test(clone: Path) -> str:
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", _TEST.title]
-    environment = {**os.environ, "PYTHONPATH": str(clone), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(clone), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     return subprocess.run(words, cwd=clone, env=environment, capture_output=True, text=True, check=False).stdout
 
 

@@ -55,16 +55,16 @@ class TracingNetwork(SimNetwork):
     echo: Echo | None = None
     _is_machine = False  # a frame that enters a link now is from a machine
 
-    def _push(self, at_s: float, action: Callable[..., None], *arguments: object) -> None:
+    def _push(self, at_s: float, action: Callable[..., object], *arguments: object) -> None:
         if self.echo is None:
             super()._push(at_s, action, *arguments)
         else:
             super()._push(at_s, self._under, self.echo, action, *arguments)
 
-    def _under(self, echo: Echo, action: Callable[..., None], *arguments: object) -> None:
+    def _under(self, echo: Echo, action: Callable[..., object], *arguments: object) -> object:
         self.echo = echo
         try:
-            action(*arguments)
+            return action(*arguments)
         finally:
             self.echo = None
 

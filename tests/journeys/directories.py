@@ -17,7 +17,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from tests.journeys.flows import Flow, advertise
+from tests.journeys.flows import LEASES, Flow, advertise
 from tests.journeys.networks import LEASE_S, PERIOD_S, SETTLE_S, draw_uppers
 
 DOMAINS_MAX: Final = 12
@@ -152,7 +152,7 @@ class Trial:
         world = self.world
         assert world.run_until_attached(SETTLE_S), "not every member is attached"
         flows = [self._established(*pair) for pair in self.plan.pairs()]
-        end_s = max(death.after_s for death in self.plan.deaths) + 3.25 * LEASE_S  # of joins, which none outlasts
+        end_s = max(death.after_s for death in self.plan.deaths) + LEASES * LEASE_S  # of joins, which none outlasts
         count = int(end_s / PERIOD_S)
         for flow in flows:
             flow.stream(count, PERIOD_S, size=50)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from gdp.intervals import JOIN, NEIGHBOUR, SoftState
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from tests.journeys.flows import Flow, advertise
+from tests.journeys.flows import LEASES, Flow, advertise
 
 SWITCHES_MAX: Final = 40
 DOMAINS_MAX: Final = 6
@@ -200,7 +200,7 @@ class Trial:
         """Let all members publish to all others, inject the faults, and check the deliveries."""
         assert self.world.run_until_attached(SETTLE_S), "not every member is attached"
         flows = [self._established(label) for label in self.world.members]
-        count = int((self._faults_end_s() + 3.25 * LEASE_S) / PERIOD_S)
+        count = int((self._faults_end_s() + LEASES * LEASE_S) / PERIOD_S)
         for flow in flows:
             flow.stream(count, PERIOD_S, size=50)
         for fault in self.plan.faults:

@@ -11,7 +11,7 @@ from gdp.client.publisher import Publisher
 from gdp.names import Name
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from tests.journeys.flows import STEP_S
+from tests.journeys.flows import LEASES, STEP_S
 
 SERVICE = "/add_two_ints"
 
@@ -79,7 +79,7 @@ class Party:
         self.world.network.send_pending(self.label)
 
 
-def outlive(world: Simulation, client: Party, *servers: Party, leases: float = 3.25) -> None:
+def outlive(world: Simulation, client: Party, *servers: Party, leases: float = LEASES) -> None:
     """Call at a steady rate until three leases are over; each server answers each request once, and in order."""
     client.collect()
     before, count = len(client.got), ceil(leases * world.lease_s / STEP_S)

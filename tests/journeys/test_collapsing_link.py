@@ -16,6 +16,7 @@ from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
+from tests.lanes import nightly
 
 FIFO_BYTES: Final = 64_000
 ROBOT, READER = "s0/robot", "s2/reader"
@@ -95,7 +96,7 @@ class Collapse:
         return sum(number in self.came_s[name] for number in numbers) / len(numbers)
 
 
-@pytest.mark.parametrize("kbit_s", [300, 1_000])
+@pytest.mark.parametrize("kbit_s", [300, *nightly(1_000)])
 def test_a_link_that_collapses_stays_up_carries_what_is_urgent_and_recovers(kbit_s: int) -> None:
     collapse = Collapse()
     collapse.run_to(BEFORE_S)

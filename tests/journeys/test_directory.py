@@ -8,6 +8,7 @@ from hypothesis import example, given
 from tests.draws import draws
 from tests.journeys.directories import Death, Plan, Trial, plans
 from tests.journeys.networks import short_leases
+from tests.lanes import long_example
 
 
 def star(*order: int) -> Plan:
@@ -29,11 +30,11 @@ A_RIB_WAITS_FOR_A_SILENT_TIER = Plan(
 
 
 @pytest.mark.momentary("every trial runs for three leases after its last death; hypothesis also draws shorter attempts")
-@draws(4)
+@draws(1, long=16)
 @given(plans())
-@example(star(0, 0, 0, 0))
-@example(star(1, 0, 0, 0))
-@example(star(2, 0, 0, 0))
+@long_example(star(0, 0, 0, 0))
+@long_example(star(1, 0, 0, 0))
+@long_example(star(2, 0, 0, 0))
 @example(star(3, 0, 0, 0))
 @example(ALL_NEAR_RIBS_DIE)
 @example(A_RIB_WAITS_FOR_A_SILENT_TIER)

@@ -12,6 +12,7 @@ from gdp.trust.grants import EPOCH_S, begun_epochs, daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, advertise, flowing, ring
+from tests.lanes import nightly
 
 
 def topic(flow: Flow, label: str, right: Right, epochs: list[int]) -> Topic:
@@ -89,18 +90,14 @@ def on_day(flow: Flow, label: str, right: Right, epochs: set[int], day: float) -
     ("loss", "clock_days"),
     [
         (0.03, -1 / 30),
-        (0.0, 1 / 30),
-        *(
-            pytest.param(*each, marks=pytest.mark.nightly)
-            for each in ((0.0, -1 / 30), (0.0, 0), (0.03, 0), (0.03, 1 / 30))
-        ),
+        *nightly((0.0, 1 / 30), (0.0, -1 / 30), (0.0, 0), (0.03, 0), (0.03, 1 / 30)),
     ],
 )
 def test_epochs_of_three_days_follow_each_other_without_a_lost_or_doubled_message(
     loss: float, clock_days: float
 ) -> None:
     """A reader is away at a change of the day, another comes on the third; the publisher's clock may be wrong."""
-    world = ring()
+    world = ring(lease_s=6.0)  # shorter than the absence
     away, late, former = (f"nuc{number}/{name}" for number, name in ((4, "away"), (3, "late"), (2, "former")))
     for label in (away, late, former):
         world.add_member(label, label.partition("/")[0])

@@ -23,11 +23,13 @@ from gdp.trust.right import Right
 from lab.network import SimLink
 from tests.draws import IS_LONG
 from tests.gdp.session.simulated import Simulated, world_of
+from tests.lanes import nightly
 
 ROBOT, NEAR, OTHER, WATCH = "robot", "near", "other", "watch"
 NEAR_S, UPLINK_BYTES_S, SERVER_BYTES_S, FIFO_S = 0.005, 100e6 / 8, 1e9 / 8, 0.1
 EVERY_S: Final = 0.25
 CALLS: Final = {100: 40, 307_200: 10, 2_000_000: 4} if IS_LONG else {100: 20, 307_200: 6, 2_000_000: 3}  # by bytes
+LARGE: Final = max(CALLS)
 CASES: Final = ("far", "thin", "lossy", "stalled")
 JOINED_AFTER, REQUESTS = 40, 120 if IS_LONG else 80  # requests: before a server joins, and in all
 SHARE: Final = 1.1  # of the time of the near server alone
@@ -167,8 +169,10 @@ def assert_as_fast(took_s: list[float], alone_s: list[float]) -> None:
     assert max(took_s) <= SHARE * max(alone_s), said
 
 
-@pytest.mark.parametrize("size", CALLS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "size"),
+    [pytest.param(case, size, marks=pytest.mark.nightly if size == LARGE else []) for case in CASES for size in CALLS],
+)
 def test_a_second_server_does_not_delay_the_first_answer(case: str, size: int) -> None:
     replicas = Replicas((OTHER, NEAR))
     replicas.begin(case)
@@ -177,7 +181,7 @@ def test_a_second_server_does_not_delay_the_first_answer(case: str, size: int) -
     assert_as_fast(replicas.call(size, CALLS[size]), near_alone(size))
 
 
-@pytest.mark.parametrize("size", CALLS)
+@pytest.mark.parametrize("size", [*list(CALLS)[:-1], *nightly(LARGE)])
 def test_the_call_that_meets_a_server_as_it_freezes_takes_a_few_round_trips_more(size: int) -> None:
     replicas = Replicas((OTHER, NEAR))
     replicas.begin("frozen")
@@ -187,23 +191,25 @@ def test_the_call_that_meets_a_server_as_it_freezes_takes_a_few_round_trips_more
     assert_as_fast(later_s, alone_s)
 
 
-@pytest.mark.parametrize("case", ["as near", "far"])
+@pytest.mark.parametrize("case", ["as near", *nightly("far")])
 def test_a_server_that_joins_while_requests_follow_each_other_delays_at_most_the_call_that_meets_it(case: str) -> None:
     replicas = Replicas((OTHER, NEAR))
     replicas.links[OTHER].delay_s += 0.1 * (case == "far")
     replicas.serve(NEAR)
-    core, calls = replicas.net.cores[ROBOT], list[tuple[float, Call]]()
+    core, begun_s = replicas.net.cores[ROBOT], list[float]()
+    open_calls: dict[int, Call] = {}
     took_s: dict[int, float] = {}
 
     def ask() -> None:
-        calls.append((replicas.net.now_s, Call(payload=bytes(307_200), timeout_s=20.0, replication=ALL)))
-        core.call(replicas.topic, calls[-1][1], replicas.net.now_s)
+        call = open_calls[len(begun_s)] = Call(payload=bytes(307_200), timeout_s=20.0, replication=ALL)
+        begun_s.append(replicas.net.now_s)
+        core.call(replicas.topic, call, replicas.net.now_s)
         replicas.net.send(ROBOT)
 
     def look() -> bool:
-        for number, (begun_s, call) in enumerate(calls):
-            if call.is_done:
-                took_s.setdefault(number, replicas.net.now_s - begun_s)
+        for number in [number for number, call in open_calls.items() if call.is_done]:
+            del open_calls[number]
+            took_s[number] = replicas.net.now_s - begun_s[number]
         return len(took_s) == REQUESTS
 
     replicas.call(1, 2)

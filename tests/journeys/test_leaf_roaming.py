@@ -8,7 +8,7 @@ from gdp.frame.kinds import Kind
 from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from tests.journeys.flows import Flow, Tap, flowing
+from tests.journeys.flows import Flow, Tap, flowing, outlive_together
 
 LEASE_S = 2.5
 ROBOT, DESK, CROWD = "leaf/robot", "desk/operator", "lift/screen"
@@ -49,7 +49,7 @@ def drive(world: Simulation, flows: list[Flow], stops: tuple[str, ...]) -> None:
             assert flow.numbers(reader) == list(range(count))
 
 
-@pytest.mark.parametrize("stops", [("lift",), ("desk", "lift", "hall")])
+@pytest.mark.parametrize("stops", [("desk", "lift", "hall"), pytest.param(("lift",), marks=pytest.mark.nightly)])
 def test_a_leaf_that_roams_with_both_links_up_loses_nothing_of_its_nodes(stops: tuple[str, ...]) -> None:
     world = corridor()
     camera = flowing(world, "/camera", ROBOT, (DESK, CROWD))
@@ -75,5 +75,4 @@ def test_between_two_uplinks_a_leaf_passes_nothing_even_where_that_is_shorter() 
     own.stream(50, EVERY_S)
     assert world.network.run(5, lambda: own.has(DESK, 50) and own.has(CROWD, 50))
     assert set(own.hops(DESK)) == set(own.hops(CROWD)) == {2}
-    own.outlive()
-    others.outlive()
+    outlive_together(own, others)

@@ -15,6 +15,7 @@ from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
 from lab.simulation import Simulation
 from lab.topology import Topology, chain, ring5
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
+from tests.lanes import nightly
 
 MIDDLE = frozenset(("nuc2", "nuc3"))
 DETOUR = frozenset(("nuc5", "nuc1"))
@@ -40,16 +41,16 @@ def too_big(flow: Flow) -> int:
     return flow.world.network.drops[DropReason.TOO_BIG]
 
 
-def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> Simulation:
+def wide(topology: Topology, mtu: int = JUMBO, lease_s: float = LEASE_S, **links: int) -> Simulation:
     """Return a network of wide links, except those given as ``a_b=mtu``."""
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
-    world = Simulation(topology=replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
+    world = Simulation(topology=replace(topology, links=made), lead_mtu=mtu, lease_s=lease_s)
     assert world.run_until_attached()
     return world
 
 
-@pytest.mark.parametrize("mtu", [SMALL, 1_280, USUAL, JUMBO, LARGEST])
+@pytest.mark.parametrize("mtu", [SMALL, USUAL, LARGEST, *nightly(1_280, JUMBO)])
 def test_frames_fill_links_of_any_size(mtu: int) -> None:
     flow = flowing(wide(ring5(), mtu))
     assert largest(flow) == mtu
@@ -57,7 +58,7 @@ def test_frames_fill_links_of_any_size(mtu: int) -> None:
     flow.outlive()
 
 
-@pytest.mark.parametrize("mtu", [SMALL, 1_280, USUAL, JUMBO])
+@pytest.mark.parametrize("mtu", [SMALL, USUAL, *nightly(1_280, JUMBO)])
 def test_one_narrow_link_in_the_middle_decides(mtu: int) -> None:
     flow = flowing(wide(ring5(), LARGEST, nuc2_nuc3=mtu))
     assert largest(flow) == mtu
@@ -65,7 +66,7 @@ def test_one_narrow_link_in_the_middle_decides(mtu: int) -> None:
     flow.outlive()
 
 
-@pytest.mark.parametrize("ends", [MIDDLE, frozenset(("nuc1", "nuc2")), frozenset(("nuc4", "nuc5"))])
+@pytest.mark.parametrize("ends", [MIDDLE, frozenset(("nuc4", "nuc5")), *nightly(frozenset(("nuc1", "nuc2")))])
 def test_a_link_that_changes_on_the_way_is_followed_by_the_next_message(ends: frozenset[str]) -> None:
     flow = flowing(ring())
     network, seen = flow.world.network, []
@@ -196,7 +197,7 @@ def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> 
 
 @pytest.mark.parametrize("where", ["links", pytest.param("leads", marks=pytest.mark.nightly)])
 def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
-    flow = flowing(wide(ring5()))
+    flow = flowing(wide(ring5(), lease_s=20.0))  # three leases are over when the last message is sent
     flow.publisher.set_options(SendOptions(fec=False))  # frames that leave space for parity are smaller than the MTU
     world, network, sim_link = flow.world, flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
     world.leads[ROBOT].jitter_s = 0.02 if where == "leads" else 0.0
@@ -210,7 +211,6 @@ def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
         network.run(NEWS_S)
         seen.append(largest(flow))
     assert seen == [JUMBO, 1_280, JUMBO, 800]
-    flow.outlive()
 
 
 # a link that shrinks under messages that are already sealed

@@ -22,13 +22,14 @@ from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.draws import draws
-from tests.journeys.flows import Flow, advertise
+from tests.journeys.flows import LEASES, Flow, advertise
 from tests.journeys.networks import LEASE_S, SETTLE_S, short_leases
+from tests.lanes import long_example
 
 KINDS = ("cut", "thin", "thick", "freeze", "restart", "rib", "roam")
 FAULTS_S: Final = 8.0  # all faults are over by then, from the first message on
 RECOVERED_S: Final = 4.0  # after the last fault: a dead neighbour, another path, a new window
-END_S: Final = FAULTS_S + RECOVERED_S + 3.25 * LEASE_S
+END_S: Final = FAULTS_S + RECOVERED_S + LEASES * LEASE_S
 IMAGE_BYTES: Final = 30_000
 IMAGE_HZ, COMMAND_HZ, STATE_HZ = 20, 10, 2
 STEP_S: Final = 0.01
@@ -250,7 +251,7 @@ class Trial:
         return ", ".join(f"{len(came_s)} of {self.sent[name]} of {name}" for name, came_s in self.came_s.items())
 
 
-@draws(2)
+@draws(1, long=8)
 @given(plans())
 @example(  # a reader that began late did not count what came before
     Plan(
@@ -268,16 +269,16 @@ class Trial:
         474,
     )
 )
-@example(  # of three joins that left together the last was lost each time (ADR 347)
+@long_example(  # of three joins that left together the last was lost each time (ADR 347)
     Plan(6, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("cut", 0, 1.0, 1.2),), 1)
 )
 @example(  # the replies that joins are unknown were lost (ADR 347)
     Plan(3, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("thick", 0, 3.1, 3.3),), 1)
 )
-@example(  # what a full frame takes to leave was another flow's queue
+@long_example(  # what a full frame takes to leave was another flow's queue
     Plan(5, (), (Thin(1.0, 1, 0, 1, 60),), 0, (Fault("freeze", 0, 5.0, 5.2),), 1)
 )
-@example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO
+@long_example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO
     Plan(
         7,
         ((0, 3), (1, 2), (4, 3)),

@@ -7,6 +7,7 @@ from hypothesis import example, given
 
 from tests.draws import draws
 from tests.journeys.networks import Fault, Plan, Trial, plans, short_leases
+from tests.lanes import long_example
 
 # The path within a domain was longer than one through its neighbour, which sent back the frames that left.
 LOOPED_AT_A_BORDER = Plan(
@@ -25,9 +26,9 @@ MIDDLE_TIER_DIES = Plan(
 
 
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
-@draws(2)
+@draws(1, long=8)
 @given(plans())
-@example(LOOPED_AT_A_BORDER)
+@long_example(LOOPED_AT_A_BORDER)
 @example(THREE_TIERS)
 @example(MIDDLE_TIER_DIES)
 def test_all_arrives_that_graph_and_policy_allow(plan: Plan) -> None:

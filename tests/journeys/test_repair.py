@@ -12,7 +12,7 @@ from gdp.frame.kinds import Kind
 from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import DomainPlan, Link, Topology
-from tests.journeys.flows import LEASE_S
+from tests.journeys.flows import LEASE_S, LEASES
 
 SQUARE = Topology(
     (Link("a", "b", 10), Link("a", "c", 10), Link("b", "d", 10), Link("c", "d", 15)),
@@ -31,7 +31,7 @@ def square() -> Simulation:
 
 def stays(world: Simulation, holds: Callable[[], bool]) -> None:
     """Check that something holds until three leases are over."""
-    for _ in range(ceil(3.25 * world.lease_s / 0.5)):
+    for _ in range(ceil(LEASES * world.lease_s / 0.5)):
         assert holds()
         world.network.run(0.5)
     assert holds()

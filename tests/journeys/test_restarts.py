@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
+from tests.draws import IS_LONG
 from tests.journeys.flows import flowing
 
-DRAWS: Final = 12
+DRAWS: Final = 12 if IS_LONG else 3
 BORDER, NEIGHBOURS = "right", ("left", "top", "inner")
 AT_S, SILENT_S, LASTS_S, PERIOD_S, CATCHES_UP_S = 1.0, 1.5, 6.0, 0.1, 6.0
 TRIANGLE: Final = Topology(

@@ -13,6 +13,7 @@ from gdp.rib.route import Route
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
+from tests.lanes import nightly
 
 
 def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
@@ -23,7 +24,7 @@ def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
     return next(label for label, each in world.switches.items() if each.name == switch)
 
 
-@pytest.mark.parametrize("to", ["nuc2", "nuc3", "nuc4", "nuc5"])
+@pytest.mark.parametrize("to", ["nuc5", *nightly("nuc2", "nuc3", "nuc4")])
 def test_a_publisher_that_moves_keeps_its_readers_and_loses_nothing(to: str) -> None:
     flow = flowing(ring(keepalive_ms=None))
     flow.stream(200, 0.02, size=100)
@@ -33,7 +34,7 @@ def test_a_publisher_that_moves_keeps_its_readers_and_loses_nothing(to: str) -> 
     flow.outlive()
 
 
-@pytest.mark.parametrize("to", ["nuc2", "nuc3", "nuc5"])
+@pytest.mark.parametrize("to", ["nuc3", *nightly("nuc2", "nuc5")])
 def test_a_publisher_that_moved_is_known_there_in_every_tier(to: str) -> None:
     flow = flowing(ring(keepalive_ms=None))
     world = flow.world
@@ -45,7 +46,7 @@ def test_a_publisher_that_moved_is_known_there_in_every_tier(to: str) -> None:
     flow.outlive()
 
 
-@pytest.mark.parametrize("to", ["nuc1", "nuc2", "nuc3", "nuc4"])
+@pytest.mark.parametrize("to", ["nuc4", *nightly("nuc1", "nuc2", "nuc3")])
 def test_a_reader_that_moves_reads_on_and_loses_nothing(to: str) -> None:
     flow = flowing(ring(keepalive_ms=None))
     flow.stream(200, 0.02, size=100)

@@ -19,6 +19,7 @@ from lab.network import SimLink
 from tests.journeys.flows import Flow
 from tests.journeys.services import Party, meet, work
 from tests.journeys.test_two_paths import Site, site
+from tests.lanes import nightly
 
 pytestmark = pytest.mark.momentary("a cut, and the seconds before and after it, are what these tests are about")
 
@@ -93,9 +94,15 @@ def pair(*, reliable: bool = True, paths: int = 2, seed: int = 1) -> Pair:
     return made
 
 
-@pytest.mark.parametrize("size", [200, 20_000], ids=["one part", "many parts"])
-@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
-@pytest.mark.parametrize("which", [0, 1], ids=["faster", "slower"])
+@pytest.mark.parametrize(
+    ("which", "reliable", "size"),
+    [
+        (0, True, 200),
+        (0, False, 20_000),
+        (1, True, 20_000),
+        *nightly((0, True, 20_000), (0, False, 200), (1, True, 200), (1, False, 200), (1, False, 20_000)),
+    ],
+)
 def test_a_path_that_fails_at_any_moment_costs_nothing(which: int, reliable: bool, size: int) -> None:
     rng = random.Random(size + which)
     made = pair(reliable=reliable, seed=which + 1)
@@ -110,8 +117,9 @@ def test_a_path_that_fails_at_any_moment_costs_nothing(which: int, reliable: boo
     assert made.reader.drops()[DropReason.SECOND_COPY]
 
 
-@pytest.mark.parametrize("period_s", [0.003, PERIOD_S])
-@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
+@pytest.mark.parametrize(
+    ("reliable", "period_s"), [(True, PERIOD_S), (False, 0.003), *nightly((True, 0.003), (False, PERIOD_S))]
+)
 def test_what_one_path_loses_is_awaited_from_the_other_and_not_requested(reliable: bool, period_s: float) -> None:
     made = pair(reliable=reliable)
     made.period_s = period_s

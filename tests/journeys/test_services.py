@@ -14,8 +14,9 @@ from gdp.sansio import ReceivedFrame
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, SERVER, Tap, ring
+from tests.journeys.flows import LEASES, ROBOT, SERVER, Tap, ring
 from tests.journeys.services import SERVICE, Party, meet, outlive, work
+from tests.lanes import nightly
 
 OTHER = "nuc4/other"
 
@@ -102,7 +103,7 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     world.network.stop(SERVER)
     assert world.network.run(READER.lease_s + 2, lambda: not client.member.services.peers(client.service))
     assert world.network.run(40, lambda: not list(client.member.subscriptions.writer_proxies()))
-    world.network.run(3.25 * world.lease_s)
+    world.network.run(LEASES * world.lease_s)
     assert list(client.member.subscriptions.writer_proxies()) == []
 
 
@@ -115,7 +116,7 @@ def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     assert client.member.services.peers(client.service) == []
     with pytest.raises(LocalError):
         server.member.services.respond(server.service, client.member.name, b"too late")
-    world.network.run(3.25 * world.lease_s)
+    world.network.run(LEASES * world.lease_s)
     assert client.member.services.peers(client.service) == []
 
 
@@ -152,7 +153,7 @@ def test_a_restarted_server_answers_again() -> None:
     outlive(world, client, server)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *nightly(2, 3)])
 def test_a_lost_part_of_an_answer_is_repaired(seed: int) -> None:
     world = ring(seed, lease_s=8.0, keepalive_ms=None)  # shorter ones may end before a renewal has passed such links
     server, client = pair(world)
@@ -297,7 +298,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
 
 
 def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -> None:
-    world = ring(keepalive_ms=2_000)  # no link fails, and much time passes
+    world = ring(lease_s=20.0, keepalive_ms=2_000)  # no link fails, and much time passes
     server, client = pair(world)
     server.answer(client.member.name, b"1")
     assert work(world, client, until_s=2, have=1)
@@ -390,7 +391,7 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     assert world.network.run(1, lambda: not server.member.services.peers(server.service))
     with pytest.raises(LocalError, match="is not heard"):
         server.answer(client.member.name, b"?")
-    world.network.run(3.25 * world.lease_s)
+    world.network.run(LEASES * world.lease_s)
     assert server.member.services.peers(server.service) == []
 
 

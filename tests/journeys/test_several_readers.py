@@ -10,7 +10,8 @@ import pytest
 
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
-from tests.journeys.flows import advertise
+from tests.journeys.flows import advertise, outlive_together
+from tests.lanes import nightly
 
 SWITCHES = ("s0", "s1", "s2", "s3", "s4")
 READERS = ("s2/r2", "s3/r3", "s4/r4")
@@ -32,9 +33,7 @@ def world_of() -> Simulation:
     return world
 
 
-@pytest.mark.parametrize(
-    ("mbit_s", "slow"), [(4.0, 1.0), (4.0, 0.5), pytest.param(20.0, 1.0, marks=pytest.mark.nightly)]
-)
+@pytest.mark.parametrize(("mbit_s", "slow"), [(4.0, 0.5), *nightly((4.0, 1.0), (20.0, 1.0))])
 def test_a_reliable_topic_and_images_to_three_readers_share_full_links(mbit_s: float, slow: float) -> None:
     """``slow``: rate of the link to one reader, as a share of the others'."""
     world = world_of()
@@ -131,8 +130,7 @@ def test_topics_reach_a_reader_that_restarts_and_the_others_at_once() -> None:
     world.network.run(10)
     for label in (killed, other):
         world.members[label].poll_messages()
-    for flow in flows:
-        flow.outlive()
+    outlive_together(*flows)
 
 
 def test_the_slowest_reader_of_a_topic_is_known_to_govern_it() -> None:

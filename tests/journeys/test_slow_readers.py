@@ -18,6 +18,7 @@ from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from lab.simulation import Simulation
 from lab.topology import chain
 from tests.journeys.flows import LEASE_S, Flow, flowing
+from tests.lanes import nightly
 
 SOURCE, NEAR, FAR, SLOW = "s1/left", "s1/near", "s3/right", "s2/slow"
 QUEUE_FRAMES = 64  # of the slow reader
@@ -139,7 +140,7 @@ def test_reliable_a_slow_reader_slows_its_own_publisher_and_no_other_topic_of_th
     other.outlive()
 
 
-@pytest.mark.parametrize("frames_s", [0, 20])
+@pytest.mark.parametrize("frames_s", [0, *nightly(20)])
 def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_learns_what_it_will_not_get(frames_s: int) -> None:
     world, slow = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(NEAR, FAR, SLOW))

@@ -13,6 +13,7 @@ from gdp.limits import SPREAD
 from gdp.trust.right import Right
 from tests.journeys.flows import Flow
 from tests.journeys.test_two_paths import Site, site
+from tests.lanes import nightly
 
 pytestmark = pytest.mark.momentary("shares of paths within seconds are what these tests are about")
 
@@ -73,8 +74,15 @@ class Striped:
         return second / (first + second)
 
 
-@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
-@pytest.mark.parametrize(("rates", "share"), [((2e6, 2e6), 0.5), ((4e6, 1e6), 0.2), ((1e6, 4e6), 0.8)])
+@pytest.mark.parametrize(
+    ("rates", "share", "reliable"),
+    [
+        ((2e6, 2e6), 0.5, True),
+        ((4e6, 1e6), 0.2, False),
+        ((1e6, 4e6), 0.8, True),
+        *nightly(((2e6, 2e6), 0.5, False), ((4e6, 1e6), 0.2, True), ((1e6, 4e6), 0.8, False)),
+    ],
+)
 def test_each_path_carries_what_it_can(rates: tuple[float, float], share: float, reliable: bool) -> None:
     striped = Striped(rates, reliable=reliable)
     striped.run(20)
@@ -85,7 +93,7 @@ def test_each_path_carries_what_it_can(rates: tuple[float, float], share: float,
     assert striped.flow.numbers(READER) == list(range(40))
 
 
-@pytest.mark.parametrize("which", [0, 1], ids=["first path", "second path"])
+@pytest.mark.parametrize("which", [1, *nightly(0)])
 def test_a_path_that_fails_takes_no_message_along_and_gets_its_share_back(which: int) -> None:
     striped = Striped((2e6, 2e6))
     striped.run(10)

@@ -20,6 +20,7 @@ SHORT_S = 3 * LEASE_S + 8
 KEEPALIVE_MS = 1_000  # where no link fails in silence, the real ones would only cost time, too
 WIDE_BYTES = 9_000  # MTU of links; how statements of RIBs are split is the subject of other files, and of the ring here
 PERIOD_S = 0.2  # between messages: several are published during each fault
+NIGHTLY = pytest.mark.nightly  # much like another case, or its mirror image: messages go both ways
 
 
 def complete(flow: Flow, label: str, count: int, within_s: float) -> None:
@@ -29,7 +30,12 @@ def complete(flow: Flow, label: str, count: int, within_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "cut", [("nuc1", "nuc2"), ("nuc2", "nuc3"), ("nuc3", "nuc4"), ("nuc4", "nuc5"), ("nuc5", "nuc1")]
+    "cut",
+    [
+        ("nuc1", "nuc2"),
+        ("nuc2", "nuc3"),
+        *(pytest.param(each, marks=NIGHTLY) for each in (("nuc3", "nuc4"), ("nuc4", "nuc5"), ("nuc5", "nuc1"))),
+    ],
 )
 def test_any_link_of_the_ring_may_fail_for_ever(cut: tuple[str, str]) -> None:
     world = ring(lease_s=LEASE_S)
@@ -84,10 +90,14 @@ MOVES = {
     "to and fro": ["b2", "a1"] * 5,
     "through all domains": ["b1", "top", "c1", "a2"],
 }
+HARDEST = "through all domains"
 
 
-@pytest.mark.parametrize("moves", MOVES.values(), ids=MOVES)
-@pytest.mark.parametrize("who", [A, pytest.param(C, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "moves",
+    [pytest.param(moves, id=name, marks=[] if name == HARDEST else NIGHTLY) for name, moves in MOVES.items()],
+)
+@pytest.mark.parametrize("who", [A, pytest.param(C, marks=NIGHTLY)])
 def test_a_node_that_moves_keeps_every_flow(who: str, moves: list[str]) -> None:
     world = sites()
     there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
@@ -110,11 +120,8 @@ def test_both_ends_may_move_at_once() -> None:
     complete(flow, C, count, SHORT_S + 10)
 
 
-NIGHTLY = pytest.mark.nightly  # the mirror image of another case: messages go both ways
-
-
 @pytest.mark.parametrize(
-    ("who", "to"), [(A, "a2"), (C, "b2"), pytest.param(A, "b2", marks=NIGHTLY), pytest.param(C, "a2", marks=NIGHTLY)]
+    ("who", "to"), [(C, "b2"), *(pytest.param(*each, marks=NIGHTLY) for each in ((A, "a2"), (A, "b2"), (C, "a2")))]
 )
 def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
     world = sites(ADVERTISEMENT.lease_s)
@@ -129,7 +136,7 @@ def test_a_node_moves_while_all_ribs_are_dead(who: str, to: str) -> None:
     complete(back, A, count, 10)
 
 
-@pytest.mark.parametrize("minutes", [5, pytest.param(10, marks=pytest.mark.nightly)])  # link states live for 100 s
+@pytest.mark.parametrize("minutes", [5, pytest.param(10, marks=NIGHTLY)])  # link states live for 100 s
 def test_established_flows_go_on_while_all_ribs_are_dead_for_minutes(minutes: int) -> None:
     world = sites(ADVERTISEMENT.lease_s, keepalive_ms=1_500)
     flow = flowing(world, source=A, readers=(C,))
@@ -152,13 +159,11 @@ def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> Non
 @pytest.mark.parametrize(
     "dead",
     [
-        ("top",),
-        ("a",),
-        pytest.param(("c",), marks=NIGHTLY),
-        pytest.param(("a", "top"), marks=NIGHTLY),
-        ("c", "top"),
-        ("a", "c"),
         ("a", "b", "c"),
+        *(
+            pytest.param(each, marks=NIGHTLY)
+            for each in (("top",), ("a",), ("c",), ("a", "top"), ("a", "c"), ("c", "top"))
+        ),
     ],
     ids=" ".join,
 )
@@ -214,7 +219,7 @@ def three_tiers() -> Topology:
     )
 
 
-@pytest.mark.parametrize("reader", ["m1/member", "b1/member"])
+@pytest.mark.parametrize("reader", ["b1/member", pytest.param("m1/member", marks=NIGHTLY)])
 def test_the_tier_above_the_dead_one_takes_its_place_until_it_returns(reader: str) -> None:
     world = Simulation(topology=three_tiers(), lead_mtu=WIDE_BYTES, lease_s=LEASE_S, keepalive_ms=KEEPALIVE_MS)
     assert world.run_until_attached()
@@ -258,7 +263,7 @@ def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
 
 
 def test_a_ring_survives_one_fault_after_the_other() -> None:
-    world = ring()
+    world = ring(lease_s=LEASE_S)
     there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
     count = int(LONG_S / PERIOD_S)
     there.stream(count, PERIOD_S, size=100)

@@ -25,6 +25,7 @@ from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow
+from tests.lanes import nightly
 
 pytestmark = pytest.mark.momentary("a cut, and the seconds before and after it, are what these tests are about")
 
@@ -197,7 +198,7 @@ def drawn(seed: int) -> list[tuple[str, str, int]]:
             return [(f"s{a}", f"s{b}", rng.randint(5, 20)) for a, b in sorted(graph.edges())]
 
 
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize("seed", [3, 7, *nightly(1, 2, 4, 5, 6, 8)])
 def test_on_any_network_without_a_bridge_a_cut_delays_no_message(seed: int) -> None:
     links = drawn(seed)
     reader = max(link[1] for link in links)

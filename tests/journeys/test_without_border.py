@@ -20,12 +20,13 @@ from gdp.names import Name
 from gdp.trust.right import Right
 from tests.draws import draws
 from tests.gdp.switch.nat import Nat, permits
-from tests.journeys.flows import LEASE_S, Flow, advertise
+from tests.journeys.flows import LEASE_S, LEASES, Flow, advertise
 from tests.journeys.services import Party, meet
 from tests.journeys.tunnelled import BORDER, SITES, Tunnelled, tunnelled
+from tests.lanes import long_example
 
 STEP_S, LATE_S, LOOK_S, SETTLE_S = 0.25, 1.0, 0.05, 40.0
-LEASES_S: Final = 3.25 * LEASE_S
+LEASES_S: Final = LEASES * LEASE_S
 DEAD_S: Final = DETECT_MULTIPLIER * SCAPY_KEEPALIVE_MS / 1e3
 FIRST_S: Final = 1.0  # the first fault, after the first message
 RIBS: Final = ("lab", "lab#2")
@@ -186,11 +187,11 @@ KILLED: Final = (Fault("border", 0.0, LEASES_S),)
 @pytest.mark.momentary(
     "every trial publishes for three leases after its last fault; hypothesis also draws shorter ones"
 )
-@draws(2)
+@draws(1, long=8)
 @given(_drawn())
-@example(Drawn((Nat.PORT, Nat.PORT, None), BORDER, KILLED))
+@long_example(Drawn((Nat.PORT, Nat.PORT, None), BORDER, KILLED))
 @example(Drawn((Nat.PORT, Nat.PORT, Nat.PORT), BORDER, KILLED, frozenset(SITES)))
-@example(Drawn((Nat.SYMMETRIC, Nat.FULL_CONE, Nat.PORT), BORDER, KILLED))
+@long_example(Drawn((Nat.SYMMETRIC, Nat.FULL_CONE, Nat.PORT), BORDER, KILLED))
 @example(Drawn((Nat.PORT, Nat.PORT, Nat.SYMMETRIC), "a", (*KILLED, Fault("c", 1.0, 0.5))))
 def test_direct_pairs_outlive_their_border_and_all_others_return_with_it(drawn: Drawn) -> None:
     nats = dict(zip(SITES, drawn.nats, strict=True))

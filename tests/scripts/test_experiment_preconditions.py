@@ -47,7 +47,8 @@ def ends(capsys: pytest.CaptureFixture[str]) -> Ends:
 
 
 def on(monkeypatch: pytest.MonkeyPatch, state: MachineState) -> None:
-    """Let experiments and benches find a machine in this state."""
+    """Let experiments and benches find a machine in this state; spreads are estimated quickly."""
+    monkeypatch.setattr("results._RESAMPLES", 20)
     for module in ("experiment", "skeleton", "papers"):
         monkeypatch.setattr(f"{module}.machine_state", lambda: state)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from lab.process import python_path
+from tests.draws import IS_LONG
 from tests.pages import ROOT
 
 PLANNING = """
@@ -65,7 +66,7 @@ def test_the_networks_read_the_drawn_words_and_cover_them() -> None:
     from vision import Networks, Scene
 
     networks = Networks()
-    for seed in range(3):
+    for seed in range(3 if IS_LONG else 1):
         scene = Scene.draw(seed)
         assert scene.agrees(networks.detect(scene.frame))
         assert scene.is_covered(networks.segment(scene.frame))

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import fuzz as script
 from tests.fuzzing.decoder import Decoder
 from tests.fuzzing.record import Tried, add
 from tests.fuzzing.registry import DECODERS
 from tests.fuzzing.runner import Outcome, corpus_of, fuzz
-from tests.pages import ROOT
 
-SCRIPT = ROOT / "scripts" / "fuzz.py"
 EXECUTIONS = 60  # of mutated inputs for each decoder
 
 
-def run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, check=False, timeout=120)
+@pytest.fixture(autouse=True)
+def _logs() -> Iterator[None]:
+    """Log again, as the script does not."""
+    yield
+    logging.disable(logging.NOTSET)
 
 
 @pytest.mark.parametrize("decoder", DECODERS, ids=lambda decoder: decoder.name)
@@ -53,18 +55,19 @@ def test_the_same_seed_gives_the_same_inputs() -> None:
     assert taken[0] == taken[1]
 
 
-def test_the_script_lists_its_decoders_and_refuses_unknown_ones() -> None:
-    listed = run("--list")
-    assert listed.returncode == 0
-    assert "msg " in listed.stdout
-    assert run("--only", "nonsense").returncode == 2
+def test_the_script_lists_its_decoders_and_refuses_unknown_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert script.main(["--list"]) == 0
+    assert "msg " in capsys.readouterr().out
+    assert script.main(["--only", "nonsense"]) == 2
 
 
-def test_the_script_ends_with_a_table(tmp_path: Path) -> None:
-    done = run("--only", "frame,msg", "--seconds", "0.1")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 decoders, 0 with a foreign exception" in done.stdout
-    assert "Examples" in run("--help").stdout
+def test_the_script_ends_with_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert script.main(["--only", "frame,msg", "--seconds", "0.1"]) == 0
+    assert "2 decoders, 0 with a foreign exception" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        script.main(["--help"])
+    assert not left.value.code
+    assert "Examples" in capsys.readouterr().out
 
 
 def test_executions_of_several_runs_add_up(tmp_path: Path) -> None:

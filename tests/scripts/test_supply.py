@@ -27,6 +27,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from gdp.stores.issue import make_owner
+from tests.draws import IS_LONG
 from tests.pages import ROOT
 
 LOCKS = {path.name: read_lock(path) for path in sorted((ROOT / "requirements").glob("*.lock"))}
@@ -409,15 +410,16 @@ def test_a_commit_is_built_to_the_same_bytes_each_time_without_what_is_not_commi
 
 @needs_toml
 @needs_backend
-def test_the_release_of_this_commit_is_reproducible_pure_and_passes_twine(tmp_path: Path) -> None:
+def test_the_release_of_this_commit_is_pure_and_passes_twine(tmp_path: Path) -> None:
+    """That each build gives the same bytes is shown by a small one, and by night by this one too."""
     twine = pytest.importorskip("twine.commands.check", reason="twine of the extra `dev` is not installed")
     if subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, check=False).returncode:
         pytest.skip("this is no clone: a release is built from a commit")
-    for out in ("one", "two"):
-        release.build(tmp_path / out)
+    release.build(tmp_path / "one")
     files = sorted((tmp_path / "one").iterdir())
-    for path in files:
-        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+    if IS_LONG:
+        release.build(tmp_path / "two")
+        assert [path.read_bytes() for path in files] == [(tmp_path / "two" / path.name).read_bytes() for path in files]
     (wheel,), (sdist,) = (tmp_path / "one").glob("*.whl"), (tmp_path / "one").glob("*.tar.gz")
     assert twine.check([str(wheel), str(sdist)], strict=True) is False
     assert wheel.name.endswith("-py3-none-any.whl")

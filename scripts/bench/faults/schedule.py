@@ -52,6 +52,7 @@ _STORE_LEAST_S: Final = 3.0  # a replica takes over within two seconds: a shorte
 _SERVERS: Final = 3  # number of servers of a role
 _AT_ONCE: Final = 3
 _CLOCK_STEP_S: Final = 300.0
+_PACE_S: Final = 2.0  # mean time between the starts of two faults
 _FIRST_S: Final = 1.0
 _TRIES: Final = 40
 
@@ -101,28 +102,25 @@ def make_schedule(
     seed: int,
     duration_s: float,
     *,
-    pace_s: float = 2.0,
     kinds: Sequence[FaultKind] | None = None,
     has_store: bool = False,
 ) -> list[Fault]:
     """Return the faults of a run, in the order of their starts.
 
-    ``duration_s``: when the last fault has ended. ``pace_s``: mean time between two starts. ``kinds``: what may happen;
-    None: everything. ``has_store``: RIBs share a store of several servers, which may fail.
+    ``duration_s``: when the last fault has ended. ``kinds``: what may happen; None: everything. ``has_store``: RIBs
+    share a store of several servers, which may fail.
     """
     drawn = set(kinds or FaultKind) - (frozenset() if has_store else _OF_STORE)
-    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, pace_s, drawn))
+    return list(_draw(plan, random.Random(f"schedule {seed}"), duration_s, drawn))
 
 
-def _draw(
-    plan: Plan, chance: random.Random, duration_s: float, pace_s: float, kinds: set[FaultKind]
-) -> Iterator[Fault]:
+def _draw(plan: Plan, chance: random.Random, duration_s: float, kinds: set[FaultKind]) -> Iterator[Fault]:
     oracle, under_way, at = Oracle(plan), list[Fault](), {mover: homes[0] for mover, homes in plan.homes.items()}
     weights = {kind: weight for kind, weight in _WEIGHTS.items() if kind in kinds}
     revoke_s = duration_s * 0.6 if FaultKind.REVOKE in kinds and VICTIM in plan.members else None
     now_s = _FIRST_S
     while weights:
-        now_s += min(chance.expovariate(1 / pace_s), 4 * pace_s)
+        now_s += min(chance.expovariate(1 / _PACE_S), 4 * _PACE_S)
         if now_s >= duration_s:
             break
         under_way = [fault for fault in under_way if fault.end_s > now_s]

@@ -6,6 +6,7 @@ from os import urandom
 
 import pytest
 
+from gdp.client import best_effort_queue
 from gdp.client.publisher import Publisher
 from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, KeyContext, Sealer, fragment_capacity
@@ -140,7 +141,10 @@ def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_undelivered_messages_are_bounded_in_memory_and_evictions_are_counted_in_messages(reliable: bool) -> None:
+def test_undelivered_messages_are_bounded_in_memory_and_evictions_are_counted_in_messages(
+    reliable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(best_effort_queue, "WINDOW_BYTES", WINDOW_BYTES // 8)  # of small messages there are many
     publisher = publisher_of(reliable=reliable)
     pipe, (end,) = live(publisher)
     message, count = bytes(10_000 if reliable else 300), 0

@@ -6,7 +6,7 @@ from functools import partial
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.client.send_options import SendOptions
@@ -15,6 +15,7 @@ from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import REPAIR_S, REPORT_DELAY_S
 from gdp.message.late_repairs import HOLD_S
+from tests.draws import draws
 from tests.gdp.client.pipe import End, Pipe, publisher_of
 
 IMAGE_BYTES = 828_000  # 600 fragments
@@ -285,7 +286,7 @@ def test_repairs_leave_before_new_frames() -> None:
     one_way_s=st.sampled_from([0.0005, 0.03, 0.15]),
     deadline_s=st.sampled_from([None, 0.05, 2.0]),
 )
-@settings(max_examples=60)
+@draws(20, long=60)
 def test_what_arrives_is_whole_in_order_and_once_and_the_rest_is_counted(
     seed: int, loss: float, jitter_s: float, doubled: float, one_way_s: float, deadline_s: float | None
 ) -> None:

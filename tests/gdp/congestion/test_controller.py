@@ -11,6 +11,7 @@ from gdp.congestion.delivery_rate import DeliveryRate
 from gdp.congestion.filters import WindowedExtreme
 from gdp.congestion.states import State
 from tests.gdp.congestion.simulated_path import MTU, CubicSender, Flow, SimulatedPath
+from tests.lanes import nightly
 
 RTT_S = 0.06
 SECOND = 1.0
@@ -37,7 +38,9 @@ def test_a_gigabit_path_is_full_after_ten_round_trips() -> None:
     assert flow.share(10 * RTT_S, 11 * RTT_S, link.bits_s) >= 0.95
 
 
-@pytest.mark.parametrize(("mbit_s", "rtt_s"), [(1, 0.2), (5, 0.01), (5, 0.2), (10, 0.06), (20, 0.01), (20, 0.2)])
+@pytest.mark.parametrize(
+    ("mbit_s", "rtt_s"), [(1, 0.2), (5, 0.01), (5, 0.2), (20, 0.2), *nightly((10, 0.06), (20, 0.01))]
+)
 @pytest.mark.parametrize("deep", [False, True])
 def test_a_path_is_used_with_a_short_queue_whatever_its_fifo(mbit_s: float, rtt_s: float, *, deep: bool) -> None:
     link, flow = path(mbit_s, rtt_s=rtt_s, fifo_s=SECOND if deep else rtt_s), own()
@@ -108,7 +111,7 @@ def test_a_path_that_becomes_slower_is_drained_within_two_seconds() -> None:
     assert flow.share(7, 12, 5e6) >= 0.9
 
 
-@pytest.mark.parametrize("collapsed_bits_s", [3e5, 1e6, pytest.param(5e6, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("collapsed_bits_s", [3e5, *nightly(1e6, 5e6)])
 def test_a_path_that_collapses_behind_a_short_fifo_is_drained_and_used(collapsed_bits_s: float) -> None:
     link, flow = SimulatedPath(bits_s=200e6, rtt_s=0.01, fifo_bytes=64_000), own()
     link.add(flow)
@@ -180,10 +183,8 @@ def test_next_to_a_cubic_flow_each_has_35_to_65_percent(fifo_s: float) -> None:
 _FAST_PATHS = [(fifo_s, is_first) for is_first in (False, True) for fifo_s in (RTT_S / 2, RTT_S, 2 * RTT_S)]
 
 
-@pytest.mark.parametrize(
-    ("fifo_s", "is_first"),
-    [_FAST_PATHS[0], *(pytest.param(*each, marks=pytest.mark.nightly) for each in _FAST_PATHS[1:])],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize(("fifo_s", "is_first"), _FAST_PATHS)
 def test_next_to_a_cubic_flow_on_a_fast_path_each_has_35_to_65_percent(fifo_s: float, *, is_first: bool) -> None:
     link, flow = path(100, fifo_s=fifo_s), own(start_s=0 if is_first else 5)
     cubic = Flow(CubicSender(), start_s=5 if is_first else 0)
@@ -216,7 +217,7 @@ def test_a_later_rate_that_is_lower_is_no_other_flow(fifo_s: float) -> None:
     assert link.queue_quantile(5, 0.9) <= 0.2  # what was under way at each change has to leave
 
 
-@pytest.mark.parametrize("fifo_s", [RTT_S, SECOND])
+@pytest.mark.parametrize("fifo_s", [RTT_S, *nightly(SECOND)])
 def test_the_queue_is_short_again_within_ten_seconds_after_a_cubic_flow_has_ended(fifo_s: float) -> None:
     link, flow = path(10, fifo_s=fifo_s), own()
     link.add(flow)

@@ -7,7 +7,7 @@ from thin_link.channel import ConstantRate
 from tests.gdp.congestion.simulated_robot import JPEG, RAW, SimulatedRobot, Stream, mix
 
 RTT_S = 0.06
-BEGIN_S, SECONDS = 4.0, 4.0
+BEGIN_S, SECONDS = 3.0, 2.5
 
 
 def measured(mbit_s: float, camera: Stream, fifo_s: float) -> SimulatedRobot:

@@ -17,12 +17,13 @@ from gdp.exchange import anti_entropy
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import SyncSet
+from tests.draws import IS_LONG
 
 PACE = SyncPace(total_s=10.0, soon_s=0.2, fetch_s=1.0, reply_s=0.03, reply_bytes=40_000, draws=2)
 DELAY_S = 0.01
 SETS = (b"one", b"two")
 ITEM_BYTES = 200
-MANY = 100_000
+MANY = 100_000 if IS_LONG else 30_000
 
 
 def key_of(number: int) -> bytes:

@@ -25,7 +25,7 @@ from gdp.switch.table import Table
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node
 
 BORDER, ROBOT, SERVER, LEAF = node("border"), node("robot"), node("server"), node("leaf")
-OUTAGE_S = 300.0
+OUTAGE_S = 4 * REBINDS.most_s
 
 
 def record(identity: Identity, *, is_public: bool = False) -> EndpointRecord:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import LocalError
@@ -18,6 +18,7 @@ from gdp.service.follower import Apply, Fetch, Follower, Load, Refuse, Say
 from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import AttachReplica, ReplicaProbe, ReplicaStatus, Snapshot, SnapshotRequest
 from gdp.service.sequencer import Sequencer
+from tests.draws import draws
 
 SEQUENCERS = tuple(Name(bytes([number]) * 32) for number in (1, 2))
 SERVERS = tuple(Name(bytes([number]) * 32) for number in (11, 12, 13))
@@ -213,7 +214,7 @@ def answered_are_done(world: World, client: Client) -> None:
 
 
 @pytest.mark.parametrize("tells", [True, False])
-@settings(max_examples=100, deadline=None)
+@draws(40, long=100)
 @given(seed=st.integers(0, 1 << 32), loss=st.sampled_from([0.0, 0.1]))
 def test_whatever_replica_dies_those_that_live_hold_the_answered_requests_in_order(
     tells: bool, seed: int, loss: float
@@ -242,7 +243,7 @@ def test_whatever_replica_dies_those_that_live_hold_the_answered_requests_in_ord
     assert world.clients[SEQUENCERS[0]].failed == []
 
 
-@settings(max_examples=100, deadline=None)
+@draws(40, long=100)
 @given(seed=st.integers(0, 1 << 32), loss=st.sampled_from([0.0, 0.1]))
 def test_a_sequencer_that_restarts_goes_on_from_the_replica_that_is_furthest(seed: int, loss: float) -> None:
     world = World(seed, tells=True)
@@ -278,7 +279,7 @@ def test_a_second_client_learns_the_sequencer_until_that_one_is_gone() -> None:
     assert world.agreed() == [b"0", b"2", b"3"]
 
 
-@settings(max_examples=100, deadline=None)
+@draws(40, long=100)
 @given(seed=st.integers(0, 1 << 32))
 def test_of_two_clients_that_begin_at_once_one_keeps_the_order(seed: int) -> None:
     world = World(seed, tells=True)

@@ -96,7 +96,7 @@ def test_a_state_played_back_changes_nothing_and_goes_no_further() -> None:
 
 
 def test_a_switch_that_is_gone_is_forgotten_and_the_others_are_not() -> None:
-    world = ring()
+    world = ring(lease_s=20.0)  # of names, which are not the subject
     world.network.stop("nuc3")
     world.network.run(LINK_STATE.lease_s + LINK_STATE.refresh_s + 1)
     gone = bytes(world.identities["nuc3"].name)

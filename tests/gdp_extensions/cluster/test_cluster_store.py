@@ -157,19 +157,16 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     link.close()
 
 
-def test_names_outlive_a_restart_of_all_servers(tmp_path: Path) -> None:
+def test_names_outlive_a_restart_of_all_servers(servers: Path) -> None:
     """Valkey issue 3983: where the default user has no rights, servers drop what functions wrote as they read it."""
-    if not HAS_SERVER:
-        pytest.skip("neither redis-server nor valkey-server is installed")
     site = Site()
-    with cluster(tmp_path / "store") as store:
-        before = ClusterPair(site, config_of(store))
-        assert [each.refused for each in acks(before.give(before.one, site.relay("/a", 5)))] == [None]
-        before.close()
-        subprocess.run([START_CLUSTER, "--stop", store.parent], check=True, timeout=60)
-        subprocess.run([START_CLUSTER, store.parent], check=True, timeout=120, stdout=subprocess.DEVNULL)
-        after = ClusterPair(site, config_of(store))
-        assert [each.is_negative for each in answers(after.give(after.two, site.query("/a")))] == [False]
-        (ack,) = acks(after.give(after.two, site.relay("/a", 4)))
-        assert (ack.refused, ack.sequence) == (DropReason.STALE, 5)
-        after.close()
+    before = ClusterPair(site, config_of(servers))
+    assert [each.refused for each in acks(before.give(before.one, site.relay("/a", 5)))] == [None]
+    before.close()
+    subprocess.run([START_CLUSTER, "--stop", servers.parent], check=True, timeout=60)
+    subprocess.run([START_CLUSTER, servers.parent], check=True, timeout=120, stdout=subprocess.DEVNULL)
+    after = ClusterPair(site, config_of(servers))
+    assert [each.is_negative for each in answers(after.give(after.two, site.query("/a")))] == [False]
+    (ack,) = acks(after.give(after.two, site.relay("/a", 4)))
+    assert (ack.refused, ack.sequence) == (DropReason.STALE, 5)
+    after.close()

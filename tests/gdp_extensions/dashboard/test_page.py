@@ -12,7 +12,7 @@ import pytest
 
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from gdp_extensions.dashboard.server import POLL_S, DashboardServer
-from tests.browser import console_errors, needs_browser, open_browser, save_picture
+from tests.browser import console_errors, needs_browser, open_browser, prefer_scheme, save_picture
 from tests.gdp_extensions.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 from tests.gdp_extensions.dashboard.test_server import running
 
@@ -59,15 +59,25 @@ class Page:
 Open = Callable[..., Page]
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Chrome]:
+    """A browser of all tests: each page has an origin of its own, and so its own storage."""
+    with open_browser() as driver:
+        yield driver
+
+
 @pytest.fixture
-def opened(tmp_path: Path) -> Iterator[Open]:
+def opened(browser: Chrome, tmp_path: Path) -> Iterator[Open]:
     """A function that opens the page of a network."""
     with ExitStack() as stack:
 
         def open_page(network: SyntheticNetwork, *states: Path, is_dark: bool = False) -> Page:
             nodes = stack.enter_context(serve_network(network, tmp_path))
             server = stack.enter_context(running(nodes, states, poll_s=POLL_S))
-            return Page(stack.enter_context(open_browser(is_dark=is_dark)), server)
+            prefer_scheme(browser, is_dark=is_dark)
+            stack.callback(console_errors, browser)  # those of the closed page are no other's
+            stack.callback(browser.get, "about:blank")
+            return Page(browser, server)
 
         yield open_page
 

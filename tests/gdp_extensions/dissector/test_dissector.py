@@ -18,6 +18,7 @@ from gdp.frame.codec import HEADER_BYTES, decode, ethernet
 from gdp.frame.kinds import Flag, Kind
 from gdp.frame.layers import GDP, PAYLOADS, STATEMENTS, Statement, least_bytes
 from gdp_extensions.dissector.dissector import _field, dissector
+from tests.draws import IS_LONG
 from tests.gdp_extensions.dissector.tshark import assert_same, needs_tshark, shown_by_tshark, write_pcap
 
 ETHER: Final = ethernet(b"\x02\0\0\0\0\x01", b"\x02\0\0\0\0\x02")
@@ -89,7 +90,7 @@ def _whole(rng: random.Random) -> Iterator[bytes]:
             least = least_bytes(PAYLOADS[kind][bool(flags & 1)])
             payloads += [rng.randbytes(least + extra) for extra in (-1, 0, 1)]
         if kind in STATEMENTS:
-            payloads += [_statement(rng) for _ in range(12)]
+            payloads += [_statement(rng) for _ in range(12 if IS_LONG else 4)]
         for payload in payloads:
             padding = b"" if rng.random() < 0.5 else rng.randbytes(rng.randrange(1, 46))
             yield ETHER + bytes(head / Raw(payload)) + padding

@@ -34,6 +34,7 @@ from gdp_extensions.doors.token import door_token
 from lab.process import until
 from proxy.endpoints.core.endpoint import Event
 from proxy.serial.known_types import known_channel
+from tests.draws import draws
 from tests.gdp_extensions.doors import test_foxglove_door as foxglove
 from tests.gdp_extensions.doors.rights import Everything, goal_id
 from tests.gdp_extensions.doors.test_foxglove_door import free_port
@@ -187,11 +188,22 @@ class Site:
         return said
 
 
-@pytest.mark.parametrize("number", [HUGE, [HUGE], {"id": HUGE}, ["x"] * 100_000], ids=["text", "list", "map", "many"])
-@pytest.mark.parametrize("request_", REQUESTS, ids=lambda each: each["op"])
-def test_z03_an_id_of_32_mib_is_refused_and_not_repeated(request_: dict[str, object], number: object) -> None:
+IDS: dict[str, object] = {"text": HUGE, "list": [HUGE], "map": {"id": HUGE}, "many": ["x"] * 100_000}
+
+
+@pytest.mark.parametrize(
+    ("request_", "form"),
+    [
+        pytest.param(
+            each, form, id=f"{each['op']}-{form}", marks=[] if form == "text" or at == 0 else pytest.mark.nightly
+        )
+        for at, each in enumerate(REQUESTS)
+        for form in IDS
+    ],
+)
+def test_z03_an_id_of_32_mib_is_refused_and_not_repeated(request_: dict[str, object], form: str) -> None:
     site = Site()
-    said = site.say(**request_, id=number)
+    said = site.say(**request_, id=IDS[form])
     assert "id: a text of at most 1024 characters was expected" in said
     assert len(said) < 1_000
     assert site.events == []
@@ -214,6 +226,7 @@ KEYS = sorted({key for each in (*REQUESTS, *FOXGLOVE_REQUESTS) for key in each} 
 CHANGES = st.dictionaries(st.sampled_from(KEYS), JSON, max_size=4)
 
 
+@draws(25)
 @given(st.lists(st.tuples(st.sampled_from(REQUESTS), CHANGES), max_size=4))
 def test_z03_whatever_a_rosbridge_client_sends_is_done_or_one_error(
     sent: list[tuple[dict[str, object], object]],
@@ -224,6 +237,7 @@ def test_z03_whatever_a_rosbridge_client_sends_is_done_or_one_error(
         site.say(**{**request_, **changes})
 
 
+@draws(25)
 @given(st.lists(st.tuples(st.sampled_from(FOXGLOVE_REQUESTS), CHANGES), max_size=4), st.binary(max_size=20))
 def test_z03_whatever_a_foxglove_client_sends_is_done_or_one_error(
     sent: list[tuple[dict[str, object], object]], raw: bytes

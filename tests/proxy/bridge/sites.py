@@ -1,4 +1,4 @@
-"""Machines with a ROS graph, a proxy and its bridge each, on the simulated ring of five, whose clock jumps.
+"""Machines with a ROS graph, a proxy and its bridge each, on a simulated network of two domains, whose clock jumps.
 
 A bridge is driven like in the proxy's loop: after events of its graph or the overlay, and when its own timer is due;
 not more often.
@@ -22,7 +22,7 @@ from gdp.ros_names import Kind
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from lab.topology import Topology, ring5
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.bridge import Bridge, BridgeRules
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
@@ -36,6 +36,14 @@ from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
 ROBOT: Final = "nuc1/robot"
 SERVER: Final = "nuc5/server"
+_ROW: Final = Topology(  # of the ring's switches those that have machines
+    (Link("nuc1", "nuc3"), Link("nuc3", "nuc5")),
+    (DomainPlan("school", ("nuc1",), upper="cloud"), DomainPlan("cloud", ("nuc3", "nuc5"))),
+    (
+        *(Attachment("nuc1", "rib", "rib"), Attachment("nuc3", "rib", "rib")),
+        *(Attachment("nuc1", "proxy", "robot"), Attachment("nuc5", "proxy", "server")),
+    ),
+)
 _GRAPHS: Final = {1: "{endpoint: ros1}", 2: "{endpoint: ros2, domain: 0}"}
 _TICK_S: Final = 0.5  # of the proxy's loop
 _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
@@ -130,7 +138,7 @@ class Sites:
 
     Args:
         folder: an empty one, for the files that rules name.
-        topology: None: the ring of five.
+        topology: None: three switches in a row, the first of a domain of its own.
         look_s: after which a proxy with news wakes up.
         options: further ones of ``Simulation``.
     """
@@ -138,7 +146,7 @@ class Sites:
     def __init__(
         self, folder: Path, seed: int = 1, topology: Topology | None = None, look_s: float = 0.005, **options: Any
     ) -> None:
-        self.world = Simulation(topology=topology or ring5(), seed=seed, keepalive_ms=500, **options)
+        self.world = Simulation(topology=topology or _ROW, seed=seed, keepalive_ms=500, **options)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder

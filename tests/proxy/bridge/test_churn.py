@@ -17,7 +17,7 @@ from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
 CHATTER = f"name: /chatter, type: {STRING}"
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
-TIMES = 10_000 if IS_LONG else 1_000
+TIMES = 10_000 if IS_LONG else 300
 WARM = 300  # repetitions, until all is in use
 SPARE = 100  # objects, of some hundred thousand
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gdp.intervals import READER
 from proxy.endpoints.core.qos import default
+from tests.draws import draws
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
@@ -28,7 +29,7 @@ def is_matched(machine: Machine) -> bool:
     return bool(machine.graph.subscriptions("/chatter", STRING))
 
 
-@settings(max_examples=4, deadline=None, derandomize=True)
+@draws(3)
 @given(
     count=st.integers(1, 60),
     stays_s=st.floats(0.0, 2.0),
@@ -115,7 +116,7 @@ def test_what_no_reader_waits_for_is_kept_for_a_moment_and_counted(sites: Sites)
     assert robot.stream.losses.total == 101
 
 
-@settings(max_examples=4, deadline=None, derandomize=True)
+@draws(1)
 @given(
     count=st.integers(1, 60),
     every_s=st.floats(0.01, 0.5),

@@ -37,6 +37,7 @@ def listening(sites: Sites) -> tuple[Machine, Machine, Ear]:
     ear = Ear(server.graph, "/chatter")
     robot.graph.publish("/talker", "/chatter", STRING)
     assert sites.run(3, robot.is_read)
+    sites.run(0.5)  # until the bridge has described the topic itself
     return robot, server, ear
 
 

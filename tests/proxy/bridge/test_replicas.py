@@ -36,7 +36,7 @@ from tests.proxy.bridge.test_actions import (
 )
 
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
-PLACES = ("nuc3/a", "nuc4/b", "nuc5/c")
+PLACES = ("nuc3/a", "nuc3/b", "nuc5/c")
 MODES = ["mode: all", "mode: some, copies: 2", "mode: hedged, budget: 0.5"]
 
 
@@ -134,7 +134,7 @@ def test_what_waits_at_a_server_when_its_call_ends_is_never_given_to_it(sites: S
 
 def test_an_answer_of_somebody_without_a_delegation_is_not_taken(sites: Sites) -> None:
     _, locals_, client, caller = replicas(sites, 2)
-    forger = sites.add("nuc2/forger")
+    forger = sites.add("nuc3/forger")
     caller.call(switch(on=True))
     assert sites.run(1, lambda: locals_[0].asked == 1)
     flow = client.bridge.flows[0][1]

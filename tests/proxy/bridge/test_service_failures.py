@@ -16,7 +16,7 @@ from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
 from tests.proxy.endpoints.fake import FakeGraph
 
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
-OTHER = "nuc4/other"
+OTHER = "nuc3/other"
 
 
 @pytest.fixture

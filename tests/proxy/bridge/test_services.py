@@ -89,7 +89,7 @@ def test_five_hundred_calls_at_once_get_their_own_answers_in_whatever_order(tmp_
 
 def test_clients_on_several_machines_each_get_their_own_answers(sites: Sites) -> None:
     server, client = pair(sites)
-    third = sites.add("nuc4/third", imports=[SWITCH])
+    third = sites.add("nuc3/third", imports=[SWITCH])
     LocalServer(server.graph, answer=lambda raw: switched(f"got {raw[-1]}"))
     remote_clients = [Client(client.graph), Client(third.graph)]
     assert sites.run(3, lambda: all(caller.sees_server() for caller in remote_clients))
@@ -102,7 +102,7 @@ def test_clients_on_several_machines_each_get_their_own_answers(sites: Sites) ->
 
 def test_two_far_servers_are_both_asked_and_the_first_answer_wins(sites: Sites) -> None:
     server, client = pair(sites)
-    other = sites.add("nuc4/other", expose=[SWITCH])
+    other = sites.add("nuc3/other", expose=[SWITCH])
     slow, fast = LocalServer(server.graph), LocalServer(other.graph, answer=lambda _: switched("fast"))
     caller = Client(client.graph)
     sites.run(3)

@@ -20,7 +20,7 @@ from tests.proxy.bridge.sites import ROBOT, Machine, Sites
 from tests.proxy.endpoints.fake import FakeGraph, Server
 
 RULE = f"kind: service, name: /switch, type: {SET_BOOL}, state: ordered"
-PLACES = ("nuc3/a", "nuc4/b", "nuc5/c")
+PLACES = ("nuc3/a", "nuc3/b", "nuc5/c")
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_a_second_client_is_refused_with_a_reason_until_the_first_is_gone(sites:
     _, counter = start(sites, PLACES[0])
     first, caller = client_of(sites)
     assert sites.run(10, follow(first, 1))
-    second, other = client_of(sites, "nuc2/second")
+    second, other = client_of(sites, "nuc3/second")
     assert sites.run(5, other.sees_server)
     sites.run(3)
     other.call(switch(on=True))

@@ -256,7 +256,7 @@ def test_what_a_later_publisher_latches_pushes_nothing_of_the_first_out(sites: S
 
 def test_what_publishers_on_two_machines_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
-    third = sites.add("nuc2/third", expose=[CHATTER])
+    third = sites.add("nuc3/third", expose=[CHATTER])
     for machine, text in ((robot, "robot"), (third, "third")):
         machine.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string(text))
     sites.run(2)

@@ -1,7 +1,11 @@
-"""ROS 1 master on loopback with real rospy nodes, and an endpoint whose events are awaited, never slept for."""
+"""ROS 1 master on loopback with real rospy nodes, and an endpoint whose events are awaited, never slept for.
+
+Master, nodes and the endpoints' rospy processes are forked from one zygote, which has imported rospy.
+"""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import select
@@ -12,11 +16,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
+from unittest import mock
 
 import pytest
 
 from gdp.errors import LocalError
+from lab import zygote
 from lab.process import until
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.ros1 import Ros1Endpoint
@@ -25,6 +31,9 @@ from proxy.endpoints.ros1.install import rospy_folder
 NODE = "gdp_proxy_0123456789ab"
 PATIENCE_S = 15.0
 
+_PEER: Final = Path(__file__).with_name("ros1_peer.py")
+_MODULES: Final = ("pyroute2.netns", "proxy.endpoints.ros1.child", "tests.proxy.endpoints.ros1_modules")
+_MASTER: Final = "import rosmaster.main; rosmaster.main.rosmaster_main({argv!r})"
 _PREAMBLE = """
 import os, rospy
 def print(*words):  # whole lines, whatever the threads
@@ -50,7 +59,7 @@ class Peer:
 
     def __init__(self, code: str, environment: dict[str, str]) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _PREAMBLE + code],
+            [sys.executable, str(_PEER), _PREAMBLE + code],
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -147,9 +156,8 @@ class Net:
         self._master: subprocess.Popen[bytes] | None = None
 
     def start_master(self) -> None:
-        code = "import rosmaster.main; rosmaster.main.rosmaster_main()"
         self._master = subprocess.Popen(
-            [sys.executable, "-c", code, "--core", "-p", str(self.port)],
+            [sys.executable, str(_PEER), _MASTER.format(argv=["rosmaster", "--core", "-p", str(self.port)])],
             env=self.environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -196,19 +204,19 @@ class Net:
         self.stop_master()
 
 
+@functools.cache
+def _ros1_zygote() -> zygote.Zygote:
+    return zygote.Zygote.start(_MODULES)
+
+
 @contextmanager
 def ros1_net(logs: Path) -> Iterator[Net]:
     """Running master; everything is stopped at the end."""
-    folder = need_ros1()
-    net = Net(folder, logs)
-    earlier = os.environ.get("ROS_IP")
-    os.environ["ROS_IP"] = "127.0.0.1"
-    try:
-        net.start_master()
-        yield net
-    finally:
-        net.stop()
-        if earlier is None:
-            del os.environ["ROS_IP"]
-        else:
-            os.environ["ROS_IP"] = earlier
+    net = Net(need_ros1(), logs)
+    forked = None if zygote.Popen.zygote is None else _ros1_zygote()
+    with mock.patch.dict(os.environ, ROS_IP="127.0.0.1"), mock.patch.object(zygote.Popen, "zygote", forked):
+        try:
+            net.start_master()
+            yield net
+        finally:
+            net.stop()

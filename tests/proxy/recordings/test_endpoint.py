@@ -22,6 +22,7 @@ from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
+from tests.insiders.oracle import signing_oracle
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import IMAGE, STRING
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -42,6 +43,13 @@ class FullWriter:
 
     def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
         raise LocalError("full.mcap cannot be written: No space left on device")
+
+
+@pytest.fixture(autouse=True)
+def _signatures() -> Iterator[None]:
+    """Sign by the ideal scheme: what crosses is the subject."""
+    with signing_oracle():
+        yield
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import mcap.exceptions
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import SeekingReader
 from mcap.writer import CompressionType, Writer
@@ -29,6 +29,7 @@ from proxy.cli.recording import app
 from proxy.recordings.split import SplitWriter
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import RosVersion
+from tests.draws import draws
 from tests.proxy.recordings.test_reader import LATCHED, PLAIN, START_NS, raw, read, string
 
 FILES = [(1, "a.bag"), (2, "a.mcap")]
@@ -116,7 +117,7 @@ def test_what_was_flushed_is_read_after_a_kill(ros: RosVersion, name: str, tmp_p
     assert read(tmp_path / name)[1] == ""
 
 
-@settings(max_examples=20, deadline=None)
+@draws(8)
 @given(sizes=st.lists(st.tuples(st.integers(0, 5_000), st.booleans()), min_size=1, max_size=30), cut=st.floats(0, 1))
 @pytest.mark.parametrize(("ros", "name"), FILES)
 def test_a_file_that_is_cut_anywhere_gives_all_complete_chunks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fog.cluster import MachineRequest
@@ -12,6 +12,7 @@ from fog.hardware import Hardware
 from fog.machine import Machine, MachineState
 from fog.supervisor.core.reconcile import Drain, Launch, Release, Timeouts, decide
 from fog.supervisor.core.record import Outcome, update_record
+from tests.draws import draws
 from tests.fog.supervisor.machines import NOW_S, SPOT, World, record, serving
 
 PATIENCE = Timeouts()
@@ -133,7 +134,7 @@ def world_of(states: list[str]) -> World:
 
 
 @given(st.lists(STATES, max_size=7), st.integers(1, 4))
-@settings(max_examples=80, deadline=None)
+@draws(25)
 def test_from_any_mix_of_machines_it_comes_to_what_is_wanted_and_rests(states: list[str], count: int) -> None:
     world, wanted = world_of(states), (SPOT,) * count
     for _ in range(400):
@@ -143,7 +144,7 @@ def test_from_any_mix_of_machines_it_comes_to_what_is_wanted_and_rests(states: l
 
 
 @given(st.lists(st.sampled_from(["booting", "serving", "frozen"]), min_size=1, max_size=6), st.integers(1, 4))
-@settings(max_examples=80, deadline=None)
+@draws(25)
 def test_scaling_down_never_takes_what_serves_below_what_is_wanted(states: list[str], count: int) -> None:
     world, wanted = world_of(states), (SPOT,) * count
     least = min(len(world.serving()), count)
