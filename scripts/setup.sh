@@ -58,6 +58,13 @@ package() {
     rm -f "$log"
 }
 
+# package_without_service <name> <why>: as package, but the system does not start its service: tests start their own
+package_without_service() {
+    local mask=/etc/systemd/system/$1.service
+    if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
+    RUNLEVEL=1 package "$1" "$2"
+}
+
 # hand_over <path>...: under sudo, new files belong to the calling user, not to root
 hand_over() {
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" && "${SUDO_UID}" != 0 ]]; then
@@ -72,11 +79,12 @@ link_scripts() {
     printf '%s\n' "$root/scripts" "$root/examples/grasp" >"$folder/gdp_scripts.pth"
 }
 
-# compile_own: byte-compiles our packages, so that root leaves no caches that their owner cannot delete
+# compile_own: builds the burst core where possible, and byte-compiles our packages: root leaves no caches of its own
 compile_own() {
     "$venv/bin/python" -m compileall -q gdp proxy fog gdp_extensions scripts/ring scripts/fog_demo scripts/internet scripts/internet_demo examples/grasp/grasp || fail "the source does not compile"
+    make --silent -C gdp/burst "PYTHON=$venv/bin/python" 2>/dev/null || true
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
-        find gdp proxy fog gdp_extensions scripts examples -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
+        find gdp proxy fog gdp_extensions scripts examples \( -name __pycache__ -o -name core.abi3.so \) -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
     fi
 }
 
@@ -102,12 +110,8 @@ if [[ "$extras" == "$dev" ]]; then
     if [[ $(id -u) -eq 0 ]] && command -v apt-get >/dev/null; then
         scripts/setup_ros1.sh || say "tests of ROS 1 will be skipped"
     fi
-    if ! command -v redis-server >/dev/null && ! command -v valkey-server >/dev/null; then
-        # not a system service: tests start servers of their own
-        mask=/etc/systemd/system/redis-server.service
-        if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
-        RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
-    fi
+    command -v redis-server >/dev/null || command -v valkey-server >/dev/null ||
+        package_without_service redis-server "tests of RIBs that share a cluster start it"
     command -v softhsm2-util >/dev/null || package softhsm2 "tests keep keys in its tokens"
     command -v wireguard-go >/dev/null || package wireguard-go "tests make tunnels with it; no kernel module is needed"
     command -v nft >/dev/null || [[ -x /usr/sbin/nft ]] || package nftables "tests of NAT make it with nft"
@@ -121,15 +125,9 @@ if [[ "$extras" == "$dev" ]]; then
     command -v chromium >/dev/null || package chromium "tests open the page of the live view in it"
     command -v chromedriver >/dev/null || package chromium-driver "tests drive chromium with it"
     command -v mandoc >/dev/null || package mandoc "a test checks the manual pages with it"
-    for shell in zsh fish; do
-        command -v "$shell" >/dev/null || package "$shell" "tests complete words in it"
-    done
-    if ! command -v promtool >/dev/null; then
-        # not a system service: tests use promtool alone
-        mask=/etc/systemd/system/prometheus.service
-        if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
-        RUNLEVEL=1 package prometheus "tests check alert rules with its promtool"
-    fi
+    command -v zsh >/dev/null || package zsh "tests complete words in it"
+    command -v fish >/dev/null || package fish "tests complete words in it"
+    command -v promtool >/dev/null || package_without_service prometheus "tests check alert rules with its promtool"
     command -v tshark >/dev/null || package tshark "tests compare our Wireshark dissector with Scapy"
 fi
 
@@ -155,5 +153,6 @@ rm -f "$venv"/.installed*
 printf '%s\n' "$wanted" >"$venv/.installed$extras"
 link_scripts
 compile_own
+say "burst core: $([[ -e gdp/burst/core.abi3.so ]] && echo compiled || echo "Python, without make, cc, or headers of Python or OpenSSL")"
 hand_over "$venv" ./*.egg-info
 say "done"

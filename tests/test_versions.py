@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import gdp
+from gdp import burst
 from gdp.cli.version import versioned
 from tests.pages import ROOT
 
@@ -45,7 +46,7 @@ def test_a_command_prints_its_version_and_ends(
     with pytest.raises(SystemExit) as ended:
         getattr(importlib.import_module(module), function)()
     assert ended.value.code == 0
-    assert capsys.readouterr().out == f"{command} {metadata.version('gdp-ros')}\n"
+    assert capsys.readouterr().out == f"{command} {metadata.version('gdp-ros')}\nburst core: {burst.VARIANT}\n"
 
 
 def test_the_library_has_the_version_of_its_distribution() -> None:

@@ -26,7 +26,9 @@ HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-c
 
 def _print_and_end(context: typer.Context, is_wanted: bool) -> None:
     if is_wanted:
-        echo(f"{context.find_root().info_name} {gdp.__version__}")
+        from gdp.burst import VARIANT  # it loads the ciphers
+
+        echo(f"{context.find_root().info_name} {gdp.__version__}\nburst core: {VARIANT}")
         raise typer.Exit
 
 

@@ -266,7 +266,7 @@ class Participant:
         if self.attachment.switch is None:
             return
         self._clock.advance(now_s)
-        if self.attachment.switch != self._sent_by:
+        if self.attachment.switch is not self._sent_by:
             self._sent_by = self.attachment.switch
             self.publications.attachment_changed(now_s)
         if self._reception.reporting:
@@ -276,10 +276,10 @@ class Participant:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        due_s = earliest(self.attachment.get_timer(), self.diagnostics.get_timer())
+        due_s = self.attachment.get_timer(), self.diagnostics.get_timer()
         if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
-            return due_s
-        return earliest(due_s, self.publications.next_due(), self._reception.timers.next_due())
+            return earliest(*due_s)
+        return earliest(*due_s, self.publications.next_due(), self._reception.timers.next_due())
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""

@@ -28,6 +28,7 @@ class TimerQueue(Generic[T]):
     def __init__(self) -> None:
         self._touched: dict[T, None] = {}  # in order, so that a run is reproducible
         self._queue = DueQueue[T]()
+        self._due_s: float | None = None  # while nothing is touched
 
     def reschedule(self, each: T) -> None:
         """Note that an object may be due at another time than before."""
@@ -39,7 +40,8 @@ class TimerQueue(Generic[T]):
             for each in self._touched:
                 self._queue.put(each, each.get_timer())
             self._touched.clear()
-        return self._queue.next_due()
+            self._due_s = self._queue.next_due()
+        return self._due_s
 
     def poll_due(self, now_s: float) -> list[T]:
         """Return the objects that are due; the next check reads their timers again."""

@@ -21,30 +21,30 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Callable, Sequence
-from itertools import islice
 from typing import Final, NamedTuple, Protocol, overload
 
-from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers import Cipher, modes
-from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.ciphers.algorithms import AES256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.header_batch import HeaderBatch
+from gdp import burst
+from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
-from gdp.frame.kinds import VERSION, Flag
+from gdp.frame.codec import HEADER_BYTES, Header, encode
+from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 from gdp.sansio import ReceivedFrame
 
 __all__ = [
     "SALT_BYTES",
     "SEAL_BYTES",
+    "SHARED_FLAGS",
     "SIGNATURE_BYTES",
     "TAG_BYTES",
     "KeyContext",
     "MessageKeys",
+    "Opened",
     "Opener",
     "Sealed",
     "Sealer",
@@ -55,15 +55,13 @@ __all__ = [
     "seal_key",
 ]
 
-TAG_BYTES: Final = 16
-SALT_BYTES: Final = 8
 SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its ciphertext
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
-_NONCE: Final = struct.Struct("!QI")
-_COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
 _LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a microsecond each
-_BODY_AT: Final = HEADER_BYTES + SALT_BYTES
+_SHARED: Final = struct.Struct("!2sBxH2xQ4x84s")  # of a frame: without hops left, payload length and part
+_HASHED: Final = struct.Struct("!13s2sBHQ84s")
+SHARED_FLAGS: Final = 0xFF & ~_LAST  # of all parts of a message
 _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
 
 
@@ -111,15 +109,15 @@ class MessageKeys:
         counters = int.from_bytes(b"\x00\x01X\x00" + bytes(12) + b"\x00\x02X\x00" + bytes(12), "big")
         self._mask = counters ^ (subkey << 128 | subkey)
 
-    def of(self, salt: bytes) -> AESGCM:
-        """Return the cipher under a salt of up to 12 bytes: the first half of XAES's nonce, padded with zeros."""
+    def of(self, salt: bytes) -> bytes:
+        """Return the key of a salt of up to 12 bytes: the first half of XAES's nonce, padded with zeros."""
         first = int.from_bytes(salt, "big") << 8 * (12 - len(salt))
-        return AESGCM(self._encrypt(((first << 128 | first) ^ self._mask).to_bytes(32, "big")))
+        return self._encrypt(((first << 128 | first) ^ self._mask).to_bytes(32, "big"))
 
 
 def salt_of(frame: bytes) -> bytes:
     """Return the salt of a sealed part; not yet authenticated, and shorter where the part is."""
-    return frame[HEADER_BYTES:_BODY_AT]
+    return frame[HEADER_BYTES:BODY_AT]
 
 
 def fragment_capacity(mtu: int) -> int:
@@ -130,23 +128,10 @@ def fragment_capacity(mtu: int) -> int:
     return capacity
 
 
-def digest_of(header: Header, salt: bytes) -> hashlib._Hash:
+def digest_of(frame: bytes) -> hashlib._Hash:
     """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
-    return hashlib.sha256(
-        b"gdp-message-2"
-        + _COMMON.pack(
-            VERSION,
-            header.kind,
-            header.flags & ~_LAST,
-            header.epoch,
-            header.number,
-            header.parts,
-            header.incarnation,
-            header.destination,
-            header.source,
-        )
-        + salt
-    )
+    kind, flags, epoch, number, others = _SHARED.unpack_from(frame)
+    return hashlib.sha256(_HASHED.pack(b"gdp-message-2", kind, flags & SHARED_FLAGS, epoch, number, others))
 
 
 class Sealer:
@@ -202,9 +187,8 @@ class Sealer:
         epoch, kind, incarnation, destination, source = self._fixed
         header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
         salt = self._random_bytes(SALT_BYTES)
-        return Sealed(
-            aead=self._keys.of(salt), salt=salt, signer=self._signer, header=header, message=message, capacity=capacity
-        )
+        cipher, head, signer = burst.CIPHER(self._keys.of(salt)), encode(header) + salt, self._signer
+        return Sealed(cipher=cipher, signer=signer, head=head, parts=parts, message=message, capacity=capacity)
 
 
 class Sealed(Sequence[bytes]):
@@ -213,33 +197,31 @@ class Sealed(Sequence[bytes]):
     def __init__(
         self,
         *,
-        aead: AESGCM,
-        salt: bytes,
+        cipher: MessageCipher,
         signer: Signer | None,
-        header: Header,
+        head: bytes,
+        parts: int,
         message: bytes | Sealed,
         capacity: int,
     ) -> None:
-        self._aead = aead
-        self._salt = salt
-        self._encrypt = aead.encrypt
+        self._cipher = cipher
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
-        self._header = header
+        self._head, self._parts = head, parts
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
-            self._message, self.message_bytes = memoryview(message), len(message)
+            self._message, self.message_bytes = message, len(message)
         else:
-            self._message, self.message_bytes = memoryview(b""), message.message_bytes
+            self._message, self.message_bytes = b"", message.message_bytes
             self._origin = message._origin or message
         self._capacity = capacity
-        self._running = None if signer is None else digest_of(header, salt)
+        self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []
-        self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
+        self.size_bytes = self.message_bytes + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
-        return self._header.parts
+        return self._parts
 
     @overload
     def __getitem__(self, at: int) -> bytes: ...
@@ -248,7 +230,7 @@ class Sealed(Sequence[bytes]):
     def __getitem__(self, at: slice) -> list[bytes]: ...
 
     def __getitem__(self, at: int | slice) -> bytes | list[bytes]:
-        parts = self._header.parts
+        parts = self._parts
         end = at.indices(parts)[1] if isinstance(at, slice) else at % parts + 1 if -parts <= at < parts else parts
         if end > len(self._frames):
             self._seal_until(end)
@@ -257,63 +239,36 @@ class Sealed(Sequence[bytes]):
     @property
     def largest(self) -> int:
         """Return the bytes of the largest frame, sealed or not."""
-        return self.size_bytes if self._header.parts == 1 else self._capacity + HEADER_BYTES + SEAL_BYTES
+        return self.size_bytes if self._parts == 1 else self._capacity + HEADER_BYTES + SEAL_BYTES
 
     def message(self) -> bytes:
         """Return the plaintext, to be sealed again under another number."""
         if self._origin is not None:
             return self._origin.message()
-        if len(self._frames) < self._header.parts:
-            return bytes(self._message)
-        last, number, decrypt = self._header.parts - 1, self._header.number, self._aead.decrypt
-        plains = [
-            decrypt(
-                _NONCE.pack(number, part),
-                frame[_BODY_AT : len(frame) - self._signature_bytes * (part == last)],
-                authenticated(frame),
-            )
-            for part, frame in enumerate(self._frames)
-        ]
-        return b"".join(plains)
+        frames = self._frames
+        if len(frames) < self._parts:
+            return self._message
+        ends = [len(frame) for frame in frames]
+        ends[-1] -= self._signature_bytes
+        opened = [self._cipher.open(frame, end) for frame, end in zip(frames, ends, strict=True)]
+        return b"".join([each[0] for each in opened if each is not None])
 
     def _seal_until(self, end: int) -> None:
         if self._origin is not None:
-            self._message, self._origin = memoryview(self._origin.message()), None
-        full_end = min(end, self._header.parts - 2)  # the last two may be shorter
-        if len(self._frames) < full_end:
-            self._seal_full(full_end)
-        for part in range(len(self._frames), end):
-            self._seal_one(part)
-
-    def _seal_full(self, end: int) -> None:
-        """Seal the parts before ``end``, all of full length, on the fast path."""
-        first, capacity, message = len(self._frames), self._capacity, self._message
-        encrypt, running, append = self._encrypt, self._running, self._frames.append
-        headers = HeaderBatch(self._header._replace(length=capacity + SEAL_BYTES), first, end - first, self._salt)
-        begins = range(first * capacity, end * capacity, capacity)
-        for begin, (header,), (additional,), (nonce,) in zip(begins, *headers.each(), strict=True):
-            sealed = encrypt(nonce, message[begin : begin + capacity], additional)
-            if running is not None:
-                running.update(sealed)
-            append(header + sealed)
-
-    def _seal_one(self, part: int) -> None:
-        header, capacity = self._header, self._capacity
-        plain = self._message[part * capacity : (part + 1) * capacity]
-        is_last = part == header.parts - 1
-        length = len(plain) + SEAL_BYTES + self._signature_bytes * is_last
-        kind, flags, hops_left, epoch, _, number, _, parts, incarnation, to, source = header
-        flags |= _LAST * is_last
-        head = encode(Header(kind, flags, hops_left, epoch, length, number, part, parts, incarnation, to, source))
-        sealed = self._encrypt(_NONCE.pack(header.number, part), plain, authenticated(head))
-        frame = head + self._salt + sealed
+            self._message, self._origin = self._origin.message(), None
+        seal, frames = self._cipher.seal, self._frames
+        sealed, payloads = seal(self._head, len(frames), end, self._message, self._capacity, self._signature_bytes)
+        frames += sealed
         if self._signer is not None and self._running is not None:
-            self._running.update(sealed)
-            if is_last:
-                frame += self._signer.sign_digest(self._running.digest())
-        if is_last:
-            self._message = self._message[:0]  # the frames hold all of it now
-        self._frames.append(frame)
+            self._running.update(payloads)
+            if end == self._parts:
+                frames[-1] += self._signer.sign_digest(self._running.digest())
+        if end == self._parts:
+            self._message = b""  # the frames hold all of it now
+
+
+# Plaintext; ciphertext and tag, as the signature covers them; signature of a signed last part.
+Opened = tuple[bytes, bytes, bytes]
 
 
 class Opener:
@@ -335,40 +290,21 @@ class Opener:
     ) -> None:
         self._signature_bytes = SIGNATURE_BYTES if is_signed else 0
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
-        self._known: dict[bytes, AESGCM] = {}  # by the salts of messages with opened parts
+        self._known: dict[bytes, MessageCipher] = {}  # by the salts of messages with opened parts
 
     def open_run(
-        self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
-    ) -> tuple[list[bytes], list[bytes]]:
-        """Open consecutive parts from ``first`` on in ``arrivals[at:]``; the fast path.
-
-        A frame that does not begin, to the bit, as ``headers`` predict ends the run, as does an altered one: ``open``
-        must check it.
-
-        Args:
-            length: payload bytes of each part; ``headers`` are of parts that are not the last.
+        self, head: bytes, length: int, first: int, count: int, arrivals: Sequence[ReceivedFrame], at: int
+    ) -> tuple[int, bytes, bytes]:
+        """Open consecutive parts, as ``MessageCipher.open_run``; one that ends the run is for ``open``.
 
         Returns:
-            plaintexts and payloads.
+            how many were opened, their plaintexts, and what their signature covers.
         """
-        plains: list[bytes] = []
-        payloads: list[bytes] = []
-        decrypt, end = self._aead_of(headers.salt).decrypt, HEADER_BYTES + length
-        expected = islice(zip(*headers.each(), strict=True), first - headers.first, None)
-        for ((header,), (additional,), (nonce,)), arrival in zip(expected, islice(arrivals, at, None), strict=False):
-            frame = arrival.frame
-            if not frame.startswith(header):
-                break
-            sealed = frame[_BODY_AT:end]
-            try:
-                plains.append(decrypt(nonce, sealed, additional))
-            except InvalidTag:
-                break
-            payloads.append(sealed)
-        return plains, payloads
+        cipher = self._cipher_of(head[HEADER_BYTES:])
+        return cipher.open_run(head, length, first, count, arrivals, at, self._signature_bytes > 0)
 
-    def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
-        """Return plaintext, ciphertext and tag as the signature covers them, and the signature of a signed last part.
+    def open(self, header: Header, frame: bytes) -> Opened:
+        """Open a part.
 
         Args:
             header: of this frame, already decoded.
@@ -384,17 +320,16 @@ class Opener:
         sealed_end = end - self._signature_bytes if is_last else end
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
-        salt, sealed = frame[HEADER_BYTES:_BODY_AT], frame[_BODY_AT:sealed_end]
-        aead = self._aead_of(salt)
-        try:
-            plain = aead.decrypt(_NONCE.pack(header.number, header.part), sealed, authenticated(frame))
-        except InvalidTag:
-            raise EnvelopeError(DropReason.BAD_TAG) from None
+        salt = frame[HEADER_BYTES:BODY_AT]
+        cipher = self._cipher_of(salt)
+        opened = cipher.open(frame, sealed_end)
+        if opened is None:
+            raise EnvelopeError(DropReason.BAD_TAG)
         if header.parts > 1 and salt not in self._known:
             if len(self._known) >= _KEYS_KEPT:
                 del self._known[next(iter(self._known))]
-            self._known[salt] = aead
-        return plain, sealed, frame[sealed_end:end]
+            self._known[salt] = cipher
+        return *opened, frame[sealed_end:end]
 
-    def _aead_of(self, salt: bytes) -> AESGCM:
-        return self._known.get(salt) or self._keys.of(salt)
+    def _cipher_of(self, salt: bytes) -> MessageCipher:
+        return self._known.get(salt) or burst.CIPHER(self._keys.of(salt))

@@ -19,7 +19,6 @@ from gdp.limits import PARTS_MAX
 from gdp.names import NAME_BYTES
 
 __all__ = [
-    "AAD_BYTES",
     "DESTINATION_AT",
     "ETHER_BYTES",
     "FLAGS_AT",
@@ -27,10 +26,12 @@ __all__ = [
     "HOPS_AT",
     "HOPS_MASK",
     "KIND_AT",
+    "LENGTH_AT",
     "NUMBER_AND_PART",
     "NUMBER_AT",
     "OVERHEAD_BYTES",
     "PARTS_AT",
+    "PART_AT",
     "SECOND_PATH",
     "SOURCE_AT",
     "Header",
@@ -49,11 +50,12 @@ OVERHEAD_BYTES: Final = ETHER_BYTES + HEADER_BYTES
 KIND_AT: Final = 1
 FLAGS_AT: Final = 2
 HOPS_AT: Final = 3
+LENGTH_AT: Final = 6
 NUMBER_AT: Final = 8
+PART_AT: Final = 16
 PARTS_AT: Final = 20
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64
-AAD_BYTES: Final = HEADER_BYTES - 1
 HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
 SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gdp.crypto.envelope import SHARED_FLAGS
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import FLAGS_AT, Header, decode
 from gdp.frame.kinds import Flag
@@ -36,7 +37,6 @@ _FORGET_S: Final = 1.0
 _MESSAGES_MAX: Final = 16
 _OVERHEAD_BYTES: Final = 128  # of a kept frame, in addition to its bytes
 _PARITY: Final = int(Flag.PARITY)
-_SHARED_FLAGS: Final = 0xFF & ~int(Flag.LAST)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -241,4 +241,4 @@ class FrameRecovery:
 
 def _is_same(a: Header, b: Header) -> bool:
     """Return whether two frames may be of one message."""
-    return (a.parts, a.epoch, a.flags & _SHARED_FLAGS) == (b.parts, b.epoch, b.flags & _SHARED_FLAGS)
+    return (a.parts, a.epoch, a.flags & SHARED_FLAGS) == (b.parts, b.epoch, b.flags & SHARED_FLAGS)

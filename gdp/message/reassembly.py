@@ -14,16 +14,16 @@ evicted. Without signatures, under a session secret, only the writer can make fr
 
 from __future__ import annotations
 
-import struct
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from gdp.crypto.envelope import digest_of, salt_of
-from gdp.crypto.header_batch import HeaderBatch
+from gdp.burst.cipher import BODY_AT
+from gdp.crypto.envelope import SHARED_FLAGS, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PARTS_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
@@ -32,28 +32,13 @@ from gdp.message.second_copies import REPEATED_PARTS_MAX, RepeatedFrames, Second
 from gdp.message.striping import StripedPaths
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["ALL_PARTS", "SCAN_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
+__all__ = ["ALL_PARTS", "SCAN_PARTS", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
-_SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
-_URGENT = int(Flag.URGENT)
+_URGENT = int(Flag.URGENT)  # a plain number: an IntFlag's operators cost a microsecond each
 _PREPAID_BYTES = 32 << 10  # memory is reserved ahead for this many bytes of a message whose fragments come in order
 _PART_OVERHEAD_BYTES = 128  # overhead of a kept fragment, in addition to its bytes
-_NUMBER_AND_PART = struct.Struct("!QI")
-_AHEAD_PARTS = 64  # heads made at once
 SCAN_PARTS = 4_096  # examined at once for what is missing: more than an honest publisher has under way
-
-
-class OpensParts(Protocol):
-    """An ``Opener`` of the envelope, or a stand-in."""
-
-    def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
-        """Return plaintext, signed payload, signature; or raise ``EnvelopeError``."""
-
-    def open_run(
-        self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
-    ) -> tuple[list[bytes], list[bytes]]:
-        """Return plaintexts and payloads of the consecutive inner fragments from ``first`` on."""
 
 
 class VerifiesDigest(Protocol):
@@ -74,43 +59,30 @@ class ReassembledMessage(NamedTuple):
     head: bytes = b""  # the first bytes under the seal, before the message: ``head_bytes`` of its reassembler
 
 
-class _Hash(Protocol):
-    def update(self, data: bytes, /) -> None: ...
-    def digest(self) -> bytes: ...
-
-
-class _Nothing:
-    """The hash of a message that has no signature."""
-
-    def update(self, data: bytes, /) -> None:
-        """Ignore a ciphertext."""
-
-    def digest(self) -> bytes:
-        """Return no digest."""
-        return b""
-
-
-_NOTHING = _Nothing()
-
-
 @dataclass(slots=True, kw_only=True)
 class _PartialMessage:
     parts: int
     salt: bytes
-    epoch: int
-    opener: OpensParts
-    running: _Hash
+    opener: Opener
+    running: hashlib._Hash | None  # None: the message has no signature
     touched_s: float
-    header: Header  # of the newest fragment that came in order
-    headers: HeaderBatch | None = None  # of the fragments expected next
-    plain: dict[int, bytes] = field(default_factory=dict)
-    early: dict[int, bytes] = field(default_factory=dict)  # ciphertext ahead of the hash
-    hashed: int = 0  # fragments the hash has taken
+    head: bytes = b""  # header and salt of the newest fragment that came in order
+    length: int = 0  # its payload bytes
+    plain: list[bytes] = field(default_factory=list)  # in order; an item may be several fragments
+    early: dict[int, tuple[bytes, bytes]] = field(default_factory=dict)  # plaintext and ciphertext ahead of these
+    hashed: int = 0  # fragments in ``plain``, which the hash has taken
     top: int = -1  # highest fragment held
     signature: bytes = b""
     held_bytes: int = 0
     prepaid_bytes: int = 0  # of ``held_bytes``, not yet used
     hops: int = 0
+
+    def append(self, count: int, plain: bytes, sealed: bytes) -> None:
+        """Append the next fragments."""
+        self.plain.append(plain)
+        self.hashed += count
+        if self.running is not None:
+            self.running.update(sealed)
 
 
 class Reassembler:
@@ -134,7 +106,7 @@ class Reassembler:
     def __init__(
         self,
         source: bytes,
-        opener_of: Callable[[int], OpensParts],
+        opener_of: Callable[[int], Opener],
         writer: VerifiesDigest | None,
         budget: ReassemblyQuota,
         *,
@@ -170,38 +142,26 @@ class Reassembler:
         message = self._unfinished.get(self._under_way)
         if message is None or message.early:
             return 0
-        frame, header = arrivals[at].frame, message.header
+        frame, head, first = arrivals[at].frame, message.head, message.hashed
         if (
-            frame[NUMBER_AT:PARTS_AT] != _NUMBER_AND_PART.pack(header.number, message.hashed)
-            or frame[DESTINATION_AT:HEADER_BYTES] != header.destination + header.source
+            frame[NUMBER_AT:PARTS_AT] != head[NUMBER_AT:PART_AT] + first.to_bytes(4, "big")
+            or frame[DESTINATION_AT:BODY_AT] != head[DESTINATION_AT:]
         ):
             return 0  # a frame of another message
-        taken, first = 0, message.hashed
-        while at + taken < len(arrivals):
-            part, headers = message.hashed, message.headers
-            if headers is None or not 0 <= part - headers.first < headers.count:
-                count = min(_AHEAD_PARTS, message.parts - 1 - part)
-                if count <= 0:
-                    break
-                headers = message.headers = HeaderBatch(message.header, part, count, message.salt)
-            wanted = min(len(arrivals) - at - taken, headers.count - part + headers.first)
-            cost = message.header.length + _PART_OVERHEAD_BYTES
-            if message.prepaid_bytes < wanted * cost:
-                if not self._reserve_memory(_PREPAID_BYTES + wanted * cost):
-                    break
-                message.held_bytes += _PREPAID_BYTES + wanted * cost
-                message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
-            plains, payloads = message.opener.open_run(headers, part, message.header.length, arrivals, at + taken)
-            message.plain.update(enumerate(plains, part))
-            for payload in payloads:
-                message.running.update(payload)
-            message.prepaid_bytes -= len(plains) * cost
-            message.hashed += len(plains)
-            taken += len(plains)
-            if len(plains) < wanted:
-                break
+        wanted = min(len(arrivals) - at, message.parts - 1 - first)
+        if wanted <= 0:
+            return 0
+        cost = message.length + _PART_OVERHEAD_BYTES
+        if message.prepaid_bytes < wanted * cost:
+            if not self._reserve_memory(_PREPAID_BYTES + wanted * cost):
+                return 0
+            message.held_bytes += _PREPAID_BYTES + wanted * cost
+            message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
+        taken, plain, payloads = message.opener.open_run(head, message.length, first, wanted, arrivals, at)
         if taken:
-            message.top = first + taken - 1
+            message.append(taken, plain, payloads)
+            message.prepaid_bytes -= taken * cost
+            message.top = message.hashed - 1
             message.touched_s = now_s
             self.new_parts += taken
             self.full_parts += taken
@@ -215,23 +175,23 @@ class Reassembler:
             return None
         message, salt = self._unfinished.get(number), salt_of(frame)
         is_same = message is not None and message.parts == header.parts and message.salt == salt
-        if is_same and message is not None and header.part in message.plain:
+        if is_same and message is not None and (header.part < message.hashed or header.part in message.early):
             self.drop_copy(header, DropReason.DUPLICATE, now_s)
             return None
         try:
             opener = self._opener_of(header.epoch)
-            plain, sealed, signature = opener.open(header, frame)
+            opened = opener.open(header, frame)
         except EnvelopeError as error:
             self.drops[error.reason] += 1
             return None
         if header.parts == 1:
-            return self._take_whole(header, salt, plain, sealed, signature, now_s)
+            return self._take_whole(header, frame, opened, now_s)
         if message is None and not self._free_space(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
         if message is None or not is_same:
-            message = self._start(header, salt, opener, now_s)
-        return self._keep(message, header, plain, sealed, signature, now_s)
+            message = self._start(header, frame, opener, now_s)
+        return self._keep(message, header, frame, opened, now_s)
 
     def drop_copy(self, header: Header, reason: DropReason, now_s: float) -> None:
         """Count a fragment that was here before: for ``reason``, or as a second copy where each may have one."""
@@ -242,14 +202,12 @@ class Reassembler:
         self.drops[DropReason.SECOND_COPY] += 1
         self.copies.handle_copy(header.number, header.part, now_s)
 
-    def _take_whole(
-        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes, now_s: float
-    ) -> ReassembledMessage | None:
-        number = header.number
+    def _take_whole(self, header: Header, frame: bytes, opened: Opened, now_s: float) -> ReassembledMessage | None:
+        number, (plain, sealed, signature) = header.number, opened
         if self._writer is not None:
-            running = digest_of(header, salt)
+            running = digest_of(frame)
             running.update(sealed)
-            if not self._is_signed(self._writer, signature, running):
+            if not self._is_signed(signature, running):
                 return None
         if number in self._unfinished:  # another sender stated a larger number of fragments
             self._drop(number)
@@ -264,32 +222,30 @@ class Reassembler:
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return ReassembledMessage(
             number=number,
-            flags=header.flags & _SHARED_FLAGS,
+            flags=header.flags & SHARED_FLAGS,
             message=message,
             parts=1,
             hops=max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0),
             head=head,
         )
 
-    def _start(self, header: Header, salt: bytes, opener: OpensParts, now_s: float) -> _PartialMessage:
+    def _start(self, header: Header, frame: bytes, opener: Opener, now_s: float) -> _PartialMessage:
         """Return a new partial message; it replaces one with another number of fragments, or another salt."""
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
         return _PartialMessage(
             parts=header.parts,
-            salt=salt,
-            epoch=header.epoch,
+            salt=salt_of(frame),
             opener=opener,
-            running=_NOTHING if self._writer is None else digest_of(header, salt),
+            running=None if self._writer is None else digest_of(frame),
             touched_s=now_s,
-            header=header,
         )
 
     def _keep(
-        self, message: _PartialMessage, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
+        self, message: _PartialMessage, header: Header, frame: bytes, opened: Opened, now_s: float
     ) -> ReassembledMessage | None:
-        number = header.number
+        number, (plain, sealed, signature) = header.number, opened
         in_order = header.part == message.hashed
         cost = len(plain) + _PART_OVERHEAD_BYTES + (0 if in_order else len(sealed))
         if not self._reserve(number, cost):
@@ -301,7 +257,6 @@ class Reassembler:
         self.full_parts += header.part < header.parts - 1
         message.held_bytes += cost
         message.touched_s = now_s
-        message.plain[header.part] = plain
         message.top = max(message.top, header.part)
         message.hops = max(message.hops, HOPS_MAX - (header.hops_left & HOPS_MASK))
         if self.copies is not None:
@@ -311,42 +266,38 @@ class Reassembler:
         if signature:
             message.signature = signature
         if in_order:
-            message.header, message.headers = header, None
+            message.head, message.length = frame[:BODY_AT], header.length
             self._under_way = number
-            self._hash(message, sealed)
+            message.append(1, plain, sealed)
+            while message.early and (early := message.early.pop(message.hashed, None)) is not None:
+                message.append(1, *early)
+                message.held_bytes -= len(early[1])
+                self._release_memory(len(early[1]))
         else:
-            message.early[header.part] = sealed
+            message.early[header.part] = plain, sealed
         return self._finish(header, message) if message.hashed == message.parts else None
-
-    def _hash(self, message: _PartialMessage, sealed: bytes) -> None:
-        message.running.update(sealed)
-        message.hashed += 1
-        while message.early and (early := message.early.pop(message.hashed, None)) is not None:
-            message.running.update(early)
-            message.hashed += 1
-            message.held_bytes -= len(early)
-            self._release_memory(len(early))
 
     def _finish(self, header: Header, message: _PartialMessage) -> ReassembledMessage | None:
         number = header.number
         self._drop(number)
-        if self._writer is not None and not self._is_signed(self._writer, message.signature, message.running):
+        if message.running is not None and not self._is_signed(message.signature, message.running):
             return None  # not finished: the writer's own fragments may still come
         self.window.finish(number)
         first, size = message.plain[0], self._head_bytes
-        whole = b"".join([first[size:], *(message.plain[part] for part in range(1, message.parts))])
+        whole = b"".join([first[size:], *message.plain[1:]])
         return ReassembledMessage(
             number=number,
-            flags=header.flags & _SHARED_FLAGS,
+            flags=header.flags & SHARED_FLAGS,
             message=whole,
             parts=message.parts,
             hops=message.hops,
             head=first[:size],
         )
 
-    def _is_signed(self, writer: VerifiesDigest, signature: bytes, running: _Hash) -> bool:
+    def _is_signed(self, signature: bytes, running: hashlib._Hash) -> bool:
+        assert self._writer is not None  # else nothing is hashed
         try:
-            writer.verify_digest(signature, running.digest())
+            self._writer.verify_digest(signature, running.digest())
         except RemoteError as error:
             self.drops[error.reason] += 1
             return False
@@ -472,7 +423,7 @@ class Reassembler:
         lacking_from = message.hashed
         seen_to = min(message.top + 1, message.hashed + SCAN_PARTS)
         for part in range(message.hashed, seen_to):
-            if part in message.plain:
+            if part in message.early:
                 if lacking_from < part:
                     ranges.append((lacking_from, part - 1))
                 lacking_from = part + 1

@@ -25,13 +25,13 @@ _DOUBT: Final = 3.0  # standard deviations that chance explains
 
 def samples_of(frames: Iterable[bytes], place: int = 0) -> list[tuple[int, int]]:
     """Return place and seal of each sample among frames, the first of which has ``place``."""
-    sampled = [(each, frame) for each, frame in enumerate(frames, place) if not frame[-1] & _SAMPLE_BITS]
-    return [(each, int.from_bytes(frame[-9:-1], "big")) for each, frame in sampled]
+    places = enumerate(frames, place)
+    return [(each, int.from_bytes(frame[-9:-1], "big")) for each, frame in places if not frame[-1] & _SAMPLE_BITS]
 
 
 def sum_of_samples(frames: Iterable[bytes]) -> int:
     """Return the sum of the seals of those frames that are samples."""
-    return sum(seal for _, seal in samples_of(frames))
+    return sum([int.from_bytes(frame[-9:-1], "big") for frame in frames if not frame[-1] & _SAMPLE_BITS])
 
 
 class ReceiptCheck:

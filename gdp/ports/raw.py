@@ -14,30 +14,26 @@ from __future__ import annotations
 
 import select
 import socket
-import struct
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Final
 
+from gdp import burst
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import (
     ETHER_BYTES,
     FLAGS_AT,
-    HEADER_BYTES,
     HOPS_AT,
-    HOPS_MASK,
     KIND_AT,
     OVERHEAD_BYTES,
-    SECOND_PATH,
-    second_path_key,
 )
-from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
+from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.plane import Port, ReceivedFrame
 from gdp.ports.sockets import (
     TrafficClass,
     attach_drop_all_filter,
@@ -53,10 +49,7 @@ from gdp.token_bucket import TokenBucket
 
 __all__ = ["RawPlane"]
 
-# From the header on: version and kind as one number, hops left, payload length, destination and source as one key.
-_GLANCE: Final = struct.Struct("!HxBxxH24x64s")
-_FIRST: Final = VERSION << 8
-_FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
+_ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
 _URGENT: Final = int(Flag.URGENT)
 _CLASSES: Final = (
     TrafficClass.CONTROL,
@@ -66,12 +59,6 @@ _CLASSES: Final = (
     TrafficClass.GUEST,
 )  # in the order of service
 _GREETINGS: Final = Rate(500.0, burst=128.0)  # per second, and at once; each costs at most 30 us before its rejection
-
-
-@lru_cache(maxsize=4_096)  # more than the number of frequent sizes
-def _shape(size: int) -> struct.Struct:
-    """Return the struct that reads the sender's address and a frame of ``size`` bytes from a slot."""
-    return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
 def _traffic_class_of(frame: bytes) -> TrafficClass:
@@ -225,13 +212,8 @@ class RawPlane(NetdevPlane):
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
         self._came[port] += len(sizes)
-        pool, arrivals, waited = batch.pool, self._arrivals, waited_s(source) if sizes else 0.0
-        for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
-            mac, frame = _shape(size).unpack_from(pool, slot)
-            arrivals.append(ReceivedFrame(port, mac, frame, waited))
-
-    def _arrival(self, port: int, slot: int, size: int) -> ReceivedFrame:
-        return ReceivedFrame(port, *_shape(size).unpack_from(self._batch.pool, slot))
+        if sizes:
+            self._arrivals += burst.received(batch.pool, batch.slot_bytes, sizes, port, waited_s(source))
 
     def _forward_all(
         self,
@@ -242,32 +224,23 @@ class RawPlane(NetdevPlane):
         sinks: Mapping[int, socket.socket],
     ) -> None:
         """Receive one batch from a port and forward it by ``sinks``; punt the frames for the node."""
-        batch, get = self._batch, entries.get
-        pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
+        batch = self._batch
+        pool, step = batch.pool, batch.slot_bytes
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
         self._came[port] += len(sizes)
-        run_key, run_hops, run_start, fits = b"", NOWHERE, 0, 0
-        for at, size in zip(range(ETHER_BYTES, len(pool), step), sizes, strict=False):
-            first, hops_left, length, key = glance(pool, at)
-            if hops_left & SECOND_PATH:
-                key = second_path_key(key)
-            if key != run_key:
-                slot = at // step
-                self._send(sinks, run_hops, run_start, slot - run_start)
-                hops = get(key)
-                if hops is None:
-                    hops = get(key[:NAME_BYTES])
-                run_key, run_hops, run_start = key, hops or NOWHERE, slot
-                fits = self._narrowest(run_hops) if key not in sides or is_side(sides[key], port) else 0
-            if HEADER_BYTES + length <= size <= fits and hops_left & HOPS_MASK > 1 and _FIRST <= first < _FIRST_CONTROL:
-                pool[at + HOPS_AT] = hops_left - 1
+        for first, count, key, largest in burst.runs(pool, step, sizes):
+            hops = entries.get(key)
+            if hops is None:
+                hops = entries.get(key[:NAME_BYTES], NOWHERE)
+            if key and largest <= self._narrowest(hops) and (key not in sides or is_side(sides[key], port)):
+                at = first * step + ETHER_BYTES + HOPS_AT
+                end = at + (count - 1) * step + 1
+                pool[at:end:step] = pool[at:end:step].translate(_ONE_LESS)
+                self._send(sinks, hops, first, count)
             else:
-                slot = at // step
-                self._send(sinks, run_hops, run_start, slot - run_start)
-                run_start = slot + 1
-                self._consider(entries, sides, port, sinks, slot, size)
-        self._send(sinks, run_hops, run_start, len(sizes) - run_start)
+                for slot in range(first, first + count):
+                    self._consider(entries, sides, port, sinks, slot, sizes[slot])
 
     def _narrowest(self, hops: Hops) -> int:
         """Return the size that the links of all hops accept; 0 if one is down or there is none."""
@@ -294,7 +267,8 @@ class RawPlane(NetdevPlane):
             batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
             self._send(sinks, decision.hops, slot, 1)
         else:
-            self._arrivals.append(self._arrival(port, at, size))
+            slot_bytes = ETHER_BYTES + size
+            self._arrivals += burst.received(batch.pool[at : at + slot_bytes], slot_bytes, [size], port, 0.0)
 
     def _send(self, sinks: Mapping[int, socket.socket], hops: Hops, first: int, count: int) -> None:
         """Send a run of slots to every hop."""

@@ -24,6 +24,7 @@ from machine import ROOT, MachineState, RefusedError, machine_state, require_tru
 from plot import Panel, require_plot, save_bars
 from report import Rounds, Settings, Target, progress, show, write_json
 
+from gdp.burst import VARIANT
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
 from lab.process import FailedError
@@ -201,7 +202,7 @@ def finish(
     outcome: Outcome, options: Options, state: MachineState, took_s: float, *, is_saved: bool, is_drawn: bool
 ) -> None:
     """Print an outcome, and write the files that the options select."""
-    settings: Settings = {**outcome.settings, "took, s": round(took_s)}
+    settings: Settings = {**outcome.settings, "burst core": VARIANT, "took, s": round(took_s)}
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
     own = OUTPUT if outcome.is_whole and not getattr(options, "quick", False) else None
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")

@@ -203,7 +203,7 @@ def test_what_is_above_the_limits_is_refused_before_a_number_is_spent() -> None:
 
 
 def test_message_keys_are_those_of_xaes_256_gcm() -> None:
-    sealed = MessageKeys(b"\x01" * 32).of(b"ABCDEFGHIJKL").encrypt(b"MNOPQRSTUVWX", b"XAES-256-GCM", b"")
+    sealed = AESGCM(MessageKeys(b"\x01" * 32).of(b"ABCDEFGHIJKL")).encrypt(b"MNOPQRSTUVWX", b"XAES-256-GCM", b"")
     assert sealed.hex() == "ce546ef63c9cc60765923609b33a9a1974e96e52daf2fcf7075e2271"  # C2SP, XAES-256-GCM
 
 
