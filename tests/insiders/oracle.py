@@ -20,7 +20,7 @@ from gdp.crypto import cbor, statements
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey, SoftwareKey
 from gdp.errors import DropReason, StatementError
 
-__all__ = ["signing_oracle"]
+__all__ = ["forget_decoded", "signing_oracle"]
 
 _DECODED_MAX: Final = 1_024
 
@@ -49,6 +49,11 @@ def _verify_digest(self: PublicKey, signature: bytes, digest: bytes) -> None:
 @lru_cache(_DECODED_MAX)
 def _decode_once(payload: bytes) -> cbor.Value:
     return cbor.decode(payload)
+
+
+def forget_decoded() -> None:
+    """Forget the statements that were decoded, for tests that count objects."""
+    _decode_once.cache_clear()
 
 
 def _decode(payload: bytes) -> cbor.Value:

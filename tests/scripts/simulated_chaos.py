@@ -20,6 +20,7 @@ from faults.schedule import Fault, FaultKind, broken_by
 
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
+from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.right import Right
@@ -49,6 +50,7 @@ class SimulatedChaos:
     Args:
         plan: the network.
         faults: in the order of their starts, of the kinds in ``SIMULATED``.
+        keepalive_ms: None: the usual one.
         seed: of keys, delays and losses.
 
     Attributes:
@@ -57,9 +59,13 @@ class SimulatedChaos:
         begun_s: virtual second at which the first fault was scheduled from.
     """
 
-    def __init__(self, plan: Plan, faults: Sequence[Fault], seed: int) -> None:
+    def __init__(
+        self, plan: Plan, faults: Sequence[Fault], seed: int, keepalive_ms: int | None = SCAPY_KEEPALIVE_MS
+    ) -> None:
         self._plan, self._faults = plan, faults
-        self.world = Simulation(topology=_topology(plan), seed=seed, journal_bytes=JOURNAL_BYTES)
+        self.world = Simulation(
+            topology=_topology(plan), seed=seed, keepalive_ms=keepalive_ms, journal_bytes=JOURNAL_BYTES
+        )
         self._labels = {label.rpartition("/")[2]: label for label in self.world.members}
         self._at = {mover: homes[0] for mover, homes in plan.homes.items()}
         self._incarnations: Counter[str] = Counter()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.draws import IS_LONG
+from tests.insiders.oracle import forget_decoded
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -32,6 +33,7 @@ def descriptors() -> int:
 
 
 def objects() -> int:
+    forget_decoded()
     gc.collect()
     return len(gc.get_objects())
 
