@@ -15,7 +15,6 @@ from enum import Enum
 from typing import Final
 
 from gdp.due_queue import earliest
-from gdp.intervals import NEVER_S
 
 __all__ = ["TRANSITIONS", "SpfDelay", "SpfEvent", "SpfState"]
 
@@ -73,8 +72,8 @@ class SpfDelay:
         self._settle(now_s)
         if self.state is SpfState.QUIET:
             self._learned_s = now_s + TIME_TO_LEARN_S
-        delay_s = min(_DELAYS_S[self.state], _DELAYS_S[SpfState.SHORT_WAIT] if is_loss else NEVER_S)
-        self.due_s = earliest(self.due_s, now_s + delay_s)
+        pace = SpfState.SHORT_WAIT if is_loss and self.state is SpfState.LONG_WAIT else self.state
+        self.due_s = earliest(self.due_s, now_s + _DELAYS_S[pace])
         self._held_down_s = now_s + HOLD_DOWN_S
         self.state = TRANSITIONS[self.state, SpfEvent.NEWS]
 
