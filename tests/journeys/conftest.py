@@ -6,23 +6,17 @@ marked ``momentary`` with the reason why no lease matters to it.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from contextlib import nullcontext
+from collections.abc import Generator
 
 import pytest
 
 from lab.simulation import Simulation
-from tests.insiders.oracle import signing_oracle
+from tests.insiders.signatures import signatures
+
+__all__ = ["signatures"]
 
 LEASES = 3
 _WORLDS = pytest.StashKey[list[Simulation]]()
-
-
-@pytest.fixture(autouse=True)
-def _signatures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Sign by the ideal scheme, but for the tests whose subject is a signature itself."""
-    with nullcontext() if request.node.get_closest_marker("real_signatures") else signing_oracle():
-        yield
 
 
 @pytest.fixture(autouse=True)

@@ -20,6 +20,7 @@ from gdp.names import Name
 from tests.gdp.client.incarnation_ids import Notes, reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
+pytestmark = pytest.mark.real_signatures
 PUBLISHER = Name(b"p" * 32)
 MALLORY = SigningKey.generate()
 

@@ -19,6 +19,7 @@ from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
+pytestmark = pytest.mark.real_signatures
 CHATTER = f"name: /chatter, type: {STRING}"
 OTHER = f"name: /other, type: {STRING}"
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"

@@ -18,6 +18,8 @@ from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
 from tests.proxy.bridge.test_actions import goal, goal_id
 from tests.proxy.bridge.test_replicas import SWITCH, actions
 
+pytestmark = pytest.mark.real_signatures
+
 
 @pytest.fixture
 def sites(tmp_path: Path) -> Sites:
