@@ -14,7 +14,7 @@ from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, flowing
 
 PERIOD_S = 0.01
-AFTER_S = 2.0  # for which a flow goes on after what befalls it
+AFTER_S = 2.0  # for which a flow continues after what befalls it
 BORDER_S = 0.35  # keepalives missing for up to 0.2 s show the death; what follows takes the SPF delay and the way
 MOVE_S = 0.15
 
