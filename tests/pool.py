@@ -15,7 +15,7 @@ import resource
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Container, Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -110,9 +110,12 @@ class _Seconds:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._files: defaultdict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
+        self._skipped: set[str] = set()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add the seconds of a test, which stand in its last report."""
+        if report.skipped:
+            self._skipped.add(_file_of(report.nodeid))
         if report.when == "teardown":
             values: list[Any] = [value for name, value in report.user_properties if name == _PROPERTY]
             for wall_s, processor_s in values:
@@ -132,7 +135,7 @@ class _Seconds:
         self._rows = [(folder, spent, _folders(known).get(folder)) for folder, spent in _folders(files).items()]
         self._over = [each[0] for each in self._rows if _is_over(each[1], each[2])] if option.budgets else []
         if option.save_budgets:
-            _write(SECONDS, _lesser(known, files))
+            _write(SECONDS, _lesser(known, files, self._skipped))
         if self._over and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = OVER_BUDGET
         yield
@@ -165,8 +168,15 @@ def _folders(files: Mapping[str, Iterable[float]]) -> dict[str, float]:
     return dict(sums)
 
 
-def _lesser(old: Mapping[str, list[float]], new: Mapping[str, list[float]]) -> dict[str, list[float]]:
-    return {file: [min(pair) for pair in zip(old.get(file, row), row, strict=True)] for file, row in new.items()}
+def _lesser(
+    old: Mapping[str, list[float]], new: Mapping[str, list[float]], skipped: Container[str] = ()
+) -> dict[str, list[float]]:
+    """Return the budgets; a file that skipped tests keeps its own, for it did less than elsewhere."""
+    known = {file: old.get(file, row) for file, row in new.items()}
+    return {
+        file: row if file in skipped else [min(pair) for pair in zip(row, new[file], strict=True)]
+        for file, row in known.items()
+    }
 
 
 def _is_over(spent_s: float, budget_s: float | None) -> bool:

@@ -23,6 +23,10 @@ def test_a_budget_only_falls_and_follows_the_files_that_there_are() -> None:
     assert _lesser(old, {"a.py": [1.0, 3.0], "new.py": [4.0, 4.0]}) == {"a.py": [1.0, 1.0], "new.py": [4.0, 4.0]}
 
 
+def test_a_file_that_skipped_tests_keeps_its_budget() -> None:
+    assert _lesser({"a.py": [2.0, 1.0]}, {"a.py": [0.1, 0.1]}, {"a.py"}) == {"a.py": [2.0, 1.0]}
+
+
 def test_a_folder_is_that_of_its_package() -> None:
     assert folder_of("tests/gdp/switch/test_table.py") == "tests/gdp/switch"
     assert folder_of("tests/attacks/test_joins.py") == "tests/attacks"
