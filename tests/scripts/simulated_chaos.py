@@ -124,6 +124,11 @@ class SimulatedChaos:
         found = self._continuity.broken_promises(begun_ns, last_ns, end_ns, limit_s, well_s)
         return [*found, *sorted(set(self.books.wrong)), *self.books.incomplete(self._is_last_life, end_ns - _ns(2.0))]
 
+    def silences(self, above_s: float) -> list[float]:
+        """Return the longer silences of connected ends from the first fault on, in seconds."""
+        found = self._continuity.silences(_ns(self.begun_s), _ns(self._end_s), above_s)
+        return [each.seconds for each in found]
+
     def _is_last_life(self, member: str, incarnation: int) -> bool:
         return incarnation == self._incarnations[member]
 
