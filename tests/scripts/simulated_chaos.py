@@ -16,7 +16,6 @@ from typing import Final
 from faults.accounts import Books, Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
-from faults.schedule import Fault, FaultKind, broken_by
 
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
@@ -24,10 +23,11 @@ from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.right import Right
+from lab.faults import Fault, FaultKind, broken_by, links_of
 from lab.network import SimLink
 from lab.process import FailedError
 from lab.simulation import Simulation
-from lab.topology import Attachment, DomainPlan, Topology, ends_of
+from lab.topology import Attachment, DomainPlan, Topology
 
 __all__ = ["SIMULATED", "SimulatedChaos"]
 
@@ -199,8 +199,7 @@ class SimulatedChaos:
 
     def _set_links(self, fault: Fault, *, up: bool) -> None:
         """Cut or restore what a cut or a partition takes down."""
-        links = [fault.targets] if fault.kind is FaultKind.CUT else [ends_of(link) for link in fault.targets[1:]]
-        for ends in links:
+        for ends in links_of(fault):
             self.world.network.set_link(self._cable(*ends), up=up)
 
     def _node(self, who: str) -> str:
