@@ -62,9 +62,10 @@ class AckNackSchedule:
         if (number, part) > self.newest[:2]:
             self.newest = number, part, came_s
 
-    def handle_run(self, now_s: float) -> None:
-        """Reschedule after fragments that came in order."""
-        self.due_s = min(self.due_s, now_s if self._is_owed() else now_s + REPORT_PAUSE_S)
+    def handle_run(self, now_s: float, *, is_in_order: bool) -> None:
+        """Reschedule after fragments that followed each other, behind a gap or not."""
+        pause_s = REPORT_PAUSE_S if is_in_order else REPORT_GAP_S
+        self.due_s = min(self.due_s, now_s if self._is_owed() else now_s + pause_s)
 
     def handle_part(self, header: Header, highest: int, expected: int, now_s: float) -> None:
         """Reschedule after a new fragment.
