@@ -52,7 +52,7 @@ _PRELOADED: Final = (
     "fog.cli.app",
     "ring.cli",
     *(f"gdp.cli.{each}" for each in _LATE),
-    *("proxy.cli.topic", "typer.rich_utils", "rich.markdown"),
+    *("proxy.cli.topic", "typer.rich_utils", "rich.markdown", "gdp.ports.kernel.plane", "networkx"),
 )
 # These start programs that a zygote forks.
 _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
