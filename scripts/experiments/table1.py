@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Final
 
 from experiment import Computed, command_line, run_experiment
+from page_text import text_of
+from plot import Bar, Panel, save_bars
 from report import markdown_table, print_table
 from skeleton import Options
 
@@ -97,8 +99,12 @@ def measure(options: Options) -> Computed:
         "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
     }
     title = "Table I: the price of a replica"
+
+    def draw(path: Path, title: str) -> None:
+        save_bars(path, title, f"AWS {region}", [_panel(rows)])
+
     pictured = page(region, rows, needed)
-    return Computed("table1", title, document, pictured, print_tables, lambda path, _: _draw(path, region, rows))
+    return Computed("table1", title, document, pictured, print_tables, draw)
 
 
 def bills(region: str) -> list[Row]:
@@ -178,49 +184,25 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
     """Return the page, in Markdown."""
     best = max(rows, key=lambda row: row.times_cheaper)
     worst = min(rows, key=lambda row: row.times_cheaper)
-    parts = [
-        "# Table I: the price of a replica",
-        "Made by `python scripts/experiments/table1.py`.",
-        "## By application",
-        "USD an hour. *Here*: the cheapest machines on the list that have what the application needs; one on-demand in"
-        f" the cheaper of {' and '.join(REGIONS)}, two as one in either region.",
-        markdown_table(_HEAD, _application_rows(needed)),
-        "The paper's prices for MPT are those of m5.8xlarge and m5.16xlarge in us-west-1 on this list (1.792 and"
-        " 3.584), and that for SAM is g4dn.xlarge in us-west-2 (0.526). Here c6i in us-west-2 is cheaper for MPT. No"
-        " machine of 16 cores on this list costs the paper's 0.40. Spot prices are those of other days, so they differ"
-        " most.",
-        "## Ratios",
-        markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
-        "The paper's abstract says that the cost is up to 2.2 times lower. Over two on-demand machines its own prices"
-        " reach that, for all applications but MPT Home and MPT Cubicles. Over one on-demand machine none does: MPT"
-        " TwistyCool comes nearest, whose two spot machines cost less than those of MPT Home with half the cores.",
-        "## By machine type",
-        "USD an hour, and a month of 730 hours.",
-        markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
-        "![prices](table1.png)",
-        f"Two spot machines cost between {best.bills[2].of_single:.2f} ({best.type_name}) and "
-        f"{worst.bills[2].of_single:.2f} ({worst.type_name}) of what one on-demand machine costs: at best "
-        f"{best.times_cheaper:.1f} times less. They cost less as soon as the savings pass 50 %.",
-        "Sources: " + "; ".join(aws_prices().sources) + ". Spot = on-demand × (1 − savings); the advisor's savings are "
-        "averages in whole percent, and traffic and disks are not in the price.",
-    ]
-    return "\n\n".join(parts) + "\n"
+    text = text_of(
+        "table1",
+        regions=" and ".join(REGIONS),
+        applications=markdown_table(_HEAD, _application_rows(needed)),
+        ratios=markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
+        types=markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
+        least=best.bills[2].of_single,
+        best=best.type_name,
+        most=worst.bills[2].of_single,
+        worst=worst.type_name,
+        times=best.times_cheaper,
+        sources="; ".join(aws_prices().sources),
+    )
+    return f"{text}\n"
 
 
-def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
-    from pictures import plt, save, tidy
-
-    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
-    for at, colour in enumerate(("#99a8b2", "#5d6b75", "#1f6f8b")):
-        places = [place + (at - 1) * 0.27 for place in range(len(rows))]
-        axis.bar(places, [row.bills[at].of_single for row in rows], 0.25, color=colour, label=rows[0].bills[at].what)
-    axis.axhline(1, color="#222222", lw=0.7)
-    axis.set_xticks(range(len(rows)), [row.type_name for row in rows], fontsize=8)
-    axis.set_ylabel("price, of one on-demand machine")
-    axis.set_title(f"AWS {region}", loc="left", fontsize=10)
-    axis.set_ylim(0, 2.6)
-    tidy(axis, ncols=3, loc="upper left")
-    save(figure, path)
+def _panel(rows: Sequence[Row]) -> Panel:
+    bars = [Bar(row.type_name, row.bills[2].of_single) for row in rows]
+    return Panel("two spot machines", "price, of one on-demand machine", bars)
 
 
 if __name__ == "__main__":

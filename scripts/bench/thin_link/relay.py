@@ -23,7 +23,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +32,7 @@ from peers.jsonl import say
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
+from gdp.ports.sockets import kernel_drops
 from thin_link.channel import Channel
 from thin_link.conditions import Direction
 
@@ -146,21 +147,13 @@ class _Relay:
         sides = {}
         for side, way in zip(("up", "down"), self._ways, strict=True):
             way.channel.backlog_bytes(now_ns)
-            counters = way.channel.counters
-            sides[side] = {
-                "offered": counters.offered,
-                "queue_drops": counters.queue_drops,
-                "losses": counters.losses,
-                "delivered": counters.delivered,
-                "delivered_bytes": counters.delivered_bytes,
-                "marked_bytes": counters.marked_bytes,
-                "capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns),
-                "depth_bytes": way.channel.take_depths(),
-            }
+            depths = {"depth_bytes": way.channel.take_depths()}
+            capacity = {"capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns)}
+            sides[side] = asdict(way.channel.counters) | capacity | depths
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
-            kernel_drops=sum(_kernel_drops(way.source) for way in self._ways),
+            kernel_drops=sum(kernel_drops(way.source) for way in self._ways),
             late_us=self._late_us(0.99),
             **sides,
         )
@@ -174,11 +167,6 @@ class _Relay:
             if left <= 0:
                 return (bucket + 1) * _BUCKET_NS / 1e3 if count else 0.0
         return _BUCKETS * _BUCKET_NS / 1e3
-
-
-def _kernel_drops(source: socket.socket) -> int:
-    """Return the frames that found the socket's buffer full since the last call."""
-    return int.from_bytes(source.getsockopt(_SOL_PACKET, 6, 8)[4:8], sys.byteorder)  # PACKET_STATISTICS
 
 
 def _open(device: str) -> socket.socket:
