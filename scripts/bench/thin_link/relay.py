@@ -23,7 +23,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -147,17 +147,9 @@ class _Relay:
         sides = {}
         for side, way in zip(("up", "down"), self._ways, strict=True):
             way.channel.backlog_bytes(now_ns)
-            counters = way.channel.counters
-            sides[side] = {
-                "offered": counters.offered,
-                "queue_drops": counters.queue_drops,
-                "losses": counters.losses,
-                "delivered": counters.delivered,
-                "delivered_bytes": counters.delivered_bytes,
-                "marked_bytes": counters.marked_bytes,
-                "capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns),
-                "depth_bytes": way.channel.take_depths(),
-            }
+            depths = {"depth_bytes": way.channel.take_depths()}
+            capacity = {"capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns)}
+            sides[side] = asdict(way.channel.counters) | capacity | depths
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
