@@ -36,7 +36,7 @@ from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.intervals import SoftState, renew_after_s
+from gdp.intervals import NEVER_S, SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
@@ -57,6 +57,7 @@ _IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnati
 _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT: Final = SoftState(1_800, periods=4)  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
+_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 
 
 @dataclass(slots=True, kw_only=True)
@@ -102,6 +103,7 @@ class Attachment:
 
     Attributes:
         switch: that this node is attached to; None: there is none.
+        outgoing: the frames to send next.
         started: number above those of earlier incarnations here, as far as known.
         clashes: signs of another node with this identity.
         conflict_at: switch of a newer node with this identity, once it was reported.
@@ -135,7 +137,7 @@ class Attachment:
         self._sync = RevocationSync(
             identity, policy.revoked, self.hello_protocol.neighbours, self._say_revoked, settings.first_sequence
         )
-        self._out: list[OutgoingFrames] = []
+        self.outgoing: list[OutgoingFrames] = []
         self._in_use_s = 0.0  # since when another node with this identity is accepted instead
         self.clashes = 0
         self.conflict_at: Name | None = None
@@ -218,7 +220,7 @@ class Attachment:
     def send(self, frames: list[bytes]) -> None:
         """Send frames to the switch; without one they are counted as lost."""
         if self.switch is not None:
-            self._out.append(OutgoingFrames(self.switch.port, self.switch.mac, frames))
+            self.outgoing.append(_tuple(OutgoingFrames, (self.switch.port, self.switch.mac, frames)))
         else:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 
@@ -327,7 +329,7 @@ class Attachment:
         if self.hello_protocol.drop_silent(now.mono_s):
             self._choose_switch(now.mono_s)
         self.reassembler.drop_expired(now.mono_s)
-        self._out += self.hello_protocol.hellos_to_send(now.mono_s)
+        self.outgoing += self.hello_protocol.hellos_to_send(now.mono_s)
         self._sync.handle_timer(now.mono_s)
         if self.switch is None:
             return
@@ -342,6 +344,11 @@ class Attachment:
         at_s = [] if self.switch is None else [each.advertisement_at_s for each in self._due_advertisements()]
         return earliest(self.hello_protocol.get_timer(), self._sync.get_timer(), *at_s)
 
+    def early_s(self) -> float:
+        """Return a monotonic second before which ``handle_timer`` sends nothing, not even what is due soon."""
+        due_s = self.get_timer()
+        return min(NEVER_S if due_s is None else due_s, self.hello_protocol.early_s())
+
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""
         own = self._own
@@ -349,7 +356,7 @@ class Attachment:
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
-        out, self._out = self._out, []
+        out, self.outgoing = self.outgoing, []
         return out
 
     def _choose_switch(self, now_s: float) -> None:

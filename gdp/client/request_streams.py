@@ -19,6 +19,7 @@ from typing import Final
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.errors import LocalError
+from gdp.intervals import NEVER_S
 from gdp.names import Name
 
 __all__ = ["RequestStreams"]
@@ -93,9 +94,9 @@ class RequestStreams:
             if not request.waiting:
                 del self._held[call]
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which the next copy begins at the latest, or None."""
-        return min((request.check_s for request in self._held.values()), default=None)
+    def get_timer(self) -> float:
+        """Return the monotonic second at which the next copy begins at the latest; infinity: none waits."""
+        return min((request.check_s for request in self._held.values()), default=NEVER_S)
 
     def _begin_next(self, request: _Request, now_s: float) -> None:
         server = request.waiting.popleft()
@@ -112,7 +113,7 @@ class RequestStreams:
     def _may_follow(self, request: _Request, now_s: float) -> bool:
         """Return whether the next copy may begin: those before have left, or the newest is late."""
         if request.server is None or all(
-            publisher.queue.sequences[0] > sequence for publisher, sequence in request.copies
+            publisher.queue.sent_sequence > sequence for publisher, sequence in request.copies
         ):
             return True
         if now_s < request.check_s:

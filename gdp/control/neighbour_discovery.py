@@ -457,6 +457,15 @@ class HelloProtocol:
         self._due_s = reply_at_s if reply_at_s < self._next_s else self._next_s
         return None if self._due_s == NEVER_S else self._due_s
 
+    def early_s(self) -> float:
+        """Return a monotonic second before which ``hellos_to_send`` sends nothing, not even what is due soon."""
+        due_s, slack_s = self.get_timer(), 0.0
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values():
+                if neighbour.keepalives is not None:
+                    slack_s = max(slack_s, neighbour.keepalives.out_interval_s * _TOGETHER)
+        return NEVER_S if due_s is None else due_s - slack_s
+
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
         for port in self.ports.values():
