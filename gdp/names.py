@@ -27,7 +27,7 @@ class Name(bytes):
 
     __slots__ = ()
 
-    def __new__(cls, value: bytes | bytearray | memoryview) -> Name:
+    def __new__(cls, value: bytes | bytearray | memoryview) -> Name:  # noqa: D102  # the class has it
         name = super().__new__(cls, value)
         if len(name) != NAME_BYTES:
             raise LocalError(f"a name has {NAME_BYTES} bytes, not {len(name)}")

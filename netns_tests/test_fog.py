@@ -23,6 +23,7 @@ from lab.machine import GDP, LabMachine
 from lab.namespaces import Space
 from lab.process import python_path, until
 from netns_tests.local_site import PATIENCE_S
+from netns_tests.test_ring import commands_with
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -219,13 +220,5 @@ def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_j
 
 def left_of(fog: Fog) -> list[str]:
     """Return the processes and devices of a site that still exist."""
-    words = []
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdigit():
-            try:
-                line = (folder / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
-            except OSError:
-                continue
-            words += [line] if str(fog.state) in line else []
     links = json.loads(subprocess.run(["ip", "-j", "link"], check=True, capture_output=True, text=True).stdout)
-    return [*words, *(each["ifname"] for each in links if each["ifname"].startswith("fog"))]
+    return [*commands_with(str(fog.state)), *(each["ifname"] for each in links if each["ifname"].startswith("fog"))]

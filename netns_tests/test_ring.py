@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 from unittest import mock
@@ -232,5 +233,13 @@ def left_of(run: str) -> list[str]:
     """Return the remains of a run: records, namespaces, files, processes."""
     places = [Path("/run/gdp"), Path("/run/netns"), Path(tempfile.gettempdir())]
     files = [str(path) for place in places if place.is_dir() for path in place.iterdir() if run in path.name]
-    commands = [path / "cmdline" for path in Path("/proc").iterdir() if path.name.isdigit()]
-    return files + [str(path) for path in commands if path.exists() and run in path.read_text(errors="replace")]
+    return [*files, *commands_with(run)]
+
+
+def commands_with(word: str) -> list[str]:
+    """Return the command lines of the running processes that have a word; a process may end meanwhile."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            found.append(path.read_bytes().decode(errors="replace").replace("\0", " "))
+    return [each for each in found if word in each]

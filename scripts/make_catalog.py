@@ -3,11 +3,6 @@
 Command: reads ``scripts/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
 
     python scripts/make_catalog.py
-
-The list prices below are those that AWS published for EC2 on-demand Linux machines (shared tenancy) in 2024, in USD an
-hour. Those of c5 in the US, g6, p3 and p4d agree with SkyPilot's public catalogue (``catalogs/v7/aws/vms.csv``). Within
-the families c5, c6i, m5, m6i, r5 and t3 the price is proportional to the size. Of machines with a GPU only the sizes
-given are listed. A region that is missing was not known for sure.
 """
 
 from __future__ import annotations
@@ -15,8 +10,11 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
+
+import yaml
 
 from fog.plan.trace import Trace, outages, times_independent
 
@@ -27,45 +25,18 @@ from skeleton import clean_exit  # noqa: E402
 
 TRACES: Final = "aws_*.json"
 ADVISOR: Final = "spot-advisor-data.json"
+PRICES: Final = "list_prices.yaml"
 SOURCES: Final = (
     "on-demand: AWS EC2 list prices, Linux, shared tenancy, 2024",
     "savings, interruption bands, CPUs and memory: AWS Spot Instance Advisor's data file, as stored with this project",
 )
 TRACES_SOURCE: Final = "aws r5.16xlarge, us-east-1b, c and d, 6.3 days in steps of 34 s (Can't Be Late, NSDI 2024)"
 
-US: Final = ("us-east-1", "us-east-2", "us-west-2")  # these three have one price for all types below
-SIZES: Final = {"large": 0.5, "xlarge": 1, "2xlarge": 2, "4xlarge": 4, "8xlarge": 8, "9xlarge": 9, "12xlarge": 12}
-SIZES_ALSO: Final = {"16xlarge": 16, "18xlarge": 18, "24xlarge": 24}
-# family -> price of its xlarge in US, and in other regions
-BY_SIZE: Final[dict[str, tuple[float, dict[str, float]]]] = {
-    "c5": (0.17, {"us-west-1": 0.212, "eu-west-1": 0.192, "eu-central-1": 0.194, "ap-northeast-1": 0.214}),
-    "c6i": (0.17, {"eu-west-1": 0.1824, "eu-central-1": 0.194, "ap-northeast-1": 0.214}),
-    "m5": (0.192, {"us-west-1": 0.224, "eu-west-1": 0.214, "eu-central-1": 0.23, "ap-northeast-1": 0.248}),
-    "m6i": (0.192, {"eu-west-1": 0.214, "eu-central-1": 0.23, "ap-northeast-1": 0.248}),
-    "r5": (0.252, {"us-west-1": 0.28, "eu-west-1": 0.282, "eu-central-1": 0.304, "ap-northeast-1": 0.304}),
-    "t3": (0.1664, {"us-west-1": 0.1984, "eu-west-1": 0.1824, "eu-central-1": 0.192, "ap-northeast-1": 0.2176}),
-}
-# type -> its price in US, and in other regions; GPU, how many
-WITH_GPU: Final[dict[str, tuple[float, dict[str, float], str, int]]] = {
-    "g4dn.xlarge": (0.526, {"us-west-1": 0.631, "eu-west-1": 0.587, "eu-central-1": 0.658}, "T4", 1),
-    "g4dn.2xlarge": (0.752, {}, "T4", 1),
-    "g4dn.4xlarge": (1.204, {}, "T4", 1),
-    "g4dn.8xlarge": (2.176, {}, "T4", 1),
-    "g4dn.12xlarge": (3.912, {}, "T4", 4),
-    "g5.xlarge": (1.006, {"eu-west-1": 1.123, "eu-central-1": 1.258}, "A10G", 1),
-    "g5.2xlarge": (1.212, {}, "A10G", 1),
-    "g5.4xlarge": (1.624, {}, "A10G", 1),
-    "g5.12xlarge": (5.672, {}, "A10G", 4),
-    "g6.2xlarge": (0.9776, {"eu-central-1": 1.22249, "ap-northeast-1": 1.41781}, "L4", 1),
-    "p3.2xlarge": (3.06, {"eu-west-1": 3.305, "eu-central-1": 3.823, "ap-northeast-1": 4.194}, "V100", 1),
-    "p3.8xlarge": (12.24, {"eu-west-1": 13.22, "eu-central-1": 15.292, "ap-northeast-1": 16.776}, "V100", 4),
-    "p4d.24xlarge": (
-        32.7726,
-        {"eu-west-1": 35.39655, "eu-central-1": 40.94475, "ap-northeast-1": 44.92215},
-        "A100",
-        8,
-    ),
-}
+US: Final = ("us-east-1", "us-east-2", "us-west-2")
+SIZES: Final = {
+    "large": 0.5, "xlarge": 1, "2xlarge": 2, "4xlarge": 4, "8xlarge": 8, "9xlarge": 9, "12xlarge": 12, "16xlarge": 16,
+    "18xlarge": 18, "24xlarge": 24,
+}  # fmt: skip
 SPANS_S: Final = (300, 600, 1200, 1800)
 
 
@@ -80,13 +51,14 @@ def prices() -> dict[str, object]:
     """Return types, and for each region and type: USD an hour, savings of spot in percent, interruption band."""
     advisor = json.loads((data_folder("spot", [ADVISOR]) / ADVISOR).read_text())
     known = advisor["instance_types"]
+    published = yaml.safe_load((data_folder("spot", [PRICES]) / PRICES).read_text(encoding="utf-8"))
     listed: dict[str, tuple[dict[str, float], str, int]] = {}
-    for family, (usd, elsewhere) in BY_SIZE.items():
-        for size, times in (SIZES | SIZES_ALSO | ({"medium": 0.25} if family == "t3" else {})).items():
-            by_region = {region: round(each * times, 4) for region, each in _everywhere(usd, elsewhere).items()}
+    for family, usd in published["families"].items():
+        for size, times in (SIZES | ({"medium": 0.25} if family == "t3" else {})).items():
+            by_region = {region: round(each * times, 4) for region, each in _everywhere(usd).items()}
             listed[f"{family}.{size}"] = (by_region, "", 0)
-    for name, (usd, elsewhere, gpu, gpus) in WITH_GPU.items():
-        listed[name] = (_everywhere(usd, elsewhere), gpu, gpus)
+    for name, (gpu, gpus, usd) in published["with_gpu"].items():
+        listed[name] = (_everywhere(usd), gpu, gpus)
 
     types: dict[str, list[str | int | float]] = {}
     regions: dict[str, dict[str, list[float | int | None]]] = {}
@@ -131,8 +103,9 @@ def traces() -> dict[str, object]:
     }
 
 
-def _everywhere(usd: float, elsewhere: dict[str, float]) -> dict[str, float]:
-    return dict.fromkeys(US, usd) | elsewhere
+def _everywhere(usd: Mapping[str, float]) -> dict[str, float]:
+    """Return prices by region; ``us`` stands for three."""
+    return dict.fromkeys(US, usd["us"]) | {region: each for region, each in usd.items() if region != "us"}
 
 
 def _write(name: str, items: dict[str, object]) -> None:

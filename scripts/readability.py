@@ -6,7 +6,6 @@
     scripts/readability.py --save            write the better of limit and figure as limits: they never get looser
     scripts/readability.py --words           list each listed word as file:line:column: word
     scripts/readability.py --names           list method names that many packages define
-    scripts/readability.py --docstrings      list public definitions without docstring
     scripts/readability.py --json            print the figures as JSON
 
 ``scripts/readability.json`` holds the limits, the goals, the listed words and the exceptions, each with its reason.
@@ -201,16 +200,6 @@ def public_definitions(tree: ast.Module) -> Iterator[tuple[str, Definition]]:
                     yield f"{node.name}.{method.name}", method
 
 
-def undocumented(trees: dict[str, ast.Module]) -> list[Place]:
-    """Return public definitions without docstring; overloads and setters share that of the first definition."""
-    return [
-        Place(path, node.lineno, node.col_offset + 1, name)
-        for path, tree in trees.items()
-        for name, node in public_definitions(tree)
-        if ast.get_docstring(node) is None and not _decorators(node) & {"overload", "override", "setter"}
-    ]
-
-
 def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list[tuple[int, str]]:
     """Return public method names with the number of product packages that define them, most first.
 
@@ -218,8 +207,6 @@ def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list
     """
     packages: dict[str, set[str]] = defaultdict(set)
     for path, tree in trees.items():
-        if path.split("/", 1)[0] not in PRODUCT:
-            continue
         for name, node in public_definitions(tree):
             method = name.rpartition(".")[2]
             is_noun = bool(_decorators(node) & {"property", "cached_property", "setter"})
@@ -292,7 +279,6 @@ class Report(NamedTuple):
 
     figures: dict[str, float]
     words: list[Place]
-    undocumented: list[Place]
     names: list[tuple[int, str]]
     circles: list[list[str]]
 
@@ -300,35 +286,32 @@ class Report(NamedTuple):
 def measure(root: Path, settings: Settings) -> Report:
     """Measure every figure of the source at ``root``; takes some seconds."""
     files = tracked_files(root)
-    parts = (*PRODUCT, "scripts")
     trees = {
         file.relative_to(root).as_posix(): ast.parse(file.read_text())
         for file in files
-        if file.suffix == ".py" and file.relative_to(root).parts[0] in parts
+        if file.suffix == ".py" and file.relative_to(root).parts[0] in PRODUCT
     }
     words = listed_words(root, files, settings)
     lengths = sentence_lengths(root)
     longest = lengths[: max(1, len(lengths) // 10)]
-    bare = undocumented(trees)
     names, circles = shared_names(trees, settings.protocol_names), import_circles()
     product, core, beds = line_counts(files, root)
     figures: dict[str, float] = {
         "listed words": len(words),
         "words a sentence": round(sum(lengths) / max(1, len(lengths)), 1),
         "words a sentence, longest tenth": round(sum(longest) / max(1, len(longest)), 1),
-        "public definitions without docstring": len(bare),
         "import circles": len(circles),
         "broken import rules": broken_import_rules(root),
         "packages that define one method name": names[0][0] if names else 0,
         "product lines": product,
         "core lines": core,
         "lines of scripts and test beds": beds,
-        **shape_counts(tree for path, tree in trees.items() if path.split("/", 1)[0] in PRODUCT),
+        **shape_counts(trees.values()),
         "signed statement types": len(StatementType),
         "words of docs": sum(len(page.read_text().split()) for page in _pages(root) if not _is_measured(page)),
         "tests": _test_count(files, root),
     }
-    return Report(figures, words, bare, names, circles)
+    return Report(figures, words, names, circles)
 
 
 def is_worse(figure: str, value: float, limit: float) -> bool:
@@ -412,7 +395,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--save", action="store_true", help="lower the limits to the present figures")
     parser.add_argument("--words", action="store_true", help="list each place of a listed word")
     parser.add_argument("--names", action="store_true", help="list method names that several packages define")
-    parser.add_argument("--docstrings", action="store_true", help="list public definitions without docstring")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     options = parser.parse_args(argv)
     console = Console(highlight=False, soft_wrap=True)
@@ -423,12 +405,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = measure(ROOT, settings)
     if options.json:
         print(json.dumps(report.figures, indent=2))
-    elif not options.words and not options.names and not options.docstrings:
+    elif not options.words and not options.names:
         console.print(_table(report, settings))
         for circle in report.circles:
             console.print("import circle:", ", ".join(circle), markup=False)
-    listed = (report.words if options.words else []) + (report.undocumented if options.docstrings else [])
-    for place in listed:
+    for place in report.words if options.words else ():
         console.print(str(place), markup=False)
     if options.names:
         for count, name in report.names[:40]:

@@ -1,6 +1,7 @@
-"""Cipher of one message, which seals and opens many of its parts in one call; the twin in Python.
+"""Cipher of one message, which seals and opens many of its parts in one call, and the buffer of its plaintext.
 
-Sans-I/O. Source: NIST SP 800-38D (GCM); ``frame/spec.md`` gives each byte. From part to part only the number changes::
+Sans-I/O; the twins in Python. Source: NIST SP 800-38D (GCM); ``frame/spec.md`` gives each byte. From part to part only
+the number changes::
 
     header        version kind flags hops | epoch length number PART parts incarnation destination source | salt
     additional    version kind flags      | the same as far as the source
@@ -9,6 +10,7 @@ Sans-I/O. Source: NIST SP 800-38D (GCM); ``frame/spec.md`` gives each byte. From
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from collections.abc import Sequence
 from itertools import islice
@@ -21,7 +23,7 @@ from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, HOPS_AT, LENGTH_AT, NUMBER_A
 from gdp.frame.kinds import Flag
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["BODY_AT", "SALT_BYTES", "TAG_BYTES", "MessageCipher"]
+__all__ = ["BODY_AT", "SALT_BYTES", "TAG_BYTES", "MessageCipher", "Plaintext"]
 
 SALT_BYTES: Final = 8
 TAG_BYTES: Final = 16
@@ -31,30 +33,50 @@ _PART: Final = struct.Struct("!I")
 _LAST: Final = int(Flag.LAST)
 
 
+class Plaintext(list[bytes]):
+    """Plaintext of a message that is opened part by part.
+
+    Its argument is how many bytes the message has at most. The compiled twin reserves no more ahead than it may need.
+    """
+
+    def __init__(self, _expected: int, /) -> None:
+        super().__init__()
+
+    def collect(self) -> bytes:
+        """Remove and return all of it."""
+        whole = b"".join(self)
+        self.clear()
+        return whole
+
+
 class MessageCipher:
     """Cipher under the key of one message, AES-256-GCM.
 
-    A *head* is the header of any part of the message, without ``Flag.LAST``, and the salt.
+    A *head* is the header of any part of the message, without ``Flag.LAST``, and the salt. What a signature covers of
+    each part, ciphertext and tag, is also fed to ``running``; None: the message is not signed.
     """
 
     def __init__(self, key: bytes) -> None:
         self._aead = AESGCM(key)
 
     def seal(
-        self, head: bytes, first: int, end: int, message: bytes, capacity: int, signature_bytes: int, /
-    ) -> tuple[list[bytes], bytes]:
-        """Return the frames of the parts ``first`` to ``end``, and their ciphertexts with tags if they are signed.
+        self, head: bytes, first: int, end: int, prefix: bytes, message: bytes, capacity: int, signature_bytes: int,
+        running: hashlib._Hash | None, /,
+    ) -> list[bytes]:  # fmt: skip
+        """Return the frames of the parts ``first`` to ``end``.
 
         Args:
-            message: whole; each part but the last two carries ``capacity`` bytes of it.
-            signature_bytes: that the caller appends to the last frame; 0: the message is not signed.
+            prefix: of the plaintext, no longer than a part; ``message`` follows, and is whole.
+            capacity: bytes of plaintext that each part but the last two carries.
+            signature_bytes: that the caller appends to the last frame.
         """
         frames: list[bytes] = []
         payloads: list[bytes] = []
         header, additional, size = bytearray(head), bytearray(), -1
         encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1
         for part in range(first, end):
-            plain, is_last = message[part * capacity : (part + 1) * capacity], part == last
+            at, is_last = part * capacity - len(prefix), part == last
+            plain = message[at : at + capacity] if part else (prefix + message[:capacity])[:capacity]
             if len(plain) != size or is_last:
                 size = len(plain)
                 header[FLAGS_AT] = head[FLAGS_AT] | _LAST * is_last
@@ -64,7 +86,9 @@ class MessageCipher:
             _PART.pack_into(additional, PART_AT - 1, part)
             payloads.append(encrypt(header[NUMBER_AT:PARTS_AT], plain, additional))
             frames.append(b"".join((header, payloads[-1])))
-        return frames, b"".join(payloads) if signature_bytes else b""
+        if running is not None:
+            running.update(b"".join(payloads))
+        return frames
 
     def open(self, frame: bytes, end: int, /) -> tuple[bytes, bytes] | None:
         """Return plaintext, and ciphertext with tag, of a part whose tag ends at ``end``; None: it was altered."""
@@ -76,19 +100,16 @@ class MessageCipher:
 
     def open_run(
         self, head: bytes, length: int, first: int, count: int, arrivals: Sequence[ReceivedFrame], at: int,
-        wants_payloads: bool, /,
-    ) -> tuple[int, bytes, bytes]:  # fmt: skip
-        """Open at most ``count`` consecutive parts from ``first`` on, in ``arrivals[at:]``.
+        running: hashlib._Hash | None, plaintext: Plaintext, /,
+    ) -> int:  # fmt: skip
+        """Open at most ``count`` consecutive parts from ``first`` on, in ``arrivals[at:]``; return how many.
 
         A frame that does not begin, to the bit, as its part should ends the run, as does an altered one.
 
         Args:
             length: payload bytes of each part, none of which is the last.
-
-        Returns:
-            how many parts were opened; their plaintexts; and if wanted their ciphertexts with tags.
+            plaintext: to which that of the parts is appended.
         """
-        plains: list[bytes] = []
         payloads: list[bytes] = []
         decrypt, end, nonce = self._aead.decrypt, HEADER_BYTES + length, head[NUMBER_AT:PART_AT]
         before, behind = head[:LENGTH_AT] + _LENGTH.pack(length) + head[NUMBER_AT:PART_AT], head[PARTS_AT:]
@@ -100,8 +121,10 @@ class MessageCipher:
                 break
             payload = frame[BODY_AT:end]
             try:
-                plains.append(decrypt(nonce + number, payload, additional + number + additional_behind))
+                plaintext.append(decrypt(nonce + number, payload, additional + number + additional_behind))
             except InvalidTag:
                 break
             payloads.append(payload)
-        return len(plains), b"".join(plains), b"".join(payloads) if wants_payloads else b""
+        if running is not None:
+            running.update(b"".join(payloads))
+        return len(payloads)

@@ -1,4 +1,4 @@
-"""Slots of a pool, each of which holds a received frame from its Ethernet header on; the twins in Python.
+"""Frames in the slots of a pool, each from its Ethernet header on, and samples among frames; the twins in Python.
 
 Sans-I/O; with the struct codec's offsets only.
 """
@@ -6,6 +6,7 @@ Sans-I/O; with the struct codec's offsets only.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -13,7 +14,9 @@ from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, HOPS_MASK, SECOND_PATH, s
 from gdp.frame.kinds import CONTROL_FROM, VERSION
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["received", "runs"]
+__all__ = ["received", "runs", "samples"]
+
+_SAMPLE_BITS: Final = 63  # of a frame's last byte: none is set in a sample
 
 # From the header on: version, kind, hops left, payload length, destination and source as one key.
 _GLANCE: Final = struct.Struct("!BBxBxxH24x64s")
@@ -55,3 +58,13 @@ def runs(pool: bytearray, slot_bytes: int, sizes: list[int]) -> list[tuple[int, 
         largest = size if first == slot or size > largest else largest
         run_key = key
     return [*found, (first, len(sizes) - first, run_key, largest)] if sizes else found
+
+
+def samples(frames: Sequence[ReceivedFrame] | Sequence[bytes], at: int, count: int) -> list[tuple[int, int]]:
+    """Return place and seal of each sample among ``frames[at : at + count]``, the first of which has place 0."""
+    found: list[tuple[int, int]] = []
+    for place, each in enumerate(frames[at : at + count]):
+        frame = each if isinstance(each, bytes) else each.frame
+        if not frame[-1] & _SAMPLE_BITS:
+            found.append((place, int.from_bytes(frame[-9:-1], "big")))
+    return found

@@ -5,14 +5,12 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import Header
 from gdp.intervals import READER
 from gdp.limits import REPORT_DELAY_S, REPORT_EVERY_BYTES, REPORT_EVERY_MAX_BYTES, REPORT_GAP_S, REPORT_PAUSE_S
 from gdp.message.reassembly import Reassembler
-from gdp.message.receipts import sum_of_samples
 from gdp.requests import Backoff
 
 __all__ = ["AckNackSchedule"]
@@ -49,17 +47,18 @@ class AckNackSchedule:
         self._has_come = False  # something has, since the report before
         self._missing_s = REPORT_DELAY_S  # until what is missing is requested again
 
-    def count(self, size: int, frames: Sequence[bytes], number: int, part: int, came_s: float) -> None:
+    def count(self, size: int, frames: int, receipts: int, number: int, part: int, came_s: float) -> None:
         """Count received bytes that no report confirms yet.
 
         Args:
-            frames: those that came; none of what parity has restored.
+            frames: count of those that came; none of what parity has restored.
+            receipts: sum of the samples among them.
             number: of the newest one's message; unless a later one came before, because it is a repair.
         """
         self._unreported_bytes += size
         self._total_bytes += size
-        self.received += len(frames)
-        self.receipts += sum_of_samples(frames)
+        self.received += frames
+        self.receipts += receipts
         if (number, part) > self.newest[:2]:
             self.newest = number, part, came_s
 

@@ -320,7 +320,8 @@ class SendQueue:
         """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
         assert self.mtu is not None
         number, ledger = self.next_number, self.ledger
-        frames = self._seal(number, sequence.to_bytes(SEQUENCE_BYTES, "big") + body, self.mtu, is_bundle=messages > 1)
+        prefix = sequence.to_bytes(SEQUENCE_BYTES, "big")
+        frames = self._seal(number, body, self.mtu, is_bundle=messages > 1, prefix=prefix)
         self.next_number += 1
         if not self.is_acknowledged:
             for dropped in self._best_effort.add(frames, Carried(number, sequence, messages, added_s)):
@@ -333,11 +334,12 @@ class SendQueue:
         if not number % _FORGET_EVERY:
             ledger.forget(self.oldest)
 
-    def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
+    def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool, prefix: bytes = b"") -> Sealed:
         flags = self.flags | _BUNDLE * is_bundle
-        if self.has_parity and is_protected(len(body) if isinstance(body, bytes) else body.message_bytes, mtu):
-            return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES)
-        return self._keys.data.seal(number, flags, body, mtu)
+        size = len(prefix) + (len(body) if isinstance(body, bytes) else body.message_bytes)
+        if self.has_parity and is_protected(size, mtu):
+            return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES, prefix)
+        return self._keys.data.seal(number, flags, body, mtu, prefix)
 
     def _lose(self, sequence: int, messages: int, drop_reason: DropReason, reason: LossReason) -> None:
         """Count messages that no reader gets."""

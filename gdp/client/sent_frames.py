@@ -19,12 +19,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gdp import burst
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.congestion.delivery_rate import Flight
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.message.acknack import AckNack
 from gdp.message.frame_loss import FrameLoss
-from gdp.message.receipts import ReceiptCheck, samples_of
+from gdp.message.receipts import ReceiptCheck
 
 __all__ = ["SentFrames"]
 
@@ -103,7 +104,7 @@ class SentFrames:
                 self._paths.path(name, now_s).controller.pace.charge(size, now_s)
                 if name in self._readers:
                     self._readers[name].repairs += again
-                    self._readers[name].receipts.sent(samples, is_repair=True)
+                    self._readers[name].receipts.sent(samples, 0, is_repair=True)
             for frame in frames[:again]:
                 number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
                 if number in self._runs:
@@ -119,26 +120,27 @@ class SentFrames:
 
     def _add(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, *, is_repair: bool) -> None:
         """Count frames that all leave for the first time, or all again."""
-        self._note_places(frames, self._count + 1, is_repair=is_repair)
-        paths = self._paths
-        for first in range(0, len(frames), _FLIGHT_FRAMES):
-            flight = frames[first : first + _FLIGHT_FRAMES]
-            size, count, samples = sum(map(len, flight)), len(flight), self._samples(flight)
-            self._count += count
-            for name in names:
-                path, reader = paths.path(name, now_s), self._readers.get(name)
-                if reader is None:
-                    reader = self._readers[name] = _Reader(resolved=self._count - count)
+        before, paths, samples = self._count, self._paths, self._samples(frames)
+        starts = range(0, len(frames), _FLIGHT_FRAMES)
+        sizes = [(sum(map(len, some)), len(some)) for at in starts for some in [frames[at : at + _FLIGHT_FRAMES]]]
+        self._count += len(frames)
+        self._note_places(frames, before + 1, is_repair=is_repair)
+        for name in names:
+            path, reader, place = paths.path(name, now_s), self._readers.get(name), before
+            if reader is None:
+                reader = self._readers[name] = _Reader(resolved=before)
+            if samples:
+                reader.receipts.sent(samples, before + 1, is_repair=is_repair)
+            for size, count in sizes:
                 record = path.sent(size, count, now_s)
-                record.place, record.is_repair = self._count, is_repair
+                place += count
+                record.place, record.is_repair = place, is_repair
                 reader.flights.append(record)
                 paths.leaving.append(record)
-                if samples:
-                    reader.receipts.sent(samples, is_repair=is_repair)
 
     def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
-        """Return the samples among frames that leave next; those of striped frames would prove no order."""
-        return samples_of(frames, self._count + 1) if self._counts_losses else ()
+        """Return the samples among frames; those of striped ones would prove no order."""
+        return burst.samples(frames, 0, len(frames)) if self._counts_losses else ()
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""

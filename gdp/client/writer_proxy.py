@@ -23,6 +23,7 @@ from enum import Enum
 from functools import partial
 from typing import Final
 
+from gdp import burst
 from gdp.client.ack_nack_schedule import AckNackSchedule
 from gdp.client.ack_nack_sealer import AckNackSealer
 from gdp.client.delivery import NOT_BEGUN, Delivery, Ended
@@ -202,9 +203,9 @@ class WriterProxy:
                 number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
             self.recovery.keep_run(arrivals, at, taken, now_s)
-            frames, last = [each.frame for each in arrivals[at : at + taken]], arrivals[at + taken - 1]
+            receipts, last = sum(seal for _, seal in burst.samples(arrivals, at, taken)), arrivals[at + taken - 1]
             number, part = NUMBER_AND_PART.unpack_from(last.frame, NUMBER_AT)
-            self.schedule.count(taken * len(last.frame), frames, number, part, now_s - last.waited_s)
+            self.schedule.count(taken * len(last.frame), taken, receipts, number, part, now_s - last.waited_s)
             if self.state is WriterProxyState.LIVE:
                 self.schedule.handle_run(now_s)
         return taken
@@ -331,8 +332,10 @@ class WriterProxy:
             if self.delivery.is_reliable is None:
                 self._set_reliable(header.flags)
             self.recovery.recovered += is_restored
-            frames = () if is_restored else (frame,)
-            self.schedule.count(header.length, frames, header.number, header.part, came_s)
+            came = 1 - is_restored
+            samples = burst.samples((frame,), 0, came)
+            receipts = sum([seal for _, seal in samples]) if samples else 0
+            self.schedule.count(header.length, came, receipts, header.number, header.part, came_s)
             if reassembled is None:
                 self.recovery.keep(header, frame, now_s)
             if self.state is WriterProxyState.LIVE:

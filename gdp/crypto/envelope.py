@@ -34,7 +34,6 @@ from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.codec import HEADER_BYTES, INCARNATION_AT, NUMBER_AT, Header, encode
 from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
-from gdp.sansio import ReceivedFrame
 
 __all__ = [
     "SALT_BYTES",
@@ -132,7 +131,7 @@ def fragment_capacity(mtu: int) -> int:
 def digest_of(frame: bytes) -> hashlib._Hash:
     """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
     kind, flags, epoch, number, others = _SHARED.unpack_from(frame)
-    return hashlib.sha256(_HASHED.pack(b"gdp-message-2", kind, flags & SHARED_FLAGS, epoch, number, others))
+    return burst.DIGEST(_HASHED.pack(b"gdp-message-2", kind, flags & SHARED_FLAGS, epoch, number, others))
 
 
 class Sealer:
@@ -165,7 +164,7 @@ class Sealer:
         self._template = (-1, b"")  # flags of the message before, and the header of its first part
         self._capacity = (-1, 0)  # its MTU, and the plaintext bytes of a part
 
-    def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int) -> Sealed:
+    def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int, prefix: bytes = b"") -> Sealed:
         """Return a message as its frames, each from the header on and at most ``mtu`` bytes long.
 
         A part is encrypted when its frame is first requested. So the first frames may leave before the last ones are
@@ -175,13 +174,14 @@ class Sealer:
             number: message number; above every earlier number of this sealer.
             flags: without ``Flag.LAST``.
             message: a ``Sealed`` message is opened when the first frame is requested.
+            prefix: goes before it under the seal, so that a large message need not be copied; shorter than a frame.
 
         Raises:
             LocalError: a number that is not newer (its nonces would recur), or a message above the limits.
         """
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
-        size = len(message) if isinstance(message, bytes) else message.message_bytes
+        size = len(prefix) + (len(message) if isinstance(message, bytes) else message.message_bytes)
         if self._capacity[0] != mtu:
             self._capacity = mtu, fragment_capacity(mtu)
         capacity = self._capacity[1]
@@ -197,7 +197,9 @@ class Sealer:
         salt = self._random_bytes(SALT_BYTES)
         head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
         cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
-        return Sealed(cipher=cipher, signer=signer, head=head, parts=parts, message=message, capacity=capacity)
+        return Sealed(
+            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, capacity=capacity
+        )
 
 
 class Sealed(Sequence[bytes]):
@@ -210,17 +212,18 @@ class Sealed(Sequence[bytes]):
         signer: Signer | None,
         head: bytes,
         parts: int,
+        prefix: bytes,
         message: bytes | Sealed,
         capacity: int,
     ) -> None:
         self._cipher = cipher
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
-        self._head, self._parts = head, parts
+        self._head, self._parts, self._prefix = head, parts, prefix
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
-            self._message, self.message_bytes = message, len(message)
+            self._message, self.message_bytes = message, len(prefix) + len(message)
         else:
             self._message, self.message_bytes = b"", message.message_bytes
             self._origin = message._origin or message
@@ -256,7 +259,7 @@ class Sealed(Sequence[bytes]):
             return self._origin.message()
         frames = self._frames
         if len(frames) < self._parts:
-            return self._message
+            return self._prefix + self._message
         ends = [len(frame) for frame in frames]
         ends[-1] -= self._signature_bytes
         opened = [self._cipher.open(frame, end) for frame, end in zip(frames, ends, strict=True)]
@@ -265,13 +268,10 @@ class Sealed(Sequence[bytes]):
     def _seal_until(self, end: int) -> None:
         if self._origin is not None:
             self._message, self._origin = self._origin.message(), None
-        seal, frames = self._cipher.seal, self._frames
-        sealed, payloads = seal(self._head, len(frames), end, self._message, self._capacity, self._signature_bytes)
-        frames += sealed
-        if self._signer is not None and self._running is not None:
-            self._running.update(payloads)
-            if end == self._parts:
-                frames[-1] += self._signer.sign_digest(self._running.digest())
+        frames, signs = self._frames, (self._signature_bytes, self._running)
+        frames += self._cipher.seal(self._head, len(frames), end, self._prefix, self._message, self._capacity, *signs)
+        if self._signer is not None and self._running is not None and end == self._parts:
+            frames[-1] += self._signer.sign_digest(self._running.digest())
         if end == self._parts:
             self._message = b""  # the frames hold all of it now
 
@@ -301,16 +301,9 @@ class Opener:
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
         self._known: dict[bytes, MessageCipher] = {}  # by the salts of messages with opened parts
 
-    def open_run(
-        self, head: bytes, length: int, first: int, count: int, arrivals: Sequence[ReceivedFrame], at: int
-    ) -> tuple[int, bytes, bytes]:
-        """Open consecutive parts, as ``MessageCipher.open_run``; one that ends the run is for ``open``.
-
-        Returns:
-            how many were opened, their plaintexts, and what their signature covers.
-        """
-        cipher = self._cipher_of(head[HEADER_BYTES:])
-        return cipher.open_run(head, length, first, count, arrivals, at, self._signature_bytes > 0)
+    def cipher_of(self, salt: bytes) -> MessageCipher:
+        """Return the cipher of the message with a salt."""
+        return self._known.get(salt) or burst.CIPHER(self._keys.of(salt))
 
     def open(self, header: Header, frame: bytes) -> Opened:
         """Open a part.
@@ -330,7 +323,7 @@ class Opener:
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
         salt = frame[HEADER_BYTES:BODY_AT]
-        cipher = self._cipher_of(salt)
+        cipher = self.cipher_of(salt)
         opened = cipher.open(frame, sealed_end)
         if opened is None:
             raise EnvelopeError(DropReason.BAD_TAG)
@@ -339,6 +332,3 @@ class Opener:
                 del self._known[next(iter(self._known))]
             self._known[salt] = cipher
         return *opened, frame[sealed_end:end]
-
-    def _cipher_of(self, salt: bytes) -> MessageCipher:
-        return self._known.get(salt) or burst.CIPHER(self._keys.of(salt))

@@ -216,7 +216,7 @@ class Journal:
             return function(*arguments, **named)
         if self._was_asked:
             self._add(["timer"])
-        if path == "rib.load":
+        if path in ("receive", "rib.load"):
             arguments = (list(arguments[0]), *arguments[1:])
         self._add([path, *arguments, *([named] if named else [])])
         self._is_within, self._was_asked = True, False

@@ -20,7 +20,8 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from gdp.burst.cipher import BODY_AT
+from gdp import burst
+from gdp.burst.cipher import BODY_AT, Plaintext
 from gdp.crypto.envelope import SHARED_FLAGS, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import DESTINATION_AT, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
@@ -68,7 +69,8 @@ class _PartialMessage:
     touched_s: float
     head: bytes = b""  # header and salt of the newest fragment that came in order
     length: int = 0  # its payload bytes
-    plain: list[bytes] = field(default_factory=list)  # in order; an item may be several fragments
+    before: bytes = b""  # of the plaintext, what comes before the message
+    plain: Plaintext = field(init=False)  # from the first fragment on
     early: dict[int, tuple[bytes, bytes]] = field(default_factory=dict)  # plaintext and ciphertext ahead of these
     hashed: int = 0  # fragments in ``plain``, which the hash has taken
     top: int = -1  # highest fragment held
@@ -77,10 +79,10 @@ class _PartialMessage:
     prepaid_bytes: int = 0  # of ``held_bytes``, not yet used
     hops: int = 0
 
-    def append(self, count: int, plain: bytes, sealed: bytes) -> None:
-        """Append the next fragments."""
+    def append(self, plain: bytes, sealed: bytes) -> None:
+        """Append the next fragment."""
         self.plain.append(plain)
-        self.hashed += count
+        self.hashed += 1
         if self.running is not None:
             self.running.update(sealed)
 
@@ -157,9 +159,10 @@ class Reassembler:
                 return 0
             message.held_bytes += _PREPAID_BYTES + wanted * cost
             message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
-        taken, plain, payloads = message.opener.open_run(head, message.length, first, wanted, arrivals, at)
+        cipher, running = message.opener.cipher_of(message.salt), message.running
+        taken = cipher.open_run(head, message.length, first, wanted, arrivals, at, running, message.plain)
         if taken:
-            message.append(taken, plain, payloads)
+            message.hashed += taken
             message.prepaid_bytes -= taken * cost
             message.top = message.hashed - 1
             message.touched_s = now_s
@@ -268,9 +271,12 @@ class Reassembler:
         if in_order:
             message.head, message.length = frame[:BODY_AT], header.length
             self._under_way = number
-            message.append(1, plain, sealed)
+            if not header.part:
+                message.plain = burst.PLAINTEXT(header.parts * len(plain))
+                message.before, plain = plain[: self._head_bytes], plain[self._head_bytes :]
+            message.append(plain, sealed)
             while message.early and (early := message.early.pop(message.hashed, None)) is not None:
-                message.append(1, *early)
+                message.append(*early)
                 message.held_bytes -= len(early[1])
                 self._release_memory(len(early[1]))
         else:
@@ -283,15 +289,13 @@ class Reassembler:
         if message.running is not None and not self._is_signed(message.signature, message.running):
             return None  # not finished: the writer's own fragments may still come
         self.window.finish(number)
-        first, size = message.plain[0], self._head_bytes
-        whole = b"".join([first[size:], *message.plain[1:]])
         return ReassembledMessage(
             number=number,
             flags=header.flags & SHARED_FLAGS,
-            message=whole,
+            message=message.plain.collect(),
             parts=message.parts,
             hops=message.hops,
-            head=first[:size],
+            head=message.before,
         )
 
     def _is_signed(self, signature: bytes, running: hashlib._Hash) -> bool:

@@ -13,32 +13,13 @@ from collections.abc import Iterable, Sequence
 from math import sqrt
 from typing import Final
 
-__all__ = ["RECEIPTS_MASK", "ReceiptCheck", "samples_of", "sum_of_samples"]
+__all__ = ["RECEIPTS_MASK", "ReceiptCheck"]
 
 RECEIPTS_MASK: Final = (1 << 64) - 1  # of a sum
-_SAMPLE_BITS: Final = 63
 _DUE_MAX: Final = 16  # samples of one report; of more nothing is concluded, because the sums of all sets are tried
 _SPARE_MAX: Final = 8  # samples that may come in addition: late ones, and repairs
 _MEMORY: Final = 64.0  # samples that count
 _DOUBT: Final = 3.0  # standard deviations that chance explains
-
-
-def samples_of(frames: Iterable[bytes], place: int = 0) -> list[tuple[int, int]]:
-    """Return place and seal of each sample among frames, the first of which has ``place``."""
-    samples: list[tuple[int, int]] = []
-    for each, frame in enumerate(frames, place):
-        if not frame[-1] & _SAMPLE_BITS:
-            samples.append((each, int.from_bytes(frame[-9:-1], "big")))
-    return samples
-
-
-def sum_of_samples(frames: Iterable[bytes]) -> int:
-    """Return the sum of the seals of those frames that are samples."""
-    total = 0
-    for frame in frames:
-        if not frame[-1] & _SAMPLE_BITS:
-            total += int.from_bytes(frame[-9:-1], "big")
-    return total
 
 
 class ReceiptCheck:
@@ -50,12 +31,12 @@ class ReceiptCheck:
         self._total = 0
         self._sent = self._stated = self._came = 0.0  # samples; those that came by the counts, and by the receipts
 
-    def sent(self, samples: Sequence[tuple[int, int]], *, is_repair: bool) -> None:
-        """Note the samples among frames that leave."""
+    def sent(self, samples: Sequence[tuple[int, int]], place: int, *, is_repair: bool) -> None:
+        """Note the samples among frames that leave, the first of which has ``place``."""
         if is_repair:
             self._spare.extend(seal for _, seal in samples)
         else:
-            self._due.extend(samples)
+            self._due.extend((place + each, seal) for each, seal in samples)
 
     def begin(self, total: int, place: int) -> None:
         """Take the sum in a reader's first report, whose newest frame has this place."""

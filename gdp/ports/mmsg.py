@@ -1,8 +1,8 @@
 """mmsg pool: many frames per system call, received from one port into slots and forwarded from them to another.
 
 I/O; no forwarding decision is made here.
-Source: recvmmsg(2), sendmmsg(2), through ctypes; if the C library is not reachable that way, ``recv_into`` and
-``sendmsg`` do the same. One slot holds one frame from its Ethernet header on::
+Source: recvmmsg(2), sendmmsg(2), in the compiled burst core or through ctypes. One slot holds one frame from its
+Ethernet header on::
 
     slot i      [ Ethernet header 14 | frame ... ]     receive() fills slots from the first on
     on leaving  [ head 14 ] + [ frame ... ]            forward() gathers a new Ethernet header and the frame in its slot
@@ -17,14 +17,17 @@ import ctypes
 import errno
 import socket
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
+from gdp import burst
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
 from gdp.frame.kinds import ETHERTYPE
+from gdp.ports.sockets import waited_s
+from gdp.sansio import ReceivedFrame
 
-__all__ = ["SLOTS", "MmsgBatch", "MmsgPool", "PlainBatch", "make_batch", "put_one", "send_failure"]
+__all__ = ["SLOTS", "CompiledBatch", "MmsgBatch", "MmsgPool", "make_batch", "put_one", "send_failure"]
 
 SLOTS: Final = 64
 _TAKE_BYTES: Final = 128 << 10  # approximate size of one batch, so that urgent frames wait only briefly
@@ -57,17 +60,17 @@ class MmsgPool(Protocol):
     def receive(self, source: socket.socket) -> list[int]:
         """Fill slots with the frames that arrived, without waiting; return their bytes after each Ethernet header."""
 
-    def fill(self, frames: list[bytes]) -> None:
-        """Write frames (from the GDP header on, at most ``SLOTS``, each fitting a slot) into the slots."""
+    def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
+        """Return the frames that arrived at a port's socket, without waiting."""
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames (from the GDP header on, at most ``SLOTS``) from the caller's memory.
+        """Send frames (from the GDP header on) from the caller's memory.
 
         Returns how many were sent; the others are counted in ``drops``.
         """
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send the slots ``first`` to ``first + count``, last filled by ``receive`` or ``fill``, under new addresses.
+        """Send the slots ``first`` to ``first + count``, last filled by ``receive``, under new addresses.
 
         Returns how many were sent; the others are counted in ``drops``.
         """
@@ -76,6 +79,22 @@ class MmsgPool(Protocol):
 def _take_max(slot_bytes: int) -> int:
     """Return how many slots one call fills."""
     return max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
+
+
+def _send_all(send: Callable[[int], int], at: int, end: int, drops: list[int]) -> int:
+    """Send frames ``at`` to ``end``; ``send`` returns how many left from a place on, or minus the errno."""
+    left = 0
+    while at < end:
+        sent = send(at)
+        if sent > 0:
+            left += sent
+            at += sent
+            continue
+        reason, goes_on = send_failure(-sent)
+        skipped = 1 if goes_on else end - at
+        drops[reason] += skipped
+        at += skipped
+    return left
 
 
 class _IoVec(ctypes.Structure):
@@ -99,11 +118,7 @@ class _MmsgHdr(ctypes.Structure):
 
 
 class MmsgBatch:
-    """``MmsgPool`` over ``recvmmsg`` and ``sendmmsg``.
-
-    Raises:
-        OSError, AttributeError: the C library is not reachable, or lacks the functions.
-    """
+    """``MmsgPool`` over ``recvmmsg`` and ``sendmmsg``, through ctypes."""
 
     def __init__(self, slot_bytes: int) -> None:
         library = ctypes.CDLL(None, use_errno=True)
@@ -156,20 +171,22 @@ class MmsgBatch:
         self._sizes[:got] = memoryview(array("L", sizes))
         return sizes
 
-    def fill(self, frames: list[bytes]) -> None:
-        """Write frames of our own into the slots, as ``MmsgPool``."""
-        pool, step = self.pool, self.slot_bytes
-        for at, frame in zip(range(ETHER_BYTES, len(pool), step), frames, strict=False):
-            pool[at : at + len(frame)] = frame
-        self._sizes[: len(frames)] = memoryview(array("L", map(len, frames)))
+    def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
+        """Return the frames that arrived at a port's socket, as ``MmsgPool``."""
+        sizes = self.receive(source)
+        return burst.received(self.pool, self.slot_bytes, sizes, port, waited_s(source)) if sizes else []
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
         """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
-        count = len(frames)
-        self._pointers[:count] = list(frames)
-        self._own_addresses[:count] = self._addresses[:count]
-        self._own_sizes[:count] = memoryview(array("L", map(len, frames)))
-        return self._submit(sink, self._own_at, 0, count, macs, drops)
+        left = 0
+        for first in range(0, len(frames), SLOTS):
+            some = frames[first : first + SLOTS]
+            count = len(some)
+            self._pointers[:count] = list(some)
+            self._own_addresses[:count] = self._addresses[:count]
+            self._own_sizes[:count] = memoryview(array("L", map(len, some)))
+            left += self._submit(sink, self._own_at, 0, count, macs, drops)
+        return left
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
         """Send ``count`` slots from ``first`` on to one pair of addresses; return how many were sent."""
@@ -178,72 +195,31 @@ class MmsgBatch:
     def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
         """Send ``count`` messages of the table of messages at an address."""
         self._head[: len(macs)] = macs
-        at, end, left = first, first + count, 0
-        while at < end:
-            sent = self._send(sink.fileno(), table + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
-            if sent > 0:
-                left += sent
-                at += sent
-                continue
-            reason, goes_on = send_failure(ctypes.get_errno())
-            skipped = 1 if goes_on else end - at
-            drops[reason] += skipped
-            at += skipped
-        return left
+        fd, end = sink.fileno(), first + count
+
+        def send(at: int) -> int:
+            sent: int = self._send(fd, table + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
+            return sent if sent > 0 else -ctypes.get_errno()
+
+        return _send_all(send, first, end, drops)
 
 
-class PlainBatch:
-    """``MmsgPool`` with one system call per frame."""
+class CompiledBatch(MmsgBatch):
+    """``MmsgPool`` over the burst core: frames stay where the kernel wrote them until they are read."""
 
     def __init__(self, slot_bytes: int) -> None:
-        self.slot_bytes = slot_bytes
-        self._take_max = _take_max(slot_bytes)
-        self.pool = bytearray(SLOTS * slot_bytes)
-        self._slots = [memoryview(self.pool)[slot * slot_bytes : (slot + 1) * slot_bytes] for slot in range(SLOTS)]
-        self._head = bytearray(bytes(ETHER_BYTES - 2) + _ETHERTYPE)
-        self._sizes: list[int] = []
+        super().__init__(slot_bytes)
+        self._receiver = burst.SYSTEM_CALLS.Receiver(slot_bytes, self._take_max)
 
-    def receive(self, source: socket.socket) -> list[int]:
-        """Receive the frames that wait at a socket; return their bytes after each Ethernet header, as ``MmsgPool``."""
-        sizes: list[int] = []
-        for slot in self._slots[: self._take_max]:
-            try:
-                sizes.append(source.recv_into(slot) - ETHER_BYTES)
-            except OSError:  # no more frames, or the device went down: the link monitor reports it
-                break
-        self._sizes = sizes
-        return sizes
-
-    def fill(self, frames: list[bytes]) -> None:
-        """Write frames of our own into the slots, as ``MmsgPool``."""
-        for slot, frame in zip(self._slots, frames, strict=False):
-            slot[ETHER_BYTES : ETHER_BYTES + len(frame)] = frame
-        self._sizes = [len(frame) for frame in frames]
+    def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
+        """Return the frames that arrived at a port's socket, as ``MmsgPool``."""
+        arrivals: Sequence[ReceivedFrame] = self._receiver.receive(source.fileno(), port)
+        return arrivals
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
         """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
-        return self._submit(sink, frames, macs, drops)
-
-    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many were sent."""
-        slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
-        return self._submit(sink, slots, macs, drops)
-
-    def _submit(self, sink: socket.socket, frames: Sequence[bytes | memoryview], macs: bytes, drops: list[int]) -> int:
-        self._head[: len(macs)] = macs
-        left = 0
-        for at, frame in enumerate(frames):
-            try:
-                sink.sendmsg((self._head, frame))
-            except OSError as error:
-                reason, goes_on = send_failure(error.errno or 0)
-                if not goes_on:
-                    drops[reason] += len(frames) - at
-                    break
-                drops[reason] += 1
-            else:
-                left += 1
-        return left
+        send, head = burst.SYSTEM_CALLS.send, (macs + _ETHERTYPE)[:ETHER_BYTES]
+        return _send_all(lambda at: send(sink.fileno(), frames, at, head), 0, len(frames), drops)
 
 
 def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) -> int:
@@ -257,8 +233,5 @@ def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) ->
 
 
 def make_batch(slot_bytes: int) -> MmsgPool:
-    """Return the fastest pool that this C library allows."""
-    try:
-        return MmsgBatch(slot_bytes)
-    except (OSError, AttributeError):
-        return PlainBatch(slot_bytes)
+    """Return a pool over the burst core in use."""
+    return MmsgBatch(slot_bytes) if burst.SYSTEM_CALLS is None else CompiledBatch(slot_bytes)

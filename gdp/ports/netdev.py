@@ -69,7 +69,7 @@ class NetdevPlane(ABC):
         self._epoll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}
         self._ranks: dict[int, int] = {}  # the lowest are served first
-        self._arrivals: list[ReceivedFrame] = []
+        self._arrivals: Sequence[ReceivedFrame] = []
         self._on_link: list[LinkCallback] = []
         self._links = LinkMonitor()
         self.watch(self._links, self._hear)
@@ -118,7 +118,7 @@ class NetdevPlane(ABC):
         """Return the live counts, as ``Plane.counters``."""
         return self._counters
 
-    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
+    def poll(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for events and serve them, the lowest rank first; return the punted frames, as ``Plane.poll``."""
         if self._unopened:
             timeout_s = self._open_again(timeout_s)
@@ -137,6 +137,10 @@ class NetdevPlane(ABC):
         arrivals, self._arrivals = self._arrivals, []
         self._counters.punted += len(arrivals)
         return arrivals
+
+    def _keep(self, arrivals: Sequence[ReceivedFrame]) -> None:
+        """Let the next ``poll`` return these frames; those of one system call alone stay as they are."""
+        self._arrivals = [*self._arrivals, *arrivals] if self._arrivals else arrivals
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll`` has work, for another event loop."""

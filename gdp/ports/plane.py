@@ -82,7 +82,7 @@ class Plane(Protocol):
         256th busy one. An idle one that does not wait counts only if frames came since.
         """
 
-    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
+    def poll(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames, forward what the table decides, return the punted frames.
 
         Returns early, perhaps with an empty list, after any event: frames forwarded, a link that changed, a watched

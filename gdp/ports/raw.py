@@ -31,7 +31,7 @@ from gdp.frame.codec import (
 from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
-from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
+from gdp.ports.mmsg import MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import Port, ReceivedFrame
 from gdp.ports.sockets import (
@@ -41,7 +41,6 @@ from gdp.ports.sockets import (
     kernel_drops,
     open_port,
     tell_neighbours,
-    waited_s,
 )
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
@@ -124,7 +123,7 @@ class RawPlane(NetdevPlane):
             if opened is not None:
                 tell_neighbours(opened, traffic_class, known)
 
-    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
+    def poll(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """End the pauses of sockets that are due; then as ``Plane.poll``."""
         if self._resting:
             now_s = time.monotonic()
@@ -188,32 +187,27 @@ class RawPlane(NetdevPlane):
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
         """Send frames to one neighbour; return how many were sent, as ``Plane.transmit``."""
-        counters, facts, batch = self._counters, self._ports.get(port), self._batch
+        counters, drops, facts, send = self._counters, self._counters.drops, self._ports.get(port), self._batch.send
         if facts is None or not facts.up:
-            counters.drops[DropReason.PORT_DOWN] += len(frames)
+            drops[DropReason.PORT_DOWN] += len(frames)
             return 0
-        fitting = [frame for frame in frames if len(frame) <= facts.mtu]
-        counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
+        fitting = frames
+        if max(map(len, frames), default=0) > facts.mtu:
+            fitting = [frame for frame in frames if len(frame) <= facts.mtu]
+            drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
         if not fitting:
             return 0
         sink = self._sockets_by_class[_traffic_class_of(fitting[0])][port]
-        macs, left = destination_mac + facts.mac, 0
-        if len(fitting) == 1:
-            left = put_one(sink, fitting[0], macs, counters.drops)
-            counters.frames_out += left
-            return left
-        for at in range(0, len(fitting), SLOTS):
-            left += batch.send(sink, fitting[at : at + SLOTS], macs, counters.drops)
+        macs = destination_mac + facts.mac
+        left = put_one(sink, fitting[0], macs, drops) if len(fitting) == 1 else send(sink, fitting, macs, drops)
         counters.frames_out += left
         return left
 
     def _punt_all(self, port: int, source: socket.socket) -> None:
-        batch = self._batch
-        sizes = batch.receive(source)
-        self._counters.frames_in += len(sizes)
-        self._came[port] += len(sizes)
-        if sizes:
-            self._arrivals += burst.received(batch.pool, batch.slot_bytes, sizes, port, waited_s(source))
+        arrivals = self._batch.receive_frames(source, port)
+        self._counters.frames_in += len(arrivals)
+        self._came[port] += len(arrivals)
+        self._keep(arrivals)
 
     def _forward_all(
         self,
@@ -268,7 +262,7 @@ class RawPlane(NetdevPlane):
             self._send(sinks, decision.hops, slot, 1)
         else:
             slot_bytes = ETHER_BYTES + size
-            self._arrivals += burst.received(batch.pool[at : at + slot_bytes], slot_bytes, [size], port, 0.0)
+            self._keep(burst.received(batch.pool[at : at + slot_bytes], slot_bytes, [size], port, 0.0))
 
     def _send(self, sinks: Mapping[int, socket.socket], hops: Hops, first: int, count: int) -> None:
         """Send a run of slots to every hop."""

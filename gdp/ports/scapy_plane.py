@@ -135,7 +135,7 @@ class ScapyPlane(NetdevPlane):
             self._punt(index, frame)
 
     def _punt(self, index: int, frame: bytes) -> None:
-        self._arrivals.append(ReceivedFrame(index, frame[MAC_BYTES : 2 * MAC_BYTES], frame[ETHER_BYTES:]))
+        self._keep([ReceivedFrame(index, frame[MAC_BYTES : 2 * MAC_BYTES], frame[ETHER_BYTES:])])
 
     def _send(self, port: int, packet: Packet) -> int:
         """Send one packet; return 1, or 0 when it is lost and counted."""

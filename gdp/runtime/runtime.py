@@ -10,7 +10,7 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gdp.due_queue import earliest
@@ -168,7 +168,8 @@ class Runtime:
         message does not delay received frames.
         """
         self._is_woken = False
-        is_sending, arrivals = self.send(), list[ReceivedFrame]()
+        is_sending = self.send()
+        arrivals: Sequence[ReceivedFrame] = ()
         if is_sending or self._streak:
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
@@ -201,7 +202,7 @@ class Runtime:
         """Return the monotonic second at which a step has work without frames, or None."""
         return earliest(self._machine.get_timer(), *(each.due_s for each in self._periodic))
 
-    def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
+    def _wait(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""
         begun_s = time.monotonic()
         if self._spin.pays:

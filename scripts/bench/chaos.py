@@ -37,19 +37,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from faults.accounts import Books, Continuity, Silence
-from faults.link_faults import FrameFaults
-from faults.overlay import Overlay
+from faults.accounts import Continuity, Silence
+from faults.overlay import KILLS, LOOK_S, Overlay
 from faults.plan import VICTIM, Oracle, Plan, random_network
-from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
-from faults.store import NOT_WRITTEN, StoreCluster, has_server, snapshot_faults
+from faults.schedule import make_schedule
+from faults.store import NOT_WRITTEN, has_server, snapshot_faults
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
+from lab.faults import Fault, FaultKind, broken_by, moments
 from lab.process import FailedError, new_run, until
-from lab.topology import ends_of
 
 SECONDS: Final = 60.0
 AFTER_S: Final = 8.0  # observation after the last fault
@@ -58,7 +57,6 @@ WELL_TRIPS: Final = 5  # ... and on full links so many waits in a queue: each ex
 LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
-LOOK_S: Final = 0.1
 IMAGE_SHARE: Final = 2.0  # of a thin link, as much as images offer
 REPORTED_S: Final = 0.25  # shorter silences are not reported
 SPARSE: Final = 1.5  # nor those of a flow that are shorter than so many of its periods
@@ -66,12 +64,6 @@ CALL_S: Final = 5.0
 LOG_LINES: Final = 12
 _CLUSTER_EVERY: Final = 3  # one in so many seeds gets a cluster
 _PRESSURE: Final = Path("/proc/pressure/cpu")
-FRAMES: Final = {
-    FaultKind.SILENT: FrameFaults(lost=1.0),
-    FaultKind.LOSS: FrameFaults(lost=0.05),
-    FaultKind.DOUBLED: FrameFaults(doubled=0.2),
-    FaultKind.REORDERED: FrameFaults(delayed=0.2, delay_s=0.02),
-}
 SHORT: Final = {kind.name.lower().replace("_", "-"): kind for kind in FaultKind}
 
 
@@ -85,7 +77,7 @@ class Chaos:
         self._overlay, self._plan = overlay, overlay.plan
         self._faults = faults
         self._oracle = Oracle(self._plan)
-        self.books = Books(self._plan)
+        self.books = overlay.books
         self._under_way: list[Fault] = []
         self._ended_lives: set[tuple[str, int]] = set()
         self._continuity = Continuity(self._plan, self.books)
@@ -101,7 +93,7 @@ class Chaos:
             lambda: not self._unreachable(),
             lambda: f"before any fault: {', '.join(self._unreachable())}",
             SETTLE_S,
-            lambda: self._watch(time.monotonic() + LOOK_S),
+            lambda: self._overlay.watch(LOOK_S),
         )
 
     def run(self) -> None:
@@ -112,20 +104,25 @@ class Chaos:
         begun_s, waited_s = time.monotonic(), _waited_s()
         self.begun_ns = time.monotonic_ns()
         self._note()
-        for at_s, fault, begins in _moments(self._faults):
+        for at_s, fault, begins in moments(self._faults):
             due_s = begun_s + at_s + self.late_s
             self.late_s += max(time.monotonic() - due_s, 0.0)
-            self._watch(due_s)
+            self._overlay.watch(due_s - time.monotonic())
             progress(f"{at_s:7.2f} s  {'+' if begins else '-'} {fault.kind.value}: {', '.join(fault.targets)}")
             if begins:
                 self._under_way.append(fault)
-                self._begin(fault)
+                if fault.kind in KILLS:
+                    who = fault.targets[0]
+                    self._ended_lives.add((who.removeprefix("member "), self._overlay.incarnation_ids[who]))
+                self._overlay.begin(fault)
+                if fault.kind is FaultKind.REVOKE:
+                    self.revoked_ns = time.monotonic_ns()
             else:
-                self._end(fault)
+                self._overlay.end(fault)
                 self._under_way.remove(fault)
             self.moments.append((time.monotonic_ns(), fault, begins))
             self._note()
-        self._watch(time.monotonic() + AFTER_S)
+        self._overlay.watch(AFTER_S)
         self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
     def broken_promises(self, limit_s: float, full_s: float = 0.0) -> list[str]:
@@ -177,15 +174,6 @@ class Chaos:
         silent = self._continuity.unreached()
         return silent if silent or self.books.answered or not self._plan.services else ["any answer"]
 
-    def _watch(self, until_s: float) -> None:
-        while True:
-            for member in self._plan.members:
-                for incarnation_id, records in self._overlay.read(member):
-                    self.books.take(member, incarnation_id, records)
-            if (left_s := until_s - time.monotonic()) <= 0:
-                return
-            time.sleep(min(LOOK_S, left_s))
-
     def _note(self) -> None:
         """Record what must be connected from now on."""
         at = {mover: self._overlay.at[mover] for mover in self._plan.homes}
@@ -193,72 +181,6 @@ class Chaos:
         if self.revoked_ns is not None:
             broken.members.add(VICTIM)
         self._continuity.note(time.monotonic_ns(), broken)
-
-    def _begin(self, fault: Fault) -> None:
-        overlay, kind, targets = self._overlay, fault.kind, fault.targets
-        if kind is FaultKind.CUT:
-            overlay.spaces.cut(*targets)
-        elif kind in FRAMES:
-            overlay.disturb(targets[0], targets[1], FRAMES[kind])
-        elif kind is FaultKind.PARTITION:
-            for link in targets[1:]:
-                overlay.spaces.cut(*ends_of(link))
-        elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
-            self._ended_lives.add((targets[0].removeprefix("member "), overlay.incarnation_ids[targets[0]]))
-            overlay.kill(targets[0])
-        elif kind is FaultKind.FREEZE:
-            overlay.freeze(targets[0])
-        elif kind is FaultKind.CLOCK:
-            overlay.step_clock(targets[0], fault.amount)
-        elif kind is FaultKind.ROAM:
-            overlay.move(*targets)
-        elif kind is FaultKind.REVOKE:
-            overlay.revoke(targets[0])
-            self.revoked_ns = time.monotonic_ns()
-        elif kind is FaultKind.DISK_FULL and overlay.disk is not None:
-            overlay.disk.fill()
-            for rib in targets[1:]:
-                overlay.kill(rib)
-                overlay.start(rib)
-                self._await(rib)
-        elif overlay.store is not None and targets[0] == STORE:
-            self._begin_in_store(overlay.store, fault)
-
-    def _begin_in_store(self, store: StoreCluster, fault: Fault) -> None:
-        choice = round(fault.amount)
-        if fault.kind is FaultKind.FREEZE_PRIMARY:
-            progress(f"           {store.freeze(str(fault), choice=choice)}")
-        else:
-            is_primary = fault.kind is FaultKind.KILL_PRIMARY
-            progress(f"           {store.kill(str(fault), is_primary=is_primary, choice=choice)}")
-
-    def _end(self, fault: Fault) -> None:
-        overlay, kind, targets = self._overlay, fault.kind, fault.targets
-        if kind is FaultKind.CUT:
-            overlay.spaces.restore_link(*targets)
-        elif kind in FRAMES:
-            overlay.calm(*targets)
-        elif kind is FaultKind.PARTITION:
-            for link in targets[1:]:
-                overlay.spaces.restore_link(*ends_of(link))
-        elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
-            overlay.start(targets[0])
-            self._await(targets[0])
-        elif kind is FaultKind.FREEZE:
-            overlay.thaw(targets[0])
-        elif kind is FaultKind.CLOCK:
-            overlay.step_clock(targets[0], 0.0)
-        elif kind is FaultKind.DISK_FULL and overlay.disk is not None:
-            overlay.disk.free()
-        elif kind is FaultKind.FREEZE_PRIMARY and overlay.store is not None:
-            overlay.store.thaw(str(fault))
-        elif overlay.store is not None and targets[0] == STORE:
-            overlay.store.restart(str(fault))
-
-    def _await(self, who: str) -> None:
-        """Continue to read records while a restarted process comes up; it joins the network when it reports ready."""
-        while not self._overlay.processes[who].has_line(0.0):
-            self._watch(time.monotonic() + LOOK_S)
 
     def _after_revocation(self) -> list[str]:
         if self.revoked_ns is None:
@@ -286,13 +208,6 @@ class Chaos:
         if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
         return found
-
-
-def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
-    """Yield when each fault begins and ends, in the order of time."""
-    begins = [(fault.start_s, fault, True) for fault in faults]
-    ends = [(fault.end_s, fault, False) for fault in faults]
-    return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
 
 
 def run_seed(seed: int, options: Options) -> list[str]:

@@ -69,11 +69,11 @@ def open_end(ifname: str, *, receives: bool = True, cut_bytes: int = 0) -> socke
 def send(ifname: str, frame: bytes, seconds: float) -> dict[str, float]:
     """Send a whole frame again and again, flat out; return how often, and when it began and ended (monotonic)."""
     batch, head, drops = make_batch(len(frame)), frame[:ETHER_BYTES], [0] * 64
-    batch.fill([frame[ETHER_BYTES:]] * SLOTS)
+    frames = [frame[ETHER_BYTES:]] * SLOTS
     with open_end(ifname, receives=False) as sock:
         sent, start_s = 0, time.monotonic()
         while time.monotonic() < start_s + seconds:
-            sent += batch.forward(sock, 0, SLOTS, head, drops)
+            sent += batch.send(sock, frames, head, drops)
         return {"sent": sent, "start_s": start_s, "end_s": time.monotonic()}
 
 

@@ -11,7 +11,6 @@ that waits misses some. Whole images that arrive in the window count.
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from report import Rounds
@@ -27,6 +26,7 @@ from lab.process import new_run
 
 GOODPUT, SHARE, LATE = "goodput, Mbit/s", "link share", "relay late p99, ms"
 ROWS: Final = (OURS, "zenoh-tls-block", "zenoh-quic-block")
+RATE, RTT_MS = "100", 60.0  # Mbit/s
 TARGET: Final = 5.0
 _IMAGE: Final = streams(RELIABLE)[0]
 
@@ -44,16 +44,16 @@ def goodput(lab: Lab, link: Conditions, name: str, options: Options) -> dict[str
 def measure(options: Options) -> Outcome:
     """Measure every system, round by round."""
     recorder = Recorder()
-    link = Conditions.of(options.rate, options.rtt, options.loss, "bdp", seed=options.seed, traces=Path())
+    link = Conditions.of(RATE, RTT_MS, options.loss, "bdp", seed=1)
     for number in range(1, options.rounds + 1):
         with new_run() as run:
-            lab = thin_link_lab(run, tcp_control=options.tcp_control)
+            lab = thin_link_lab(run)
             for name in ROWS:
                 work = partial(goodput, lab, link, name, options)
                 trial = Trial(link.name, name, (GOODPUT, SHARE, LATE), lambda _, work=work: work())  # type: ignore[misc]
                 recorder.attempt(trial, number, options.rounds)
     over: Rounds = recorder.rounds
-    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "TCP": options.tcp_control}
+    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "TCP": "cubic"}
     settings["trouble"] = recorder.notes or "none"
     targets = [
         over.ratio(f"{GOODPUT}: {OURS} / {other}", OURS, other, link.name, GOODPUT, TARGET if at == 0 else 1.0)
@@ -64,10 +64,6 @@ def measure(options: Options) -> Outcome:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 3.0}, has_record=True)
-    parser.add_argument("--rate", default="100", help="Mbit/s (default: %(default)s)")
-    parser.add_argument("--rtt", type=float, default=60.0, help="ms (default: %(default)s)")
     parser.add_argument("--loss", choices=list(LOSSES), default="1", help="of frames, %% (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
-    parser.add_argument("--tcp-control", default="cubic", help="of TCP under TLS (default: %(default)s)")
     parser.set_defaults(camera=RELIABLE)
     run_bench(parser, measure)

@@ -16,9 +16,8 @@ import signal
 import time
 from typing import Final
 
-from faults.overlay import Overlay
+from faults.overlay import LOOK_S, Overlay
 from faults.plan import Flow, Plan
-from faults.records import Kind
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
@@ -80,16 +79,15 @@ class _Closing:
 
     def __init__(self, overlay: Overlay) -> None:
         self._overlay = overlay
-        self._last_ns: dict[int, int] = {}  # by channel: when R got the last message
 
     def measure(self, over: Rounds) -> None:
         """Add the measurements. Raises ``FailedError``: the flows did not come up, or a process ended by itself."""
-        flows = self._overlay.plan.flows
+        flows, arrivals_ns = self._overlay.plan.flows, self._overlay.books.arrivals_ns
         until(
-            lambda: len(self._last_ns) == len(flows),
-            lambda: f"{len(self._last_ns)} of {len(flows)} flows are read",
+            lambda: len(arrivals_ns) == len(flows),
+            lambda: f"{len(arrivals_ns)} of {len(flows)} flows are read",
             STEADY_S,
-            lambda: self._watch(0.1),
+            lambda: self._overlay.watch(LOOK_S, is_strict=True),
         )
         order = list(range(len(flows)))
         random.Random(1).shuffle(order)
@@ -97,8 +95,8 @@ class _Closing:
             what = "delegation" if flows[channel].publisher == "P" else "membership"
             time.sleep(0.2 + random.random() * 0.5)
             begun_ns, signalled_ns = self._revoke(channel)
-            self._watch(AFTER_S)
-            last_ns = self._last_ns[channel]
+            self._overlay.watch(AFTER_S, is_strict=True)
+            last_ns = arrivals_ns[channel, "R"][-1]
             took_ms = max(last_ns - signalled_ns, 0) / 1e6
             over.add(what, CASE, SIGNAL, took_ms)
             over.add(what, CASE, COMMAND, (last_ns - begun_ns) / 1e6)
@@ -124,14 +122,6 @@ class _Closing:
         signalled_ns = time.monotonic_ns()
         self._overlay.processes[f"switch {HANDED_IN_AT}"].send(signal.SIGHUP)
         return begun_ns, signalled_ns
-
-    def _watch(self, seconds: float) -> None:
-        end_s = time.monotonic() + seconds
-        while time.monotonic() < end_s:
-            time.sleep(0.1)
-            for each in self._overlay.new_records("R"):
-                if each.kind == Kind.DELIVERED:
-                    self._last_ns[each.channel] = max(each.at_ns, self._last_ns.get(each.channel, 0))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from __future__ import annotations
 import random
 import signal
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,8 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from faults.overlay import Overlay
-from faults.records import Kind
+from faults.overlay import LOOK_S, Overlay
 from report import Rounds, Spread, Target, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 from survive_rows import NEW_TOPICS, ROWS, Row
@@ -40,7 +38,6 @@ SETTLE_S: Final = 11.0  # longer than a link that came and went is left out of r
 STEADY_S: Final = 0.5  # a flow that had no gap above ``STEADY_GAP_S`` for so long is steady
 STEADY_GAP_S: Final = 0.1
 PATIENCE_S: Final = 40.0  # longer than a lease
-LOOK_S: Final = 0.05
 PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
@@ -69,38 +66,18 @@ class Measured:
 
 
 class Flowing:
-    """R's side of the flow while it runs: arrivals as they are recorded."""
+    """The steady flow from P to R, while it runs."""
 
     def __init__(self, overlay: Overlay) -> None:
         self._overlay = overlay
-        self.arrivals_ns: list[int] = []
-        self.numbers: Counter[tuple[int, int]] = Counter()  # (incarnation, number) of the steady flow
-        self.published: set[tuple[int, int]] = set()
-        self.reported_lost = 0
-        self.first_of: dict[int, int] = {}  # channel -> when its first message came
-
-    def look(self) -> None:
-        """Read new records; end with an error if a process ended by itself. Raises ``FailedError``: one did."""
-        for each in self._overlay.new_records("R"):
-            if each.kind == Kind.DELIVERED:
-                self.first_of.setdefault(each.channel, each.at_ns)
-                if each.channel == 0:
-                    self.arrivals_ns.append(each.at_ns)
-                    self.numbers[each.incarnation_id, each.number] += 1
-            elif each.kind == Kind.LOST and each.channel == 0:
-                self.reported_lost += each.number
-            elif each.kind == Kind.WRONG:
-                raise FailedError(f"R had a message of channel {each.other} on channel {each.channel}")
-        for each in self._overlay.new_records("P"):
-            if each.kind == Kind.PUBLISHED and each.channel == 0:
-                self.published.add((each.incarnation_id, each.number))
+        self._arrivals_ns = overlay.books.arrivals_ns[0, "R"]
 
     def is_steady(self, since_ns: int) -> bool:
         """Return whether the flow has been steady for ``STEADY_S``, all of it after a moment."""
         begin_ns = time.monotonic_ns() - round(STEADY_S * 1e9)
         if begin_ns < since_ns:
             return False
-        late = [at_ns for at_ns in reversed(self.arrivals_ns[-4_000:]) if at_ns >= begin_ns]
+        late = [at_ns for at_ns in reversed(self._arrivals_ns[-4_000:]) if at_ns >= begin_ns]
         marks = [begin_ns, *reversed(late), time.monotonic_ns()]
         return len(late) > 1 and max(b - a for a, b in pairwise(marks)) < STEADY_GAP_S * 1e9
 
@@ -108,24 +85,17 @@ class Flowing:
         """Return whether the flow became steady in time."""
         end_s = time.monotonic() + patience_s
         while time.monotonic() < end_s:
-            self.look()
+            self._overlay.watch(LOOK_S, is_strict=True)
             if self.is_steady(since_ns):
                 return True
-            time.sleep(LOOK_S)
         return False
 
     def silence_s(self, since_ns: int) -> float:
         """Return the longest time between consecutive arrivals, the last before a moment included; up to now."""
-        before = [at_ns for at_ns in self.arrivals_ns if at_ns < since_ns][-1:]
-        after = [at_ns for at_ns in self.arrivals_ns if at_ns >= since_ns]
+        before = [at_ns for at_ns in self._arrivals_ns if at_ns < since_ns][-1:]
+        after = [at_ns for at_ns in self._arrivals_ns if at_ns >= since_ns]
         marks = [*before, *after] if after else [*(before or [since_ns]), time.monotonic_ns()]
         return max((b - a for a, b in pairwise(marks)), default=0) / 1e9
-
-    def count(self, sent: set[tuple[int, int]]) -> tuple[int, int]:
-        """Return how many of these are missing, from the first that arrived on, and the surplus deliveries of any."""
-        first = min(self.numbers, default=(0, 0))
-        missing = {each for each in sent if each >= first} - self.numbers.keys()
-        return len(missing), sum(number - 1 for number in self.numbers.values())
 
 
 def measure_row(row: Row, rounds: int, options: Options) -> Measured:
@@ -144,14 +114,17 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
             raise FailedError(f"{row.what}: no steady flow before any event")
-        _watch(flow, options.settle_s)  # path computation waits longer in a network that has just started (RFC 8405)
+        overlay.watch(
+            options.settle_s, is_strict=True
+        )  # path computation waits longer in a network that has just started (RFC 8405)
         for at in range(rounds):
             _once(overlay, flow, row, at, found, options)
-        flow.look()
-        sent = set(flow.published)
-        _watch(flow, LAST_S)
-        found.lost, found.doubled = flow.count(sent)
-        found.published, found.reported_lost = len(sent), flow.reported_lost
+        books = overlay.books
+        found.published = len(books.published[0, 1])
+        overlay.watch(LAST_S, is_strict=True)
+        account = books.accounts[0, "R", 1, 1]
+        found.lost, found.doubled = account.missing(found.published), account.doubled
+        found.reported_lost = books.reported_losses[0, "R", 1]
     return found
 
 
@@ -173,9 +146,9 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, o
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
-        found.new_name_s.append(_new_name_s(overlay, flow, at))
+        found.new_name_s.append(_new_name_s(overlay, at))
     if row.holds:
-        _watch(flow, options.dead_s)
+        overlay.watch(options.dead_s, is_strict=True)
     patience_s = 0.1 if row.holds and options.dead_s >= PATIENCE_S and not flow.is_steady(since_ns) else PATIENCE_S
     found.never += not flow.await_steady(since_ns, patience_s)
     found.silence_s.append(flow.silence_s(since_ns))
@@ -185,27 +158,19 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, o
         row.undo(overlay, at)
         found.never += not flow.await_steady(max(since_ns, time.monotonic_ns()))
         found.return_s.append(flow.silence_s(since_ns))
-        _watch(flow, options.settle_s)
+        overlay.watch(options.settle_s, is_strict=True)
 
 
-def _watch(flow: Flowing, seconds: float) -> None:
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        flow.look()
-        time.sleep(LOOK_S)
-
-
-def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
+def _new_name_s(overlay: Overlay, at: int) -> float:
     """Make P publish, and R read, an unknown name; return the seconds until its first message."""
-    channel = len(overlay.plan.flows) + len(overlay.plan.services) + at
+    arrivals_ns = overlay.books.arrivals_ns[len(overlay.plan.flows) + len(overlay.plan.services) + at, "R"]
     begun_ns = time.monotonic_ns()
     for who in ("member P", "member R"):
         overlay.processes[who].send(signal.SIGUSR1)
     end_s = time.monotonic() + PATIENCE_S
-    while channel not in flow.first_of and time.monotonic() < end_s:
-        flow.look()
-        time.sleep(LOOK_S)
-    return (flow.first_of.get(channel, time.monotonic_ns()) - begun_ns) / 1e9
+    while not arrivals_ns and time.monotonic() < end_s:
+        overlay.watch(LOOK_S, is_strict=True)
+    return ((arrivals_ns or [time.monotonic_ns()])[0] - begun_ns) / 1e9
 
 
 def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:

@@ -18,12 +18,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, TypedDict
 
-from faults.link_faults import FrameFaults
-from faults.overlay import READY_S, Overlay
+from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 
+from lab.faults import Fault, FaultKind
 from lab.topology import Link, ends_of, make_topology
 
+CUT, KILL = FaultKind.CUT, FaultKind.KILL_SWITCH
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40
 _DEARER: Final = 12
@@ -119,68 +120,38 @@ class Both(TypedDict):
 
 
 class _OnPath:
-    """Faults at the switch, or the link to or from it, that the flow uses at that moment.
+    """Fault of the switch, or the link to or from it, that the flow uses at that moment.
 
     A link that came back may be left out of routes for seconds (damping), so the path is not always the cheaper one.
     The busier of the last switch's two devices shows the path.
 
     Args:
+        kind: of the fault.
         last: the switch where both paths meet again.
         ways: the switch before it on the flow's path, and what fails then.
     """
 
-    def __init__(
-        self,
-        last: str,
-        ways: Mapping[str, str],
-        fail: Callable[[Overlay, str], None],
-        undo: Callable[[Overlay, str], None],
-    ) -> None:
-        self._last, self._ways, self._fail, self._undo = last, dict(ways), fail, undo
-        self._failed = ""
+    def __init__(self, kind: FaultKind, last: str, **ways: str) -> None:
+        self._kind, self._last, self._ways = kind, last, ways
+        self._fault = Fault(kind, (), 0.0)
 
     def fail(self, overlay: Overlay, _: int) -> None:
         before = overlay.received(self._last, list(self._ways))
         time.sleep(_COUNT_S)
         after = overlay.received(self._last, list(self._ways))
-        self._failed = self._ways[max(self._ways, key=lambda way: after[way] - before[way])]
-        self._fail(overlay, self._failed)
+        failed = self._ways[max(self._ways, key=lambda way: after[way] - before[way])]
+        targets = (failed,) if self._kind is FaultKind.KILL_SWITCH else ends_of(failed)
+        self._fault = Fault(self._kind, targets, 0.0)
+        overlay.begin(self._fault)
 
     def undo(self, overlay: Overlay, _: int) -> None:
-        self._undo(overlay, self._failed)
-
-    def both(self) -> Both:
-        """Return both as keys of a row."""
-        return {"fail": self.fail, "undo": self.undo}
+        overlay.end(self._fault)
 
 
-def _cut(**ways: str) -> Both:
-    return _OnPath(
-        "s4",
-        ways,
-        lambda overlay, link: overlay.spaces.cut(*ends_of(link)),
-        lambda overlay, link: overlay.spaces.restore_link(*ends_of(link)),
-    ).both()
-
-
-def _silence(**ways: str) -> Both:
-    return _OnPath(
-        "s4",
-        ways,
-        lambda overlay, link: overlay.disturb(*ends_of(link), FrameFaults(lost=1.0)),
-        lambda overlay, link: overlay.calm(*ends_of(link)),
-    ).both()
-
-
-def _kill(last: str, **ways: str) -> Both:
-    return _OnPath(last, ways, lambda overlay, who: overlay.kill(who), _again).both()
-
-
-def _again(overlay: Overlay, *names: str) -> None:
-    for who in names:
-        overlay.start(who)
-    for who in names:
-        overlay.processes[who].read(READY_S)
+def _on_path(kind: FaultKind, last: str = "s4", **ways: str) -> Both:
+    """Return the keys of a row with such a fault."""
+    fault = _OnPath(kind, last, **ways)
+    return {"fail": fault.fail, "undo": fault.undo}
 
 
 def _one_rib(overlay: Overlay, at: int) -> str:
@@ -204,19 +175,21 @@ ROWS: Final[dict[str, Row]] = {
     "roam-both": Row(
         "roaming, both ends at once", 0.8, lambda hz: _star(hz, {"P": ("a1", "b1"), "R": ("c1", "d1")}), _move("P", "R")
     ),
-    "cut-alternate": Row("link cut, carrier seen, with an alternate", 0.005, _square, **_cut(s2="s1-s2", s3="s1-s3")),
-    "cut": Row("link cut, carrier seen, without an alternate", 0.05, _square, **_cut(s2="s2-s4", s3="s3-s4")),
-    "silent": Row("link cut, silent", 0.25, _square, **_silence(s2="s1-s2", s3="s1-s3")),
-    "switch": Row("switch on the path killed", 0.3, _square, **_kill("s4", s2="switch s2", s3="switch s3")),
-    "border": Row("border killed", 0.5, _borders, **_kill("b1", b2="switch a2", b3="switch a3")),
+    "cut-alternate": Row(
+        "link cut, carrier seen, with an alternate", 0.005, _square, **_on_path(CUT, s2="s1-s2", s3="s1-s3")
+    ),
+    "cut": Row("link cut, carrier seen, without an alternate", 0.05, _square, **_on_path(CUT, s2="s2-s4", s3="s3-s4")),
+    "silent": Row("link cut, silent", 0.25, _square, **_on_path(FaultKind.SILENT, s2="s1-s2", s3="s1-s3")),
+    "switch": Row("switch on the path killed", 0.3, _square, **_on_path(KILL, s2="switch s2", s3="switch s3")),
+    "border": Row("border killed", 0.5, _borders, **_on_path(KILL, "b1", b2="switch a2", b3="switch a3")),
     "rib": Row(
         "any one RIB of two killed", 0.0, lambda hz: _square(hz, ("s3", "s2"), new_names=True),
         lambda overlay, at: overlay.kill(_one_rib(overlay, at)),
-        lambda overlay, at: _again(overlay, _one_rib(overlay, at)),
+        lambda overlay, at: overlay.restart(_one_rib(overlay, at)),
         new_name_s=0.3,
     ),
     "ribs": Row(
         "all RIBs dead", 0.0, lambda hz: _square(hz, ("s3", "s2")), _kill_all_ribs,
-        lambda overlay, _: _again(overlay, *_all_ribs(overlay)), holds=True,
+        lambda overlay, _: overlay.restart(*_all_ribs(overlay)), holds=True,
     ),
 }  # fmt: skip

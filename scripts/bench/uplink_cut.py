@@ -32,7 +32,8 @@ TOPICS: Final[dict[str, Literal[1, 2]]] = {"one": 1, "two": 2}  # by the number 
 TARGET_MS: Final = 300.0
 LIMIT_MIN_MS: Final = 100.0
 CUT_S: Final = 2.0
-SETTLE_S: Final = 6.0
+SETTLE_S: Final = 6.0  # between two cuts
+QUIET_S: Final = 10.0  # without a cut, for the limit
 PATIENCE_S: Final = 60.0
 LATE, SILENCE, P99, LOST, DOUBLED = "late", "silence, ms", "p99, ms", "lost", "doubled"
 _CASES: Final = {1: "paths: 1", 2: "paths: 2"}
@@ -44,9 +45,9 @@ def measure(options: Options) -> Outcome:
     with new_run() as run, Laboratory(run) as laboratory, ExitStack() as stack:
         flows = start(laboratory, stack)
         sites = [laboratory.sites[each] for each in UPLINKS]
-        time.sleep(options.settle_s)
+        time.sleep(SETTLE_S)
         quiet_s = time.monotonic()
-        time.sleep(options.quiet_s)
+        time.sleep(QUIET_S)
         limits = {
             paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), options.limit_ms)
             for paths, flow in flows.items()
@@ -58,7 +59,7 @@ def measure(options: Options) -> Outcome:
             time.sleep(CUT_S)
             until_s = time.monotonic()
             site.restore()
-            time.sleep(options.settle_s)
+            time.sleep(SETTLE_S)
             for paths, flow in flows.items():
                 late = sum(delay > limits[paths] for delay in flow.delays_ms(since_s, until_s))
                 silences[paths].append(flow.silence_ms(since_s, until_s))
@@ -111,10 +112,6 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True)
     parser.add_argument(
-        "--quiet-s", type=float, default=10.0, help="without a cut, for the limit (default: %(default)s)"
-    )
-    parser.add_argument(
         "--limit-ms", type=float, default=LIMIT_MIN_MS, help="least delay of a late message (default: %(default)s)"
     )
-    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="between two cuts (default: %(default)s)")
     run_bench(parser, measure)

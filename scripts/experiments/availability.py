@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from experiment import Computed, command_line, run_experiment
 from machine import data_folder
+from page_text import text_of
 from report import markdown_table, print_table
 from skeleton import Options
 
@@ -102,31 +103,19 @@ def page(cases: Sequence[Case]) -> str:
     """Return the page, in Markdown."""
     seen = measured()
     low, high = seen.factors
-    taken = ", ".join(f"{zone} {share:.0%}" for zone, share in seen.taken_share.items())
-    parts = [
-        "# Availability, by replaying preemptions",
-        f"Made by `python scripts/experiments/availability.py` from {seen.source}. These are machines of 64 CPUs in a "
-        f"time of shortage. None was available for {taken} of the time, and they were preempted after "
-        f"{duration_text(round(seen.uptime_s))} on average. Read the figures as the worst that was recorded, and "
-        "compare them with each other.",
-        'The traces\' authors take 1 in their data as "no spot machine to be had", and so does this page.',
-        "\n".join(f"- *{way}*: {what}." for way, what in WAYS.items()),
-        markdown_table(_HEAD, map(_cells, cases), numbers=5),
-        "![none up](availability.png)",
-        f"The intervals are of a moving-block bootstrap (blocks of {duration_text(BLOCK_S)}, {RESAMPLES} resamples): "
-        "six days are few, and the intervals say so.",
-        "## What follows\n"
-        "- A second and a third replica in the same region help less than independence says. The zones run out of "
-        f"machines together. Pairs of zones have machines at the same time {low:g} to {high:g} times as often as "
-        "independent ones. Asked the other way round (neither has any) the ratio is 1.02 to 1.1, which says little. "
-        "That state is the normal one here, and no ratio can exceed one over its share.\n"
-        "- One replica that moves does as well as three that stay, and further ones that move add next to nothing. "
-        "What is left is the time in which the whole region has none. Other regions, other types of machine or one "
-        "on-demand machine help against that. With one on-demand machine all these shares are zero, since the traces "
-        "record nothing that takes it.\n"
-        "- Where capacity is found elsewhere, the recovery time decides.",
-    ]
-    return "\n\n".join(parts) + "\n"
+    text = text_of(
+        "availability",
+        source=seen.source,
+        taken=", ".join(f"{zone} {share:.0%}" for zone, share in seen.taken_share.items()),
+        uptime=duration_text(round(seen.uptime_s)),
+        ways="\n".join(f"- *{way}*: {what}." for way, what in WAYS.items()),
+        table=markdown_table(_HEAD, map(_cells, cases), numbers=5),
+        block=duration_text(BLOCK_S),
+        resamples=RESAMPLES,
+        low=low,
+        high=high,
+    )
+    return f"{text}\n"
 
 
 def _cells(case: Case) -> tuple[str, ...]:

@@ -69,18 +69,16 @@ class Report:
 
     Args:
         name: of its files, such as ``fig5``.
-        setting: the method, in sentences for the page.
         groups: samples by their label in the table.
-        notes: differences from the paper, in sentences.
+        text: the method, and after it as a list the differences from the paper.
         draw: writes the picture to a path, under a title.
     """
 
     name: str
     title: str
-    setting: Sequence[str]
     groups: Mapping[str, Sequence[Sample]]
     findings: Sequence[Finding]
-    notes: Sequence[str]
+    text: str
     settings: Mapping[str, str | int | float]
     draw: Callable[[Path, str], None]
 
@@ -106,20 +104,24 @@ class Report:
     def to_page(self, state: MachineState) -> str:
         """Return the page in Markdown."""
         command = f"```bash\nsudo .venv/bin/python scripts/experiments/{self.name}.py\n```"
-        parts = [f"# {self.title}", *self.setting, command, f"![{self.title}]({self.name}.png)"]
+        method, notes = self._parts()
+        parts = [f"# {self.title}", method, command, f"![{self.title}]({self.name}.png)"]
         parts += [markdown_table(("", *_COLUMNS), self.rows(state))]
         parts += [markdown_table(_FIGURES, [each.cells(state) for each in self.findings])]
-        parts += ["\n".join(f"- {note}" for note in self.notes)]
         stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
-        return "\n\n".join([*parts, f"Measured on {state}. Settings: {stated}."]) + "\n"
+        return "\n\n".join([*parts, notes, f"Measured on {state}. Settings: {stated}."]) + "\n"
 
     def show(self, state: MachineState) -> None:
         """Print the tables and the notes."""
         print(f"{self.title}\n{state}")
         print_table(("", *_COLUMNS), self.rows(state), title="latency at the robot's node")
         print_table(_FIGURES, [each.cells(state) for each in self.findings], title="figures")
-        for note in self.notes:
-            print(f"- {note}")
+        print(self._parts()[1])
+
+    def _parts(self) -> tuple[str, str]:
+        """Return the method and the list of differences."""
+        method, _, notes = self.text.partition("\n\n- ")
+        return method, f"- {notes}"
 
 
 @dataclass(frozen=True, slots=True)

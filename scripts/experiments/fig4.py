@@ -13,6 +13,7 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
+from page_text import text_of
 from samples import Sample, Series
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
@@ -26,22 +27,6 @@ COUNTED: Final = ("bytes a request from the robot", "bytes a request to the robo
 _PATIENCE_S: Final = 10.0
 _WARM_UP: Final = 1  # counted: it has the size of the others
 _EXTRA_SHARE: Final = 0.2  # accepted: a copy of its own to a replica that is too slow for the tree
-_SETTING: Final = (
-    "A robot sends frames of 640 x 480 bytes, one after the other, to a service that finds an AprilTag's pose. The"
-    " service has replicas, on machines of `fog`'s provider `local`. *Direct*: each replica is a service of its own,"
-    " and the robot calls each one. *Dedicated gateway* and *replica as gateway*: the robot makes one call, and the"
-    " gateway's switch copies it (`fog launch --gateway dedicated`, `--gateway replica`).",
-    "Bytes are those of Ethernet frames, counted by the kernel where they arrive. They include all control traffic of"
-    " that time. A request of *direct* is a call to each replica.",
-)
-_NOTES: Final = (
-    "The paper draws both gateways, and says that they spare the uplink; it has no figures of them.",
-    "One copy crosses the uplink where the path to each replica carries a request as fast as the fastest one does."
-    " Otherwise the slower replica gets a copy of its own (docs/explanation/congestion-control.md, Requests). So the"
-    " shares are above one over the number of replicas, and more so on a busy host.",
-    "Latencies of *direct* are of one call each. A robot that calls each replica must also choose among the answers."
-    " Its frames pass a dedicated gateway, too, which then copies nothing.",
-)
 
 
 def measure(options: Options) -> Report:
@@ -57,10 +42,9 @@ def measure(options: Options) -> Report:
     return Report(
         "fig4",
         "Figure 4: bytes on the robot's uplink",
-        _SETTING,
         {form: samples for form, (samples, _) in found.items()},
         findings,
-        _NOTES,
+        text_of("fig4"),
         {"replicas": options.replicas, "requests": count},
         lambda path, title: _draw(path, title, figures),
     )

@@ -22,6 +22,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from machine import DATA, RefusedError, data_folder
+from page_text import text_of
 from pictures import save_distributions
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Series, least_of_two, p99
@@ -47,16 +48,6 @@ _PAPER: Final = {  # mean gain, p99 gain
     "Cubicles": ("1.22; 1.16 in the introduction", "5.53"),
     "Twistycool": ("at most 1.22", "1.42"),
 }
-_SETTING: Final = (
-    "A robot asks for a way of a rigid body among obstacles, in OMPL.app's problems, by a service of type"
-    " nav_msgs/srv/GetPlan. *One server* is always the same one; *two replicas* both get the request, and the first"
-    " answer wins. The cases take turns, trial by trial, one request at a time.",
-    "*Waits*: the server waits as long as a recorded run of OMPL's planner took, divided by the number given, and"
-    " computes nothing. Each replica draws its waits from the recording independently, with replacement; request number"
-    " i waits entry i of either list. So the least of the two is known before: *offline* figures are computed from the"
-    " lists alone, without any overlay. *Log-normal* waits have sigma 1 and a mean of 0.15 s.",
-    "*Computed*: OMPL's planner with FCL really runs in the server.",
-)
 
 
 def measure(options: Options) -> Report:
@@ -91,10 +82,9 @@ def measure(options: Options) -> Report:
     return Report(
         "fig5",
         "Figure 5: motion planning, one server against two",
-        _SETTING,
         groups,
         findings,
-        _notes(counts, timeout),
+        _text(counts, timeout),
         {
             "computed trials": ", ".join(f"{n} {count}" for n, count in counts.items()) or "none",
             "timeout, s": timeout,
@@ -177,28 +167,21 @@ def _lists(count: int, problems: Collection[str]) -> dict[str, tuple[list[float]
     return lists | {f"{_LOG_NORMAL}, waits": (log_normal(), log_normal())}
 
 
-def _notes(counts: Mapping[str, int], timeout_s: float) -> list[str]:
+def _text(counts: Mapping[str, int], timeout_s: float) -> str:
     counted = ", ".join(f"{count} of {name}" for name, count in counts.items())
-    runs, gains = [], []
+    runs, gained = [], []
     for name, each in load().items():
         stopped = sum(run_s >= LIMIT_S for run_s in each.runs_s)
         runs.append(f"{len(each.runs_s)} of {each.planner} in {name}, of which {stopped} reached the timeout")
-        gains.append("{}: mean {:.2f}, p99 {:.2f}".format(name, *each.gains()))
-    return [
-        f"The paper ran 100 trials with a timeout of {LIMIT_S:g} s. The trials of waits are as many.",
-        f"Recorded runs: {'; '.join(runs)}. Their length is the number of states that the planner checked, by the rate"
-        f" of an idle core. A run that checked as many as {LIMIT_S:g} s allow was stopped, and counts as {LIMIT_S:g} s."
-        " A tail is known no better than so many runs show it.",
-        f"Gains of the least of any two recorded runs, by arithmetic: {'; '.join(gains)}. The p99 of two servers is the"
-        " p90 of one. So a p99 gain of 5.53 needs a p99 that is 5.53 times the p90.",
-        "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is not:"
-        " it weighs more here than in the paper (last figure of each).",
-        f"Computed trials: {counted or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
-        " the p99 is the slowest one. A problem without a solution counts with its timeout, as failed. The replicas"
-        " share two cores with each other, the robot and the overlay, and the planner calls back into Python for each"
-        " check: gains of computed trials are less than those of two machines.",
-        "The paper's planner is not named in what is at hand; the gains depend on how heavy a planner's tail is.",
-    ]
+        gained.append("{}: mean {:.2f}, p99 {:.2f}".format(name, *each.gains()))
+    return text_of(
+        "fig5",
+        limit_s=LIMIT_S,
+        runs="; ".join(runs),
+        gains="; ".join(gained),
+        counted=counted or "none in this run",
+        timeout_s=timeout_s,
+    )
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
+from page_text import text_of
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Series, least_of_two, p99
@@ -36,6 +37,7 @@ _SEED: Final = 6
 _WAIT, _COMPUTE = "count", "segment"  # role of the servers, and task of their clients
 _RUNS: Final = segmentation_runs()
 _OFFLINE: Final = p99(_RUNS) / p99(least_of_two(_RUNS))
+_P50_MS, _P99_MS = 1e3 * median(_RUNS), 1e3 * p99(_RUNS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,31 +55,6 @@ _SETTINGS: Final = {
     "servers compute, no contention": _Setting(_COMPUTE, False, ("", "1.3")),
     "servers compute, contended": _Setting(_COMPUTE, True, ("1.31", "1.96 (2.1 in the abstract)")),
 }
-_SETTING: Final = (
-    "A robot calls a service that finds the words in frames of 640 x 480 bytes. *Contended*: a second client of the"
-    f" same service, next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for"
-    f" {OFF_S:g} s. The node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and"
-    " no other client asks. Both cases take turns, request by request, with the same frames.",
-    "*Servers compute*: each runs DBNet, a neural network that gives every pixel its probability of being text, and"
-    " answers the mask. *Servers wait*: they run no network, count the words by their brightness, and wait for the rest"
-    " of the time, as if a processor of their own worked. The time is drawn, for each request and replica, from"
-    f" {len(_RUNS)} recorded runs of the same network on one thread (`record_segmentation.py`).",
-    f"Without a fault the gain is what these runs allow. Their p50 is {1e3 * median(_RUNS):.0f} ms and their p99"
-    f" {1e3 * p99(_RUNS):.0f} ms: the network does the same work for every frame, and the tail is light. By arithmetic"
-    f" alone, the p99 of the lesser of two is {_OFFLINE:.2f} times lower. The paper has 1.3, so its times varied more;"
-    " why is not known here. No target is stated.",
-)
-_NOTES: Final = (
-    "The network is that of the wheel rapidocr-onnxruntime, on one thread of a processor. The paper ran SAM, a larger"
-    " one, on machines of its own. Each mask is checked against the drawn words: a region for each, and intersection"
-    " over union of at least 0.5. Of servers that wait the number of words is checked.",
-    "The recording has processor time: it leaves out waiting for a core, but not what other work costs in the caches.",
-    "The service type is rcl_interfaces/srv/SetParameters, whose integer array carries the frame (307,200 bytes): the"
-    " installed packages have no service that takes an image.",
-    "The paper has 300 requests, as the cases in which the servers wait.",
-    "While the second client is busy and the servers compute, three processes want a core at once. With two cores the"
-    " robot's request to the second replica pays for a part of it. Two machines would not share that cost.",
-)
 
 
 def measure(options: Options) -> Report:
@@ -107,10 +84,9 @@ def measure(options: Options) -> Report:
     return Report(
         "fig6",
         "Figure 6: segmentation, one replica contended",
-        _SETTING,
         groups,
         findings,
-        _NOTES,
+        text_of("fig6", on_s=ON_S, off_s=OFF_S, runs=len(_RUNS), p50_ms=_P50_MS, p99_ms=_P99_MS, offline=_OFFLINE),
         {"requests of each case": ", ".join(map(str, counts.values())), "switches": plane},
         lambda path, title: save_distributions(path, title, panels, "latency, ms"),
     )

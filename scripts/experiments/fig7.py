@@ -13,6 +13,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from image_request import TYPE
+from page_text import text_of
 from pictures import save_distributions
 from samples import Sample, Series
 from skeleton import Options
@@ -29,33 +30,6 @@ _PATIENCE_S: Final = 10.0
 # Both readings of "+100 ms": the round trip takes 100 ms more, or each way does.
 _LINKS: Final = {"m2": ("round trip +100 ms", DELAY_S / 2), "m3": ("each way +100 ms", DELAY_S)}
 _NEAR: Final = "m1"
-_SETTING: Final = (
-    "A robot calls a service that looks for words in frames of 640 x 480 bytes. The link of one of its two servers is"
-    " slowed down, the other one's is not. *One server*: requests go to the two servers in turn, as where a load"
-    " balancer or an anycast address picks the server. So half of them meet the slow link. *Two replicas*: each"
-    " request goes to both, and the first answer wins. All cases take turns, request by request, with the same frames.",
-    "The gain depends on the server's time. A call of the near server takes a, one of the slow server a + d. One server"
-    " then has a mean of a + d / 2 and a p99 of a + d; two replicas have a for both. The gains are 1 + d / 2a and"
-    f" 1 + d / a. With d = {1e3 * DELAY_S:g} ms a mean gain of 2.1 needs a call of {1e3 * DELAY_S / 2.2:.0f} ms"
-    f" or less, and a p99 gain of 3.9 one of {1e3 * DELAY_S / 2.9:.0f} ms. With d = {2e3 * DELAY_S:g} ms both may take"
-    " twice as long. A request that takes several round trips makes d larger. So the server's own time is"
-    f" {1e3 * _TAKES_S:g} ms, and the rest is left to the network.",
-    "Which requests of its single server met the slow link in the paper is not known here. With all of them on the slow"
-    " link mean and p99 would gain alike, which they do not in the paper. Both readings of a link with 100 ms more"
-    " are measured: in the round trip, and each way.",
-)
-_NOTES: Final = (
-    "The paper has 300 requests, as each case here.",
-    "The paper ran a neural network (YOLOv8) on machines of 16 cores. Here a server counts the words by their"
-    f" brightness, and waits until {1e3 * _TAKES_S:g} ms have passed. Its count is checked against the drawn words."
-    " `--compute` runs neural networks instead: DBNet finds the words, and a recogniser reads each (wheel"
-    " rapidocr-onnxruntime, one thread). Every text must be right, and its box must overlap the drawn one by half."
-    " They take more than 100 ms of one core. So the gains are lower, by the arithmetic above, and have no target.",
-    "The service type is rcl_interfaces/srv/SetParameters, whose integer array carries the frame (307,200 bytes): the"
-    " installed packages have no service that takes an image.",
-    "Robot and servers are namespaces of one machine and share its cores. So two replicas cost each other time that two"
-    " machines would not.",
-)
 
 
 def measure(options: Options) -> Report:
@@ -83,10 +57,16 @@ def measure(options: Options) -> Report:
     return Report(
         "fig7",
         "Figure 7: object detection, one replica's link slow",
-        _SETTING,
         groups,
         findings,
-        _NOTES,
+        text_of(
+            "fig7",
+            delay_ms=1e3 * DELAY_S,
+            mean_ms=1e3 * DELAY_S / 2.2,
+            p99_ms=1e3 * DELAY_S / 2.9,
+            twice_ms=2e3 * DELAY_S,
+            takes_ms=1e3 * _TAKES_S,
+        ),
         {"requests of each case": count, "servers": "compute" if options.compute else "wait", "switches": plane},
         lambda path, title: save_distributions(path, title, panels, "latency, ms"),
     )

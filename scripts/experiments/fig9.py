@@ -14,6 +14,7 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
+from page_text import text_of
 from pictures import Span, save_timeline
 from report import progress
 from samples import Sample, Series, Summary
@@ -28,25 +29,6 @@ _HZ: Final = 10.0
 _STEADY_S: Final = 4.0  # time in which all serve, before the next machine is killed
 _LANES: Final = 1_000  # the camera does not wait for answers
 _PATIENCE_S: Final = 10.0
-_SETTING: Final = (
-    "A robot's camera sees an AprilTag. Ten times a second a frame of 640 x 480 bytes goes to a service that finds"
-    " the tag's pose, whether or not earlier answers are there. The service has replicas, each on a spot machine of"
-    " `fog`'s provider `local`: a network namespace with a switch, a proxy and the node, on one core. The machine that"
-    " has served for longest is killed: SIGKILL to all of its processes at once, its link gone. The experiment does"
-    f" nothing else. The supervisor notices the loss and requests another machine. {_STEADY_S:g} s after the"
-    " replacement serves, the next machine is killed.",
-    "A request fails when its answer does not come within 10 s, or when the pose is more than 5 mm or 0.03 rad off. How"
-    " many answers reach each call is counted by ROS 2's service introspection in the robot's node.",
-)
-_NOTES: Final = (
-    "Frames are drawn for a known pose (nine rays a pixel, no lens distortion) and are not photographs. The detector"
-    " is pupil-apriltags, family 36h11. The service type is rcl_interfaces/srv/SetParameters, whose integer array"
-    " carries the frame: the installed packages have no service that takes an image.",
-    "The paper's robot and spot machines were apart. Here robot, supervisor and all machines share the cores of one"
-    " host. So a machine that boots (Python, rclpy, keys) takes time from those that serve.",
-    "A local machine boots in seconds, one of a cloud in minutes. Spot machines get a notice; these get none.",
-    "A colour is one machine and those that replace it. On a busy host latency rises for seconds after one has joined.",
-)
 
 
 class _FaultInjector:
@@ -96,10 +78,9 @@ def measure(options: Options) -> Report:
     return Report(
         "fig9",
         "Figure 9: a tag's pose while machines are killed and the supervisor replaces them",
-        _SETTING,
         _groups(samples, spans, from_s),
         _findings(samples, asking, spans),
-        _NOTES,
+        text_of("fig9", steady_s=_STEADY_S),
         {"machines": options.machines, "requests a second": _HZ, "kills": len(spans)},
         lambda path, title: save_timeline(path, title, drawn, spans, from_s),
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from machine import MachineState
+from page_text import text_of
 from report import markdown_table, percentile
 
 CYCLONE: Final = "ROS 2, Cyclone DDS"
@@ -64,31 +65,24 @@ def page_of(document: Document) -> str:
     """Return the page, in Markdown, of the measured tasks."""
     tasks: Document = document["tasks"]
     networks = {name: task["network"] for name, task in tasks.items()}
-    parts = [
-        "# FogROS G: Table I and Figure 5",
-        "A robot computes three tasks by itself, or sends them to a server. Both ends are nodes of ROS 2. Five switches"
-        " in three trust domains carry the overlay: the [ring](../tutorials/first-ring.md), with the robot at `nuc1`"
-        " and the server at `nuc5`. *JSON* is the paper's encoding and the default one; *CDR* is that of ROS 2.",
-        "*Network* is one way, as in the paper. *There* is from the robot's first `publish` to the server's callback"
-        " with the last part of the request. *Back* is from the computed answer to its arrival at the robot. *Total* is"
-        " from the first `publish` to the answer at the robot, computing included.",
-        "![FogROS G: Table I and Figure 5](offload.png)",
-        "```bash\nsudo .venv/bin/python scripts/experiments/offload.py\n```",
-        "## Table I",
-        "Medians in seconds, with the p99 (of fewer than a hundred: the slowest) in brackets. *ROS 2* is unsecured, on"
-        " Cyclone DDS, over three Linux bridges, which are as many links. The paper has one overlay, with JSON.",
-        markdown_table(
+    text = text_of(
+        "offload",
+        table1=markdown_table(
             ("scenario", "", "robot only", *(f"{who} {what}" for who in ("ROS 2", JSON, CDR) for what in _CELLS)),
             [row for name in PAPER if name in tasks for row in _rows(name, tasks[name])],
         ),
-        "## Figure 5: what the overlay adds",
-        *_figure5(networks),
-        "## The rest of the way",
-        *_details(networks),
-        "## What differs from the paper",
-        "\n".join(f"- {note}" for note in _notes(tasks, document["slower"])),
-    ]
-    return "\n\n".join(parts) + "\n"
+        figure5=_figure5(networks),
+        details=_details(networks),
+        trials="; ".join(_trials(name, each) for name, each in networks.items()),
+        computes="\n- ".join(f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks),
+        ratios=", ".join(f"{name} {each:.2f}" for name, each in document["slower"].items()),
+        machines="\n- ".join(
+            f"{name}, {part}: measured on {MachineState(**each['machine'])}."
+            for name, task in tasks.items()
+            for part, each in task.items()
+        ),
+    )
+    return f"{text}\n"
 
 
 def save_picture(path: Path, document: Document) -> None:
@@ -134,7 +128,7 @@ def _rows(name: str, task: Document) -> list[tuple[str, ...]]:
     ]
 
 
-def _figure5(networks: Document) -> list[str]:
+def _figure5(networks: Document) -> str:
     pairs = [(overlay, other) for overlay in (JSON, CDR) for other in (CYCLONE, FAST)]
     added = {name: [added_s(network, *pair) for pair in pairs] for name, network in networks.items()}
     rows = []
@@ -145,50 +139,24 @@ def _figure5(networks: Document) -> list[str]:
     means = [f"{statistics.fmean(each[0] for each in column):+.4f}" for column in zip(*added.values(), strict=True)]
     rows.append(("mean of the tasks", "", *means, f"{PAPER_ADDED_S:+g}"))
     head = ("scenario", "request, bytes", *(f"{overlay} less {other}" for overlay, other in pairs), "paper")
-    text = (
-        "Seconds that the overlay's network time there has more than that of unsecured ROS 2: median of the rounds,"
-        " with the least and the most of any round. *Less Cyclone DDS* is the paper's comparison. The nodes of the"
-        " overlay's case use Fast DDS, so *less Fast DDS* compares equal nodes."
-    )
-    return [text, markdown_table(head, rows)]
+    return markdown_table(head, rows)
 
 
-def _details(networks: Document) -> list[str]:
+def _details(networks: Document) -> str:
     rows = []
     for name, network in networks.items():
         for who, each in network["contenders"].items():
             cells = (_text(each[key]) for key in ("there_s", "back_s", "computed_s", "total_s"))
             rows.append((name, who, *cells, str(each["failed"])))
     head = ("scenario", "", "there", "back", "computed", "total", "wrong answers")
-    trials = "; ".join(
-        f"{name}: {each['rounds']} rounds, {each['answered_at_once']} requests answered at once (there, back) and"
-        f" {each['computed']} computed (computed, total), the overlay over {each['over']}, {_cores_text(each)}"
-        for name, each in networks.items()
+    return markdown_table(head, rows)
+
+
+def _trials(name: str, network: Document) -> str:
+    return (
+        f"{name}: {network['rounds']} rounds, {network['answered_at_once']} requests answered at once (there, back) and"
+        f" {network['computed']} computed (computed, total), the overlay over {network['over']}, {_cores_text(network)}"
     )
-    return [markdown_table(head, rows), f"Of each contender: {trials}."]
-
-
-def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
-    ratios = ", ".join(f"{name} {each:.2f}" for name, each in slower.items())
-    notes = [f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks]
-    notes += [
-        "The data are recorded ones: RGB-D frames 2 to 5 of the five in slambook2 for vSLAM (the paper: TUM fr2/loop)."
-        " Three of them are cropped to 516 x 386 with an armchair's mask for grasps. The meshes are OMPL.app's Home."
-        " Answers are checked: motion within 0.1 m and 0.1 rad of the recorded poses, a path from start to goal, a"
-        " grasp on the object.",
-        "*Robot only* is the same computation in a control group with the stated share of a core, as the paper's robot"
-        f" was slower than its server (robot only over total less network: {ratios}). So the ratio is the paper's, not"
-        " a result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core,"
-        " as the server has.",
-        "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
-        " robot, switches, proxies and server; `--cores` bounds each. Links are veth pairs, without the time of a"
-        " cable, and the switches forward in the kernel.",
-        "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
-        " `dds`, without the overlay.",
-    ]
-    for name, task in tasks.items():
-        notes += [f"{name}, {part}: measured on {MachineState(**each['machine'])}." for part, each in task.items()]
-    return notes
 
 
 def _cores_text(network: Document) -> str:

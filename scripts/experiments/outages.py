@@ -19,6 +19,7 @@ from typing import Final
 from asking import Asking
 from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
+from page_text import text_of
 from pictures import Span, save_timeline
 from samples import Sample, Series
 from skeleton import Options
@@ -39,21 +40,6 @@ _PATIENCE_S: Final = 0.5
 _LANES: Final = 1_000
 _SEED: Final = 15
 _STEP_S: Final = 0.01
-_SETTING: Final = (
-    "A robot asks two services ten times a second each. One is on machine m1 alone, the other one on m1 and m2. Each"
-    " machine stops (SIGSTOP to its node and its proxy at once: its input waits) and goes on, independently. The times"
-    f" up and down are exponential, with means of {UP_S:g} s and {DOWN_S:g} s, drawn before. The servers answer at"
-    f" once. A request that has no answer after {_PATIENCE_S:g} s is unanswered.",
-    "*By the list*: the share of requests during whose whole patience all their machines are down, computed from the"
-    " times drawn, without any overlay. *By arithmetic*: the machines' shares of time down, multiplied.",
-)
-_NOTES: Final = (
-    "The paper's times (15 h up, 20 min down) would need months, so the shares here are larger ones. What is tested is"
-    " that shares multiply as the arithmetic says, and that the overlay adds little to it. A service is back as soon"
-    " as a machine of it is.",
-    "The machines stop and do not die: a new machine needs time to start, which figure 9 shows. Outages of spot"
-    " machines that come together are in availability.md.",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +103,9 @@ def measure(options: Options) -> Report:
     return Report(
         "outages",
         "Availability, measured: machines that stop and go on",
-        _SETTING,
         groups,
         _findings(groups, measured, seconds),
-        _NOTES,
+        text_of("outages", up_s=UP_S, down_s=DOWN_S, patience_s=_PATIENCE_S),
         {"seconds": seconds, "outages": sum(map(len, measured.values())), "switches": plane},
         lambda path, title: save_timeline(path, title, groups["two machines"], stopper.spans, begun_s),
     )

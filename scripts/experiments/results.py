@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from machine import MachineState
 from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seconds_text, share_text
+from page_text import text_of
 from report import markdown_table
 from samples import p99
 
@@ -124,36 +125,14 @@ def page_of(rows: Sequence[Row], machines: Sequence[str], missing: Sequence[str]
     """Return the page, in Markdown. ``missing``: experiments that have no rows."""
     head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here", "measured")
     cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions, r.measured) for r in rows]
-    return "\n\n".join([
-        "# The published figures next to ours",
-        "G is FogROS G, FT is FogROS2-FT. One command measures everything and writes this page and"
-        " [results.json](results.json); `--collect` only writes the page again.",
-        "```bash\nsudo .venv/bin/python scripts/experiments/papers.py\n```",
-        *([f"**Not complete.** Not measured: {', '.join(missing)}."] if missing else []),
-        markdown_table(head, cells),
-        "Gains are the time of one server divided by that of two replicas. Their spread is the 95 % interval of a"
-        f" bootstrap ({_RESAMPLES:,} resamples). Each experiment's own page has all latencies and its conditions"
-        " ([index](README.md)).",
-        "What differs from the published settings, in short:",
-        "\n".join(f"- {note}" for note in _NOTES),
-        "Measured on these machines. Load is that of other work; above the number of cores it takes time from what is"
-        " measured:",
-        "\n".join(f"- {machine}" for machine in machines),
-    ]) + "\n"  # fmt: skip
-
-
-_NOTES: Final = (
-    "One machine of two cores holds robot, switches and servers, as network namespaces. The authors had five NUCs (G),"
-    " and AWS machines of 4 to 64 cores in two regions (FT). Absolute times are not comparable; ratios and added times"
-    " are.",
-    "Stand-ins: visual odometry for ORB-SLAM2, geometric ranking for Dex-Net's GQ-CNN, and DBNet on a CPU for SAM and"
-    " YOLOv8, run or as recorded. Their answers are checked against known truth. Motion planning is OMPL with FCL on"
-    " the published problems, on one thread. The authors used MPT on many cores.",
-    "Servers that wait compute nothing, so two of them do not take each other's processor time. The number of trials is"
-    " then the paper's. Where servers compute there are fewer trials, and two replicas share the cores.",
-    "Long waits are divided by the number given; the network's time is not.",
-    "Prices are a list of 2024 with the spot advisor's average savings, not the day's prices.",
-)
+    text = text_of(
+        "papers",
+        missing=f"**Not complete.** Not measured: {', '.join(missing)}.\n\n" if missing else "",
+        table=markdown_table(head, cells),
+        resamples=_RESAMPLES,
+        machines="\n".join(f"- {machine}" for machine in machines),
+    )
+    return f"{text}\n"
 
 
 def _offload(document: Any) -> Iterator[Row]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from experiment import Computed, command_line, run_experiment
+from page_text import text_of
 from report import markdown_table, print_table
 from skeleton import Options
 
@@ -178,33 +179,20 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
     """Return the page, in Markdown."""
     best = max(rows, key=lambda row: row.times_cheaper)
     worst = min(rows, key=lambda row: row.times_cheaper)
-    parts = [
-        "# Table I: the price of a replica",
-        "Made by `python scripts/experiments/table1.py`.",
-        "## By application",
-        "USD an hour. *Here*: the cheapest machines on the list that have what the application needs; one on-demand in"
-        f" the cheaper of {' and '.join(REGIONS)}, two as one in either region.",
-        markdown_table(_HEAD, _application_rows(needed)),
-        "The paper's prices for MPT are those of m5.8xlarge and m5.16xlarge in us-west-1 on this list (1.792 and"
-        " 3.584), and that for SAM is g4dn.xlarge in us-west-2 (0.526). Here c6i in us-west-2 is cheaper for MPT. No"
-        " machine of 16 cores on this list costs the paper's 0.40. Spot prices are those of other days, so they differ"
-        " most.",
-        "## Ratios",
-        markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
-        "The paper's abstract says that the cost is up to 2.2 times lower. Over two on-demand machines its own prices"
-        " reach that, for all applications but MPT Home and MPT Cubicles. Over one on-demand machine none does: MPT"
-        " TwistyCool comes nearest, whose two spot machines cost less than those of MPT Home with half the cores.",
-        "## By machine type",
-        "USD an hour, and a month of 730 hours.",
-        markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
-        "![prices](table1.png)",
-        f"Two spot machines cost between {best.bills[2].of_single:.2f} ({best.type_name}) and "
-        f"{worst.bills[2].of_single:.2f} ({worst.type_name}) of what one on-demand machine costs: at best "
-        f"{best.times_cheaper:.1f} times less. They cost less as soon as the savings pass 50 %.",
-        "Sources: " + "; ".join(aws_prices().sources) + ". Spot = on-demand × (1 − savings); the advisor's savings are "
-        "averages in whole percent, and traffic and disks are not in the price.",
-    ]
-    return "\n\n".join(parts) + "\n"
+    text = text_of(
+        "table1",
+        regions=" and ".join(REGIONS),
+        applications=markdown_table(_HEAD, _application_rows(needed)),
+        ratios=markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
+        types=markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
+        least=best.bills[2].of_single,
+        best=best.type_name,
+        most=worst.bills[2].of_single,
+        worst=worst.type_name,
+        times=best.times_cheaper,
+        sources="; ".join(aws_prices().sources),
+    )
+    return f"{text}\n"
 
 
 def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:

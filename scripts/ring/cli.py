@@ -27,7 +27,7 @@ from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.faults import Cut, Kill, Roam
+from ring.faults import cut_from_text, kill_from_text, roam_from_text
 from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
 from ring.options import LIVE_S, Live, Options, RingPlane
@@ -176,9 +176,11 @@ def ring(
             out=_absolute(out),
             json=_absolute(json_file),
             pcap=_absolute(pcap),
-            cuts=tuple(Cut.from_text(text) for text in cut or ()),
-            roams=tuple(Roam.from_text(text) for text in roam or ()),
-            kills=tuple(Kill.from_text(text) for text in kill or ()),
+            faults=(
+                *map(cut_from_text, cut or ()),
+                *map(roam_from_text, roam or ()),
+                *map(kill_from_text, kill or ()),
+            ),
             lease_s=lease,
             keep=keep,
             cores=cores,

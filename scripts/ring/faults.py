@@ -1,140 +1,97 @@
-"""Faults of a run, as data: links cut, proxies that roam, processes killed; and the check that a path remains.
+"""Faults of a run, as a person writes them: links cut, proxies that roam, processes killed; and what is refused.
 
 Sans-I/O. All seconds count from the time at which the first message may be sent. An unknown switch, RIB or proxy raises
-``LocalError``.
+``LocalError``. A killed process is ``rib school``, by its domain or its switch, or ``switch nuc3``.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias, cast, get_args
+from typing import Final
 
 from gdp.errors import LocalError
+from lab.faults import Fault, FaultKind, broken_by, moments
 from lab.topology import Attachment, Topology
 
-KillRole = Literal["rib", "switch"]
-
-_SECONDS: Final = r"\d+(?:\.\d+)?"
-_WHEN: Final = rf"@({_SECONDS})(?:-({_SECONDS}))?\Z"
-_CUT: Final = re.compile(rf"([^@]+?)-([^@-]+){_WHEN}")
-_KILL: Final = re.compile(rf"({'|'.join(get_args(KillRole))}):([^@:]+){_WHEN}")
-_ROAM: Final = re.compile(rf"([^@:]+):([^@:]+)@({_SECONDS})\Z")
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """A link that goes down after ``after_s`` and, unless ``until_s`` is None, comes up again."""
-
-    a: str
-    b: str
-    after_s: float
-    until_s: float | None = None
-
-    @classmethod
-    def from_text(cls, text: str) -> Cut:
-        """Parse ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
-
-        Raises ``LocalError``: anything else, or a link that comes up before it goes down.
-        """
-        found = _CUT.match(text)
-        if found is None:
-            raise LocalError(
-                f"a cut is written like nuc2-nuc3@5, or nuc2-nuc3@5-20 (link, seconds after the start), not {text!r}"
-            )
-        return cls(found[1], found[2], *_when(text, found[3], found[4]))
-
-    @property
-    def target(self) -> frozenset[str]:
-        """Return the affected components, for comparison with other faults."""
-        return frozenset((self.a, self.b))
-
-    def __str__(self) -> str:
-        return f"{self.a}-{self.b}@{_span(self.after_s, self.until_s)}"
+CUT, ROAM = FaultKind.CUT, FaultKind.ROAM
+_KILLS: Final = {"rib": FaultKind.KILL_RIB, "switch": FaultKind.KILL_SWITCH}
+_SECONDS: Final = r"(\d+(?:\.\d+)?)"
+_SPAN: Final = rf"@{_SECONDS}(?:-{_SECONDS})?\Z"
+_CUT: Final = re.compile(rf"([^@]+?)-([^@-]+){_SPAN}")
+_KILL: Final = re.compile(rf"({'|'.join(_KILLS)}):([^@:]+){_SPAN}")
+_ROAM: Final = re.compile(rf"([^@:]+):([^@:]+)@{_SECONDS}\Z")
 
 
-@dataclass(frozen=True, slots=True)
-class Kill:
-    """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, restarted.
+def cut_from_text(text: str) -> Fault:
+    """Parse ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
 
-    ``of``: a switch; for a RIB its domain, or the switch to which it is attached.
+    Raises ``LocalError``: anything else, or a link that comes up before it goes down.
     """
-
-    role: KillRole
-    of: str
-    after_s: float
-    until_s: float | None = None
-
-    @classmethod
-    def from_text(cls, text: str) -> Kill:
-        """Parse ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
-
-        Raises ``LocalError``: anything else, or a process that restarts before it is killed.
-        """
-        found = _KILL.match(text)
-        if found is None:
-            raise LocalError(
-                "a kill is written like rib:school@8, switch:nuc3@10 or switch:nuc3@10-20 (domain of the RIB or name"
-                f" of the switch, seconds after the start), not {text!r}"
-            )
-        return cls(cast("KillRole", found[1]), found[2], *_when(text, found[3], found[4]))
-
-    @property
-    def target(self) -> frozenset[str]:
-        """Return the affected components, for comparison with other faults."""
-        return frozenset((f"{self.role}:{self.of}",))
-
-    def victims(self, topology: Topology) -> tuple[str, ...]:
-        """Return the switches at which a process of this role is killed."""
-        if self.role == "switch":
-            topology.domain_of(self.of)
-            return (self.of,)
-        ribs = topology.attached("rib")
-        found = tuple(at.switch for at in ribs if self.of in (at.switch, topology.domain_of(at.switch).label))
-        if not found:
-            known = ", ".join(dict.fromkeys(topology.domain_of(at.switch).label for at in ribs))
-            raise LocalError(f"no RIB {self.of}; there are those of {known}")
-        return found
-
-    def __str__(self) -> str:
-        return f"{self.role}:{self.of}@{_span(self.after_s, self.until_s)}"
+    found = _CUT.match(text)
+    if found is None:
+        raise LocalError(
+            f"a cut is written like nuc2-nuc3@5, or nuc2-nuc3@5-20 (link, seconds after the start), not {text!r}"
+        )
+    return Fault(CUT, (found[1], found[2]), *_span(found))
 
 
-@dataclass(frozen=True, slots=True)
-class Roam:
-    """A proxy whose cable moves to another switch after ``after_s``; ``who``: the proxy's device, such as ``robot``."""
+def kill_from_text(text: str) -> Fault:
+    """Parse ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
 
-    who: str
-    to: str
-    after_s: float
-
-    @classmethod
-    def from_text(cls, text: str) -> Roam:
-        """Parse ``robot:nuc3@10``. Raises ``LocalError``: anything else."""
-        found = _ROAM.match(text)
-        if found is None:
-            raise LocalError(f"roaming is written like robot:nuc3@10 (proxy, new switch, seconds), not {text!r}")
-        return cls(found[1], found[2], float(found[3]))
-
-    def proxy(self, topology: Topology) -> Attachment:
-        """Return the proxy that roams."""
-        proxies = topology.attached("proxy")
-        for at in proxies:
-            if at.ifname == self.who:
-                return at
-        raise LocalError(f"no proxy {self.who}; there are {', '.join(at.ifname for at in proxies)}")
-
-    def __str__(self) -> str:
-        return f"{self.who}:{self.to}@{self.after_s:g}"
+    Raises ``LocalError``: anything else, or a process that restarts before it is killed.
+    """
+    found = _KILL.match(text)
+    if found is None:
+        raise LocalError(
+            "a kill is written like rib:school@8, switch:nuc3@10 or switch:nuc3@10-20 (domain of the RIB or name"
+            f" of the switch, seconds after the start), not {text!r}"
+        )
+    return Fault(_KILLS[found[1]], (f"{found[1]} {found[2]}",), *_span(found))
 
 
-Fault: TypeAlias = "Cut | Kill | Roam"
+def roam_from_text(text: str) -> Fault:
+    """Parse ``robot:nuc3@10``: a proxy's device and its new switch. Raises ``LocalError``: anything else."""
+    found = _ROAM.match(text)
+    if found is None:
+        raise LocalError(f"roaming is written like robot:nuc3@10 (proxy, new switch, seconds), not {text!r}")
+    return Fault(ROAM, (found[1], found[2]), float(found[3]), float(found[3]))
 
 
-def roamers(faults: Iterable[Fault], topology: Topology) -> tuple[Attachment, ...]:
-    """Return the proxies that roam, each once."""
-    return tuple(dict.fromkeys(fault.proxy(topology) for fault in faults if isinstance(fault, Roam)))
+def _span(found: re.Match[str]) -> tuple[float, float]:
+    start_s, end_s = float(found[3]), float(found[4] or math.inf)
+    if end_s <= start_s:
+        raise LocalError(f"{found[0]}: it comes back before it goes")
+    return start_s, end_s
+
+
+def text_of(fault: Fault) -> str:
+    """Return a fault as it is written."""
+    what = "-".join(fault.targets) if fault.kind is CUT else ":".join(fault.targets).replace(" ", ":")
+    return f"{what}@{fault.start_s:g}" + (f"-{fault.end_s:g}" if fault.start_s < fault.end_s < math.inf else "")
+
+
+def victims(kill: Fault, topology: Topology) -> tuple[str, ...]:
+    """Return the switches at which a process is killed."""
+    _, _, of = kill.targets[0].partition(" ")
+    if kill.kind is FaultKind.KILL_SWITCH:
+        topology.domain_of(of)
+        return (of,)
+    domains = {at.switch: topology.domain_of(at.switch).label for at in topology.attached("rib")}
+    found = tuple(switch for switch, label in domains.items() if of in (switch, label))
+    if not found:
+        raise LocalError(f"no RIB {of}; there are those of {', '.join(dict.fromkeys(domains.values()))}")
+    return found
+
+
+def roamers(faults: Iterable[Fault], topology: Topology) -> dict[str, Attachment]:
+    """Return the proxies that roam, by their devices."""
+    known = {at.ifname: at for at in topology.attached("proxy")}
+    names = dict.fromkeys(fault.targets[0] for fault in faults if fault.kind is ROAM)
+    for name in names - known.keys():
+        raise LocalError(f"no proxy {name}; there are {', '.join(known)}")
+    return {name: known[name] for name in names}
 
 
 def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float | None) -> None:
@@ -147,75 +104,49 @@ def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float 
         LocalError: an unknown link, process or proxy; two simultaneous faults of one component; one that comes after
             the traffic; no path between the proxies after the last fault.
     """
+    roamers(faults, topology)
     for fault in faults:
-        if isinstance(fault, Cut):
-            topology.link(fault.a, fault.b)
-        elif isinstance(fault, Kill):
-            fault.victims(topology)
+        if fault.kind is CUT:
+            topology.link(*fault.targets)
+        elif fault.kind is ROAM:
+            topology.domain_of(fault.targets[1])
         else:
-            fault.proxy(topology)
-            topology.domain_of(fault.to)
-        last_s = fault.after_s if isinstance(fault, Roam) or fault.until_s is None else fault.until_s
+            victims(fault, topology)
+        last_s = fault.start_s if fault.end_s == math.inf else fault.end_s
         if duration_s is not None and last_s >= duration_s:
-            raise LocalError(f"{fault} comes too late: the traffic lasts {duration_s:g} s (--seconds)")
-    _refuse_overlaps([fault for fault in faults if not isinstance(fault, Roam)])
-    _refuse_parting(topology, faults)
+            raise LocalError(f"{text_of(fault)} comes too late: the traffic lasts {duration_s:g} s (--seconds)")
+    _refuse_overlaps([fault for fault in faults if fault.kind is not ROAM])
+    if faults:
+        _refuse_parting(topology, faults)
 
 
-def _refuse_overlaps(faults: Sequence[Cut | Kill]) -> None:
+def _refuse_overlaps(faults: Sequence[Fault]) -> None:
     for index, one in enumerate(faults):
         for other in faults[index + 1 :]:
-            first, second = sorted((one, other), key=lambda each: each.after_s)
-            if one.target == other.target and (first.until_s is None or second.after_s <= first.until_s):
-                raise LocalError(f"{second} comes before {first} is over")
+            first, second = sorted((one, other), key=lambda each: each.start_s)
+            if set(one.targets) == set(other.targets) and second.start_s <= first.end_s:
+                raise LocalError(f"{text_of(second)} comes before {text_of(first)} is over")
 
 
 def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
-    places = {at.ifname: at.switch for at in topology.attached("proxy")}
-    down: set[frozenset[str]] = set()
-    dead: set[str] = set()
-    newest: Fault | None = None
-    for _, fault, begins in moments(faults):
-        if isinstance(fault, Roam):
-            if places[fault.who] == fault.to:
-                raise LocalError(f"{fault}: {fault.who} is at {fault.to} already")
-            places[fault.who] = fault.to
-        elif isinstance(fault, Cut):
-            (down.add if begins else down.discard)(fault.target)
-        elif fault.role == "switch":
-            (dead.add if begins else dead.discard)(fault.of)
-        newest = fault
-    if newest is None:
-        return
-    for who, at in places.items():
-        if at in dead:
+    at = {each.ifname: each.switch for each in topology.attached("proxy")}
+    events = moments(faults)
+    for _, fault, begins in events:
+        if fault.kind is ROAM and begins:
+            who, to = fault.targets
+            if at[who] == to:
+                raise LocalError(f"{text_of(fault)}: {who} is at {to} already")
+            at[who] = to
+    broken = broken_by([fault for fault in faults if fault.end_s == math.inf], at)
+    for who, switch in at.items():
+        if switch in broken.switches:
             raise LocalError(
-                f"with switch {at} dead, {who} has no switch: let it roam before, or let the switch come back"
-                f" (switch:{at}@10-20)"
+                f"with switch {switch} dead, {who} has no switch: let it roam before, or let the switch come back"
+                f" (switch:{switch}@10-20)"
             )
-    (one, here), (other, there) = places.items()
-    if there not in topology.reached(here, down=down, dead=dead):
+    (one, here), (other, there) = at.items()
+    if there not in topology.reached(here, down=broken.links, dead=broken.switches):
         raise LocalError(
-            f"after {newest} no way is left from {one} at {here} to {other} at {there}: let something come back"
-            " (nuc2-nuc3@5-20)"
+            f"after {text_of(events[-1][1])} no way is left from {one} at {here} to {other} at {there}: let something"
+            " come back (nuc2-nuc3@5-20)"
         )
-
-
-def moments(faults: Iterable[Fault]) -> list[tuple[float, Fault, bool]]:
-    """Return the fault events in order of time, as (seconds, fault, whether it begins)."""
-    found = [(fault.after_s, fault, True) for fault in faults]
-    found += [
-        (fault.until_s, fault, False) for fault in faults if not isinstance(fault, Roam) and fault.until_s is not None
-    ]
-    return sorted(found, key=lambda each: each[0])
-
-
-def _when(text: str, after: str, until: str | None) -> tuple[float, float | None]:
-    after_s, until_s = float(after), None if until is None else float(until)
-    if until_s is not None and until_s <= after_s:
-        raise LocalError(f"{text}: it comes back before it goes")
-    return after_s, until_s
-
-
-def _span(after_s: float, until_s: float | None) -> str:
-    return f"{after_s:g}" if until_s is None else f"{after_s:g}-{until_s:g}"

@@ -9,9 +9,10 @@ from typing import Final, Literal
 
 from gdp.errors import LocalError
 from gdp.intervals import ADVERTISEMENT, LEASE_MAX_S, LEASE_MIN_S
+from lab.faults import Fault
 from lab.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
-from ring.faults import Cut, Fault, Kill, Roam, check_faults
+from ring.faults import CUT, ROAM, check_faults, text_of
 from ring.nodes.content import CAMERA_HZ
 
 RingPlane = Literal["auto", "kernel", "raw", "scapy"]
@@ -50,9 +51,7 @@ class Options:
     out: Path | None = None
     json: Path | None = None
     pcap: Path | None = None
-    cuts: tuple[Cut, ...] = ()
-    roams: tuple[Roam, ...] = ()
-    kills: tuple[Kill, ...] = ()
+    faults: tuple[Fault, ...] = ()
     keep: bool = False
     cores: bool = False
     wide: bool = False
@@ -88,11 +87,6 @@ class Options:
         check_faults(self.topology(), self.faults, self.live_s if self.live is not None else self.seconds)
 
     @property
-    def faults(self) -> tuple[Fault, ...]:
-        """Return all requested faults."""
-        return (*self.cuts, *self.roams, *self.kills)
-
-    @property
     def live_s(self) -> float:
         """Return the seconds of live traffic."""
         return LIVE_S if self.seconds is None else self.seconds
@@ -111,7 +105,7 @@ class Options:
             "mtu": self.mtu,
             "cores": self.cores,
             "lease_s": self.lease_s,
-            "cuts": [str(cut) for cut in self.cuts],
-            "roams": [str(roam) for roam in self.roams],
-            "kills": [str(kill) for kill in self.kills],
+            "cuts": [text_of(each) for each in self.faults if each.kind is CUT],
+            "roams": [text_of(each) for each in self.faults if each.kind is ROAM],
+            "kills": [text_of(each) for each in self.faults if each.kind not in (CUT, ROAM)],
         }

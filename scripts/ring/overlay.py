@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Final, Literal
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from lab.credentials import OverlayCredentials
+from lab.faults import Fault, FaultKind, moments
 from lab.machines import Lab, OverlayNodes
 from lab.process import LabProcess
 from lab.supervisor import READY_S, Supervisor
-from ring.faults import Cut, Fault, Kill, Roam, moments, roamers
+from ring.faults import CUT, ROAM, roamers, text_of, victims
 from ring.options import Options
 from ring.progress import ProgressReporter
 
@@ -40,14 +41,14 @@ class Overlay:
         self.supervisor = Supervisor()
         reporter.step(f"run {run.id}: five namespaces, keys and certificates")
         self.lab = Lab(run, self.topology, dies_with_us=not options.keep)
-        roaming = roamers(options.faults, self.topology)
-        for at in roaming:
+        self._roamers = roamers(options.faults, self.topology)
+        for at in self._roamers.values():
             self.lab.namespaces.connect_device(at.switch, at.ifname, at.switch)
         self.credentials = OverlayCredentials(
             self.topology,
             run.directory,
             metrics=options.keep,
-            roamers=roaming,
+            roamers=self._roamers.values(),
             lease_s=options.lease_s,
             uplink={"data_plane": "scapy"} if options.data_plane == "scapy" else None,
         )
@@ -98,28 +99,31 @@ class Overlay:
 
     def inject(self, fault: Fault, *, begins: bool) -> None:
         """Begin a fault, or end it. Raises ``LocalError``: the kernel refuses."""
-        namespaces = self.lab.namespaces
-        if isinstance(fault, Cut):
-            (namespaces.cut if begins else namespaces.restore_link)(fault.a, fault.b)
-            self.reporter.step(f"cut {fault.a}-{fault.b}" if begins else f"{fault.a}-{fault.b} is back")
-        elif isinstance(fault, Roam):
-            home = fault.proxy(self.topology).switch
-            namespaces.unplug(home, fault.who)
-            namespaces.connect_device(home, fault.who, fault.to)
-            self.reporter.step(f"{fault.who} moved to {fault.to}")
-        else:
+        namespaces, targets = self.lab.namespaces, fault.targets
+        if fault.kind is CUT:
+            (namespaces.cut if begins else namespaces.restore_link)(*targets)
+            link = "-".join(targets)
+            self.reporter.step(f"cut {link}" if begins else f"{link} is back")
+        elif fault.kind is not ROAM:
             self._kill(fault, begins=begins)
+        elif begins:
+            who, to = targets
+            home = self._roamers[who].switch
+            namespaces.unplug(home, who)
+            namespaces.connect_device(home, who, to)
+            self.reporter.step(f"{who} moved to {to}")
 
-    def _kill(self, kill: Kill, *, begins: bool) -> None:
+    def _kill(self, kill: Fault, *, begins: bool) -> None:
         """Kill a switch, or the RIBs of a domain, or start them again."""
-        what = f"{kill.role} of {kill.of}" if kill.role == "rib" else f"{kill.role} {kill.of}"
-        for node in kill.victims(self.topology):
+        role: Literal["rib", "switch"] = "rib" if kill.kind is FaultKind.KILL_RIB else "switch"
+        what = kill.targets[0].replace("rib ", "rib of ")
+        for node in victims(kill, self.topology):
             if begins:
-                process = self.nodes.running[kill.role, node]
+                process = self.nodes.running[role, node]
                 self.supervisor.release(process)
                 process.kill_group()
                 continue
-            process = self.nodes.start(kill.role, node, *(_RIB_WORDS if kill.role == "rib" else ()))
+            process = self.nodes.start(role, node, *(_RIB_WORDS if role == "rib" else ()))
             self.supervisor.expect(process, lambda _: self.reporter.step(f"{what} is back"))
         if begins:
             self.reporter.step(f"killed {what}")
@@ -147,7 +151,7 @@ class Injection:
     def stop(self) -> list[str]:
         """Stop the injection; return, as complaints, the faults that came too late."""
         self._supervisor.meanwhile = lambda: math.inf
-        return [f"{fault} came too late: the traffic was over" for _, fault, begins in self._moments if begins]
+        return [f"{text_of(fault)} came too late: the traffic was over" for _, fault, begins in self._moments if begins]
 
     def _go_on(self) -> float:
         """Inject what is due; return the seconds until the next moment."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from lab.command import StepDisplay
 
 _PLAIN_EVERY_S: Final = 2.0
+_RATED_S: Final = 0.4  # both sides report twice a second; a rate over a shorter time would fluctuate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,52 +48,31 @@ class Traffic:
         return words + "".join(f"  {flow} silent for {seconds:.0f} s" for flow, seconds in self.silent)
 
 
-class ProgressReporter:
+class ProgressReporter(StepDisplay):
     """Reports steps and traffic; ``console``: on standard error."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bar: Progress | None = None
-        self._task = TaskID(0)
-        self._reported = Traffic()
-        self._reported_s = time.monotonic()
-        self._began_s = self._reported_s
-
-    def __enter__(self) -> ProgressReporter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.end_traffic()
-
-    def step(self, text: str) -> None:
-        """Report the present step."""
-        at = f"[dim]{time.monotonic() - self._began_s:6.1f} s[/dim]"
-        self._console.print(f"{at}  {text}", highlight=False, soft_wrap=True)
+        super().__init__(console, is_kept=False, plain_every_s=_PLAIN_EVERY_S)
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
+        self._bar = Progress(*columns)
+        self._task = self._bar.add_task("", words="")
+        self._rated, self._rated_s = Traffic(), time.monotonic()
 
     def begin_traffic(self, total: int) -> None:
         """Begin the report of ``total`` messages."""
-        self._reported, self._reported_s = Traffic(total=total), time.monotonic()
-        if self._console.is_terminal:
-            columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
-            self._bar = Progress(*columns, console=self._console, transient=True)
-            self._task = self._bar.add_task("", total=total, words="")
-            self._bar.start()
+        self._rated, self._rated_s = Traffic(total=total), time.monotonic()
+        self._bar.reset(self._task, total=total, words="")
 
     def traffic(self, now: Traffic) -> None:
         """Report the traffic so far; plain lines come at most every two seconds."""
-        elapsed_s = time.monotonic() - self._reported_s
-        if self._bar is not None:
-            if elapsed_s >= 0.4:  # both sides report twice a second; a rate over a shorter time would fluctuate
-                self._bar.update(
-                    self._task, completed=now.received, words=now.words(now.rate(self._reported, elapsed_s))
-                )
-                self._reported, self._reported_s = now, time.monotonic()
-        elif elapsed_s >= _PLAIN_EVERY_S:
-            self.step(f"{now.received}/{now.total}  {now.words(now.rate(self._reported, elapsed_s))}")
-            self._reported, self._reported_s = now, time.monotonic()
+        elapsed_s = time.monotonic() - self._rated_s
+        if elapsed_s >= _RATED_S:
+            words = now.words(now.rate(self._rated, elapsed_s))
+            self._rated, self._rated_s = now, time.monotonic()
+            self._bar.update(self._task, completed=now.received, words=words)
+            self._show(self._bar.get_renderable(), Text(f"{now.received}/{now.total}  {words}"))
 
     def end_traffic(self) -> None:
         """Remove the bar."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        if self._live is not None:
+            self._live.stop()

@@ -16,7 +16,6 @@ from typing import Final
 from faults.accounts import Books, Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
-from faults.schedule import Fault, FaultKind, broken_by
 
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
@@ -24,10 +23,11 @@ from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.right import Right
+from lab.faults import Fault, FaultKind, broken_by, links_of
 from lab.network import SimLink
 from lab.process import FailedError
 from lab.simulation import Simulation
-from lab.topology import Attachment, DomainPlan, Topology, ends_of
+from lab.topology import Attachment, DomainPlan, Topology
 
 __all__ = ["SIMULATED", "SimulatedChaos"]
 
@@ -124,6 +124,11 @@ class SimulatedChaos:
         found = self._continuity.broken_promises(begun_ns, last_ns, end_ns, limit_s, well_s)
         return [*found, *sorted(set(self.books.wrong)), *self.books.incomplete(self._is_last_life, end_ns - _ns(2.0))]
 
+    def silences(self, above_s: float) -> list[float]:
+        """Return the longer silences of connected ends from the first fault on, in seconds."""
+        found = self._continuity.silences(_ns(self.begun_s), _ns(self._end_s), above_s)
+        return [each.seconds for each in found]
+
     def _is_last_life(self, member: str, incarnation: int) -> bool:
         return incarnation == self._incarnations[member]
 
@@ -194,8 +199,7 @@ class SimulatedChaos:
 
     def _set_links(self, fault: Fault, *, up: bool) -> None:
         """Cut or restore what a cut or a partition takes down."""
-        links = [fault.targets] if fault.kind is FaultKind.CUT else [ends_of(link) for link in fault.targets[1:]]
-        for ends in links:
+        for ends in links_of(fault):
             self.world.network.set_link(self._cable(*ends), up=up)
 
     def _node(self, who: str) -> str:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 from faults.accounts import Books, Timeline
-from faults.plan import VICTIM, Broken, Flow, Oracle, Plan, Service, random_network
+from faults.plan import VICTIM, Flow, Oracle, Plan, Service, random_network
 from faults.records import Kind, Record, RecordReader, RecordWriter
-from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
+from faults.schedule import STRUCTURAL, make_schedule
 from faults.store import critical_lines, snapshot_faults
 
 from gdp.message.loss import LossReason
+from lab.faults import Broken, Fault, FaultKind, broken_by
 from lab.topology import make_topology
 
 SEEDS = range(1, 9)

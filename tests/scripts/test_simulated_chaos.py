@@ -10,8 +10,9 @@ from typing import Final
 
 import pytest
 from faults.plan import random_network
-from faults.schedule import Fault, make_schedule
+from faults.schedule import make_schedule
 
+from lab.faults import Fault
 from tests.draws import IS_LONG, TIMES
 from tests.insiders.oracle import signing_oracle
 from tests.scripts.simulated_chaos import SIMULATED, SimulatedChaos

@@ -110,7 +110,7 @@ class KernelPlane(RawPlane):
         """Return frames and bytes that the kernel forwarded by the busiest entries. Safe in any thread."""
         return self._mirror.counts(most)
 
-    def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
+    def poll(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Renew the lease of the program and read its counts when due; then as ``Plane.poll``."""
         if self._loaded.is_leased:
             timeout_s = _FILTER.refresh_s if timeout_s is None else min(timeout_s, _FILTER.refresh_s)

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from faults.plan import Broken, Oracle, Plan
+from faults.plan import Oracle, Plan
 from faults.records import Kind, Record
 from gdp.message.loss import LossReason
+from lab.faults import Broken
 
 UNCONFIRMED_S: Final = 2.0  # the publisher may count a message as lost that came so shortly before a reader's death
 _SECOND_NS: Final = 1_000_000_000

@@ -18,6 +18,7 @@ from typing import Final
 from pyroute2 import IPRoute
 from report import progress
 
+from faults.accounts import Books
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
@@ -33,11 +34,20 @@ from gdp.stores.keyring import load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
+from lab.faults import STORE, Fault, FaultKind, links_of
 from lab.machines import Lab
 from lab.namespaces import received, set_link
-from lab.process import FailedError, LabProcess, end_processes
+from lab.process import FailedError, LabProcess, end_processes, until
 
 READY_S: Final = 60.0
+LOOK_S: Final = 0.1
+KILLS: Final = frozenset({FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER})
+FRAMES: Final = {
+    FaultKind.SILENT: FrameFaults(lost=1.0),
+    FaultKind.LOSS: FrameFaults(lost=0.05),
+    FaultKind.DOUBLED: FrameFaults(doubled=0.2),
+    FaultKind.REORDERED: FrameFaults(delayed=0.2, delay_s=0.02),
+}
 JOURNAL_MIB: Final = 64  # about two hours of a switch, or what it takes in a minute of chaos
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 
@@ -59,6 +69,7 @@ class Overlay:
         incarnation_ids: how often each process was started.
         at: the switch that each member, or switch that moves, is plugged into.
         spaces: the namespaces, in which links can be cut.
+        books: what the members have recorded, as far as ``watch`` has read it.
 
     Raises:
         LocalError: the kernel refuses.
@@ -88,6 +99,7 @@ class Overlay:
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = self._lab.namespaces
+        self.books = Books(plan)
         self._credentials = OverlayCredentials(plan.topology, run.directory)
         self._clocks: dict[str, Clock] = {}
         if has_clocks:
@@ -119,6 +131,52 @@ class Overlay:
             *(f"member {node}" for node in self.plan.members),
         ]
 
+    # faults
+
+    def begin(self, fault: Fault) -> None:
+        """Make a fault happen. Raises ``FailedError``: a process that it restarts does not come up."""
+        kind, targets = fault.kind, fault.targets
+        if kind in FRAMES:
+            self.disturb(targets[0], targets[1], FRAMES[kind])
+        elif kind in KILLS:
+            self.kill(targets[0])
+        elif kind is FaultKind.FREEZE:
+            self.freeze(targets[0])
+        elif kind is FaultKind.CLOCK:
+            self.step_clock(targets[0], fault.amount)
+        elif kind is FaultKind.ROAM:
+            self.move(*targets)
+        elif kind is FaultKind.REVOKE:
+            self.revoke(targets[0])
+        elif kind is FaultKind.DISK_FULL and self.disk is not None:
+            self.disk.fill()
+            for rib in targets[1:]:
+                self.kill(rib)
+                self.restart(rib)
+        elif self.store is not None and targets[0] == STORE:
+            is_kill, is_primary = kind is not FaultKind.FREEZE_PRIMARY, kind is not FaultKind.KILL_REPLICA
+            progress(f"           {self.store.take(fault, is_kill=is_kill, is_primary=is_primary)}")
+        for link in links_of(fault):
+            self.spaces.cut(*link)
+
+    def end(self, fault: Fault) -> None:
+        """Undo a fault that can be undone; a killed process is ready then. Raises as ``begin``."""
+        kind, targets = fault.kind, fault.targets
+        if kind in FRAMES:
+            self.calm(*targets)
+        elif kind in KILLS:
+            self.restart(targets[0])
+        elif kind is FaultKind.FREEZE:
+            self.thaw(targets[0])
+        elif kind is FaultKind.CLOCK:
+            self.step_clock(targets[0], 0.0)
+        elif kind is FaultKind.DISK_FULL and self.disk is not None:
+            self.disk.free()
+        elif self.store is not None and targets[0] == STORE:
+            self.store.give_back(fault)
+        for link in links_of(fault):
+            self.spaces.restore_link(*link)
+
     # processes
 
     def start_all(self) -> None:
@@ -143,6 +201,13 @@ class Overlay:
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self.processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
+
+    def restart(self, *names: str) -> None:
+        """Start processes, and read records until each is ready: it joins the network then."""
+        for who in names:
+            self.start(who)
+        for who in names:
+            until(partial(self.processes[who].has_line, 0.0), who, READY_S, lambda: self.watch(LOOK_S))
 
     def kill(self, who: str) -> None:
         """Kill a process at once (SIGKILL)."""
@@ -175,15 +240,23 @@ class Overlay:
                 self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
             yield incarnation_id, self._records[member, incarnation_id].read()
 
-    def new_records(self, member: str) -> Iterator[Record]:
-        """Yield what all incarnations of a member recorded since the last call.
+    def watch(self, seconds: float, *, is_strict: bool = False) -> None:
+        """Read into the books what members record, for so long.
 
-        Raises ``FailedError``: a process ended by itself.
+        Raises ``FailedError``: with ``is_strict``, a process ended by itself, or a member had a message of another.
         """
-        for who in self.died():
-            raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
-        for _, records in self.read(member):
-            yield from records
+        end_s = time.monotonic() + seconds
+        while True:
+            for who in self.died() if is_strict else ():
+                raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
+            for member in self.plan.members:
+                for incarnation_id, records in self.read(member):
+                    self.books.take(member, incarnation_id, records)
+            if is_strict and self.books.wrong:
+                raise FailedError(self.books.wrong[0])
+            if (left_s := end_s - time.monotonic()) <= 0:
+                return
+            time.sleep(min(LOOK_S, left_s))
 
     def log_tail(self, who: str, lines: int = 15) -> str:
         """Return the end of a process's log, of its latest incarnation."""

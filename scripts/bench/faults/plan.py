@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from lab.faults import Broken
 from lab.topology import Link, Topology, make_topology
 
 
@@ -167,16 +168,6 @@ def _members(domains: dict[str, tuple[str, ...]], chance: random.Random) -> dict
 def _homes(home: str, everywhere: list[str], chance: random.Random) -> tuple[str, ...]:
     others = [switch for switch in everywhere if switch != home]
     return (home, *chance.sample(others, _HOMES - 1))
-
-
-@dataclass(slots=True)
-class Broken:
-    """State of the faults: switches, links (both ends) and members that do not work; locations of moved members."""
-
-    switches: set[str] = field(default_factory=set)
-    links: set[frozenset[str]] = field(default_factory=set)
-    members: set[str] = field(default_factory=set)
-    at: dict[str, str] = field(default_factory=dict)
 
 
 class Oracle:

@@ -9,34 +9,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Final
 
-from faults.plan import VICTIM, Broken, Oracle, Plan
-
-
-class FaultKind(Enum):
-    """Kind of a fault."""
-
-    CUT = "link cut"
-    SILENT = "link silent"
-    LOSS = "5 % loss"
-    DOUBLED = "frames doubled"
-    REORDERED = "frames reordered"
-    KILL_SWITCH = "switch killed"
-    KILL_RIB = "RIB killed"
-    KILL_MEMBER = "member killed"
-    FREEZE = "process frozen"
-    CLOCK = "clock stepped"
-    REVOKE = "membership revoked"
-    PARTITION = "partition"
-    ROAM = "member moved"
-    DISK_FULL = "disk full"
-    KILL_PRIMARY = "primary killed"
-    KILL_REPLICA = "replica killed"
-    FREEZE_PRIMARY = "primary frozen"
-
+from faults.plan import VICTIM, Oracle, Plan
+from lab.faults import STORE, Fault, FaultKind, broken_by
 
 STRUCTURAL: Final = frozenset({FaultKind.CUT, FaultKind.SILENT, FaultKind.KILL_SWITCH})
 _WEIGHTS: Final = {
@@ -46,7 +22,6 @@ _WEIGHTS: Final = {
     FaultKind.KILL_PRIMARY: 2, FaultKind.KILL_REPLICA: 1, FaultKind.FREEZE_PRIMARY: 2,
 }  # fmt: skip
 DISK: Final = "the disk"
-STORE: Final = "the store"
 _OF_STORE: Final = frozenset({FaultKind.KILL_PRIMARY, FaultKind.KILL_REPLICA, FaultKind.FREEZE_PRIMARY})
 _STORE_LEAST_S: Final = 3.0  # a replica takes over within two seconds: a shorter fault would end in the middle of that
 _SERVERS: Final = 3  # number of servers of a role
@@ -55,46 +30,6 @@ _CLOCK_STEP_S: Final = 300.0
 _PACE_S: Final = 2.0  # mean time between the starts of two faults
 _FIRST_S: Final = 1.0
 _TRIES: Final = 40
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One fault: ``targets`` are a process (``switch s1``), the two ends of a link, or a mover and its new switch.
-
-    ``start_s``, ``end_s``: from the start of the run; a fault without an end of its own ends at its start. ``amount``:
-    seconds of a clock step; the index of the server of the store, among those of the role.
-    """
-
-    kind: FaultKind
-    targets: tuple[str, ...]
-    start_s: float
-    end_s: float
-    amount: float = 0.0
-
-    def __str__(self) -> str:
-        amount = f" {self.amount:+g} s" if self.kind is FaultKind.CLOCK else ""
-        return f"{self.start_s:7.2f}-{self.end_s:7.2f} s  {self.kind.value}{amount}: {', '.join(self.targets)}"
-
-
-def broken_by(faults: Sequence[Fault], at: dict[str, str]) -> Broken:
-    """Return what does not work while these faults are active."""
-    broken = Broken(at=dict(at))
-    for fault in faults:
-        if fault.kind in (FaultKind.CUT, FaultKind.SILENT):
-            broken.links.add(frozenset(fault.targets))
-        elif fault.kind is FaultKind.PARTITION:
-            broken.links |= {frozenset(each.split("-")) for each in fault.targets[1:]}
-        elif fault.kind is FaultKind.KILL_SWITCH:
-            broken.switches.add(fault.targets[0].split()[1])
-        elif fault.kind in (FaultKind.KILL_MEMBER, FaultKind.FREEZE):
-            role, _, node = fault.targets[0].partition(" ")
-            if role == "member":
-                broken.members.add(node)
-            elif role == "switch":
-                broken.switches.add(node)
-        elif fault.kind is FaultKind.REVOKE:
-            broken.members.add(fault.targets[0])
-    return broken
 
 
 def make_schedule(

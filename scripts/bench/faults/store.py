@@ -23,6 +23,7 @@ from redis.exceptions import RedisError
 from gdp.host import netns_files
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
+from lab.faults import Fault, FaultKind
 from lab.machine import LabMachine
 from lab.namespaces import Namespace, Namespaces, add_address, add_bridge, set_link
 from lab.process import until
@@ -73,34 +74,32 @@ class StoreCluster:
         self._program = program
         for number in self._servers:
             run.note_process(self._pid(number))
-        self._away: dict[str, int] = {}  # killed or frozen servers, by name
+        self._away: dict[Fault, int] = {}  # killed or frozen servers
 
     @property
     def config(self) -> Mapping[str, object]:
         """Return the keys of a RIB's file that make it use the cluster."""
         return dict(self._config)
 
-    def kill(self, fault: str, *, is_primary: bool, choice: int) -> str:
-        """Kill (SIGKILL) a replica, or a primary that has a replica in step; return which."""
-        return self._take(fault, signal.SIGKILL, is_primary=is_primary, choice=choice)
+    def take(self, fault: Fault, *, is_kill: bool, is_primary: bool) -> str:
+        """Kill or stop a replica, or a primary that has a replica in step; return which."""
+        fit = until(lambda: self._fit(is_primary=is_primary), lambda: "a whole store after a fault", _WHOLE_S)
+        server = self._away[fault] = fit[round(fault.amount) % len(fit)]
+        os.kill(self._pid(server), signal.SIGKILL if is_kill else signal.SIGSTOP)
+        return f"server {server}"
 
-    def freeze(self, fault: str, *, choice: int) -> str:
-        """Stop a primary that has a replica in step (SIGSTOP); return which."""
-        return self._take(fault, signal.SIGSTOP, is_primary=True, choice=choice)
-
-    def restart(self, fault: str) -> None:
-        """Restart a killed server. Raises ``FailedError``: it does not start."""
+    def give_back(self, fault: Fault) -> None:
+        """Continue a stopped server, or restart a killed one. Raises ``FailedError``: it does not start."""
         number = self._away.pop(fault)
+        if fault.kind is FaultKind.FREEZE_PRIMARY:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid(number), signal.SIGCONT)
+            return
         folder = self._folder / str(number)
         (folder / "server.pid").unlink(missing_ok=True)
         LabMachine(folder, self._enter).output(self._program, "server.conf")
         until(lambda: self._role(number) is not None, lambda: f"an answer of server {number} of the store", _WHOLE_S)
         self._run.note_process(self._pid(number))
-
-    def thaw(self, fault: str) -> None:
-        """Continue a frozen server."""
-        with suppress(ProcessLookupError):
-            os.kill(self._pid(self._away.pop(fault)), signal.SIGCONT)
 
     def complaints(self) -> list[str]:
         """Return which servers said in their log that they lost data."""
@@ -111,12 +110,6 @@ class StoreCluster:
         for number in self._servers:
             with suppress(FileNotFoundError, ProcessLookupError):
                 os.kill(self._pid(number), signal.SIGKILL)
-
-    def _take(self, fault: str, number: signal.Signals, *, is_primary: bool, choice: int) -> str:
-        fit = until(lambda: self._fit(is_primary=is_primary), lambda: "a whole store after a fault", _WHOLE_S)
-        server = self._away[fault] = fit[choice % len(fit)]
-        os.kill(self._pid(server), number)
-        return f"server {server}"
 
     def _fit(self, *, is_primary: bool) -> list[int]:
         """Return the servers of this role; only those that another server could replace, or that replace none yet."""

@@ -32,6 +32,7 @@ from peers.jsonl import say
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
+from gdp.ports.sockets import kernel_drops
 from thin_link.channel import Channel
 from thin_link.conditions import Direction
 
@@ -160,7 +161,7 @@ class _Relay:
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
-            kernel_drops=sum(_kernel_drops(way.source) for way in self._ways),
+            kernel_drops=sum(kernel_drops(way.source) for way in self._ways),
             late_us=self._late_us(0.99),
             **sides,
         )
@@ -174,11 +175,6 @@ class _Relay:
             if left <= 0:
                 return (bucket + 1) * _BUCKET_NS / 1e3 if count else 0.0
         return _BUCKETS * _BUCKET_NS / 1e3
-
-
-def _kernel_drops(source: socket.socket) -> int:
-    """Return the frames that found the socket's buffer full since the last call."""
-    return int.from_bytes(source.getsockopt(_SOL_PACKET, 6, 8)[4:8], sys.byteorder)  # PACKET_STATISTICS
 
 
 def _open(device: str) -> socket.socket:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.message.receipts import ReceiptCheck, samples_of, sum_of_samples
+from gdp.burst import samples
+from gdp.message.receipts import ReceiptCheck
 
 FLIGHT = 40
 
@@ -32,7 +33,7 @@ class Reader:
     def flight(self, loss: float, lateness: float = 0.0, repaired: float = 0.0) -> tuple[int, int]:
         """Send frames; return how many of them, and how many were lost."""
         frames = [self.random.randbytes(40) for _ in range(FLIGHT)]
-        self.check.sent(samples_of(frames, self.sent + 1), is_repair=False)
+        self.check.sent(samples(frames, 0, FLIGHT), self.sent + 1, is_repair=False)
         self.sent += len(frames)
         came, lost = [*self.late], list[bytes]()
         self.late.clear()
@@ -42,8 +43,8 @@ class Reader:
             else:
                 lost.append(frame)
         again = [frame for frame in lost if self.random.random() < repaired]
-        self.check.sent(samples_of(again), is_repair=True)
-        self.total += sum_of_samples([*came, *again])
+        self.check.sent(samples(again, 0, len(again)), 0, is_repair=True)
+        self.total += sum(seal for _, seal in samples([*came, *again], 0, 2 * FLIGHT))
         return len(frames), len(lost) + len(self.late)
 
     def judged(self, frames: int, lost: int) -> int:

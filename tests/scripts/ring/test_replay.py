@@ -14,7 +14,7 @@ from gdp.host.run_registry import Run, RunRegistry
 from lab.process import FailedError, LabProcess
 from lab.supervisor import Supervisor
 from ring import run as replay_module
-from ring.faults import Cut
+from ring.faults import cut_from_text, text_of
 from ring.overlay import Injection
 from ring.progress import ProgressReporter
 from ring.run import Replay, Report
@@ -110,8 +110,8 @@ def test_a_process_that_does_not_answer_in_time_is_reported(run: Run) -> None:
 
 def test_faults_are_injected_at_their_seconds_and_those_that_come_too_late_are_complaints(run: Run) -> None:
     supervisor, injected = Supervisor(), list[str]()
-    cuts = [Cut.from_text("a-b@0-0.05"), Cut.from_text("a-c@60")]
-    injection = Injection(supervisor, cuts, lambda fault, begins: injected.append(f"{fault} {begins}"))
+    cuts = [cut_from_text("a-b@0-0.05"), cut_from_text("a-c@60")]
+    injection = Injection(supervisor, cuts, lambda fault, begins: injected.append(f"{text_of(fault)} {begins}"))
     supervisor.follow((), lambda: len(injected) == 2, patience_s=10)
     assert injected == ["a-b@0-0.05 True", "a-b@0-0.05 False"]
     assert injection.stop() == ["a-c@60 came too late: the traffic was over"]

@@ -1,0 +1,423 @@
+/* Burst core, frames: received into slots by one recvmmsg, read there without a copy, and sent by one sendmmsg.
+ *
+ * A slot holds a frame from its Ethernet header on.
+ */
+#include "core.h"
+#include <errno.h>
+#include <linux/sockios.h>
+#include <string.h>
+#include <sys/ioctl.h>
+#include <sys/socket.h>
+#include <time.h>
+
+enum {
+    AT_ONCE = 128, /* frames of one system call */
+    FRAME = 2,     /* place of the bytes in a ReceivedFrame */
+    SEAL_END = 9,  /* bytes from the end of a frame: the seal that a sample adds, and the byte that makes it one */
+    SAMPLE_BITS = 0x3f,
+};
+
+static const double WAITED_MOST_S = 10.0; /* beyond that the system clock was set */
+static PyTypeObject *received_frame;      /* ReceivedFrame, a named tuple */
+static PyTypeObject *arrivals_type;
+
+/* Puts a new reference into a new tuple; returns 0 if there is none. */
+static int put_item(PyObject *tuple, Py_ssize_t at, PyObject *item)
+{
+    return item != NULL && PyTuple_SetItem(tuple, at, item) == 0;
+}
+
+static PyObject *same(PyObject *object)
+{
+    Py_XINCREF(object);
+    return object;
+}
+
+/* Returns a ReceivedFrame of a slot. ``mac``: of the frame before; the same sender's is used again. */
+static PyObject *read_slot(const char *slot, Py_ssize_t size, PyObject *port, PyObject *waited_s, PyObject **mac)
+{
+    if (*mac == NULL || memcmp(PyBytes_AsString(*mac), slot + MAC, MAC)) {
+        Py_XDECREF(*mac);
+        *mac = PyBytes_FromStringAndSize(slot + MAC, MAC);
+    }
+    allocfunc allocate = (allocfunc)PyType_GetSlot(received_frame, Py_tp_alloc);
+    PyObject *arrival = allocate(received_frame, 4);
+    if (arrival != NULL && put_item(arrival, 0, same(port)) && put_item(arrival, 1, same(*mac)) &&
+        put_item(arrival, FRAME, PyBytes_FromStringAndSize(slot + ETHER, size)) && put_item(arrival, 3, same(waited_s)))
+        return arrival;
+    Py_XDECREF(arrival);
+    return NULL;
+}
+
+/* ---- frames that one system call received, in the pool of slots where the kernel wrote them ---- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *pool, *port, *waited_s, *mac;
+    Py_ssize_t slot_bytes, count;
+    int sizes[AT_ONCE]; /* after the Ethernet headers */
+} Arrivals;
+
+static const char *slot_of(const Arrivals *self, Py_ssize_t at)
+{
+    return PyByteArray_AsString(self->pool) + at * self->slot_bytes;
+}
+
+static void arrivals_free(Arrivals *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    Py_XDECREF(self->pool);
+    Py_XDECREF(self->port);
+    Py_XDECREF(self->waited_s);
+    Py_XDECREF(self->mac);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static Py_ssize_t arrivals_length(Arrivals *self)
+{
+    return self->count;
+}
+
+static PyObject *arrivals_item(Arrivals *self, Py_ssize_t at)
+{
+    if (at < 0 || at >= self->count) {
+        PyErr_SetString(PyExc_IndexError, "fewer frames arrived");
+        return NULL;
+    }
+    return read_slot(slot_of(self, at), self->sizes[at], self->port, self->waited_s, &self->mac);
+}
+
+static PyObject *arrivals_subscript(Arrivals *self, PyObject *key)
+{
+    Py_ssize_t begin, end, step;
+    if (!PySlice_Check(key)) {
+        Py_ssize_t at = PyNumber_AsSsize_t(key, PyExc_IndexError);
+        return at == -1 && PyErr_Occurred() ? NULL : arrivals_item(self, at < 0 ? at + self->count : at);
+    }
+    if (PySlice_Unpack(key, &begin, &end, &step) < 0)
+        return NULL;
+    Py_ssize_t count = PySlice_AdjustIndices(self->count, &begin, &end, step);
+    PyObject *list = PyList_New(count);
+    for (Py_ssize_t each = 0; list != NULL && each < count; each++) {
+        PyObject *arrival = arrivals_item(self, begin + each * step);
+        if (arrival == NULL || PyList_SetItem(list, each, arrival) < 0)
+            Py_CLEAR(list);
+    }
+    return list;
+}
+
+Frame *frames_of(PyObject *arrivals, Py_ssize_t at, Py_ssize_t *count)
+{
+    Py_ssize_t arrived = PyObject_Size(arrivals), found = 0;
+    if (arrived < 0)
+        return NULL;
+    Py_ssize_t wanted = *count < arrived - at ? *count : arrived > at ? arrived - at : 0;
+    Frame *frames = PyMem_Malloc((wanted + 1) * sizeof *frames);
+    if (frames == NULL) {
+        PyErr_NoMemory();
+        return NULL;
+    }
+    for (; found < wanted; found++) {
+        if (Py_TYPE(arrivals) == arrivals_type) {
+            const Arrivals *from = (const Arrivals *)arrivals;
+            frames[found] = (Frame){(const uint8_t *)slot_of(from, at + found) + ETHER, from->sizes[at + found], NULL};
+            continue;
+        }
+        PyObject *arrival = PySequence_GetItem(arrivals, at + found), *frame = arrival;
+        if (arrival != NULL && PyTuple_Check(arrival))
+            frame = PyTuple_GetItem(arrival, FRAME);
+        if (frame == NULL || !PyBytes_Check(frame)) {
+            Py_XDECREF(arrival);
+            if (!PyErr_Occurred())
+                PyErr_SetString(PyExc_TypeError, "frames are bytes, and received ones tuples with these in the third place");
+            release_frames(frames, found);
+            return NULL;
+        }
+        frames[found] = (Frame){(const uint8_t *)PyBytes_AsString(frame), PyBytes_Size(frame), same(frame)};
+        Py_DECREF(arrival);
+    }
+    *count = wanted;
+    return frames;
+}
+
+void release_frames(Frame *frames, Py_ssize_t count)
+{
+    while (count > 0)
+        Py_XDECREF(frames[--count].held);
+    PyMem_Free(frames);
+}
+
+/* ---- system calls ---- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *pool; /* a bytearray; another one once arrivals that are still in use have it */
+    Py_ssize_t slot_bytes, slots;
+} Receiver;
+
+static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    Py_ssize_t slot_bytes, slots;
+    (void)keywords;
+    if (!PyArg_ParseTuple(args, "nn:Receiver", &slot_bytes, &slots))
+        return NULL;
+    if (slot_bytes < ETHER || slot_bytes > ETHER + FRAME_MAX || slots < 1 || slots > AT_ONCE)
+        return refusal("slots for frames, of one system call");
+    Receiver *self = (Receiver *)((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
+    if (self == NULL)
+        return NULL;
+    self->slot_bytes = slot_bytes;
+    self->slots = slots;
+    return (PyObject *)self;
+}
+
+static void receiver_free(Receiver *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    Py_XDECREF(self->pool);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+/* Returns for how many seconds the frame that was read last had waited, as sockets.waited_s. */
+static double waited_s(int source)
+{
+    struct timespec came, now;
+    if (ioctl(source, SIOCGSTAMPNS_OLD, &came) < 0)
+        return 0.0;
+    clock_gettime(CLOCK_REALTIME, &now);
+    double since_s = (double)(now.tv_sec - came.tv_sec) + (double)(now.tv_nsec - came.tv_nsec) * 1e-9;
+    return since_s >= 0.0 && since_s < WAITED_MOST_S ? since_s : 0.0;
+}
+
+static PyObject *receiver_receive(Receiver *self, PyObject *args)
+{
+    int source, got = 0;
+    double since_s = 0.0;
+    PyObject *port;
+    if (!PyArg_ParseTuple(args, "iO:receive", &source, &port))
+        return NULL;
+    if (self->pool == NULL || Py_REFCNT(self->pool) > 1) {
+        Py_XDECREF(self->pool);
+        self->pool = PyByteArray_FromStringAndSize(NULL, self->slots * self->slot_bytes);
+    }
+    Arrivals *arrivals = (Arrivals *)((allocfunc)PyType_GetSlot(arrivals_type, Py_tp_alloc))(arrivals_type, 0);
+    if (self->pool == NULL || arrivals == NULL) {
+        Py_XDECREF(arrivals);
+        return NULL;
+    }
+    struct mmsghdr messages[AT_ONCE];
+    struct iovec vectors[AT_ONCE];
+    memset(messages, 0, self->slots * sizeof *messages);
+    for (Py_ssize_t slot = 0; slot < self->slots; slot++) {
+        vectors[slot] = (struct iovec){PyByteArray_AsString(self->pool) + slot * self->slot_bytes, self->slot_bytes};
+        messages[slot].msg_hdr.msg_iov = vectors + slot;
+        messages[slot].msg_hdr.msg_iovlen = 1;
+    }
+    arrivals->pool = same(self->pool);
+    Py_BEGIN_ALLOW_THREADS;
+    got = recvmmsg(source, messages, (unsigned)self->slots, MSG_DONTWAIT, NULL);
+    if (got > 0)
+        since_s = waited_s(source);
+    Py_END_ALLOW_THREADS;
+    arrivals->slot_bytes = self->slot_bytes;
+    arrivals->count = got > 0 ? got : 0; /* no frames, or the device went down: the link monitor reports it */
+    for (Py_ssize_t slot = 0; slot < arrivals->count; slot++)
+        arrivals->sizes[slot] = messages[slot].msg_len > ETHER ? (int)messages[slot].msg_len - ETHER : 0;
+    arrivals->port = same(port);
+    arrivals->waited_s = PyFloat_FromDouble(since_s);
+    return (PyObject *)arrivals;
+}
+
+static PyObject *send_frames(PyObject *module, PyObject *args)
+{
+    int sink, sent, error;
+    Py_ssize_t at, count = AT_ONCE, head_size;
+    const char *head;
+    PyObject *list;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "iOny#:send", &sink, &list, &at, &head, &head_size))
+        return NULL;
+    if (head_size != ETHER || at < 0)
+        return refusal("an Ethernet header, and frames");
+    Frame *frames = frames_of(list, at, &count);
+    if (frames == NULL)
+        return NULL;
+    struct mmsghdr messages[AT_ONCE];
+    struct iovec vectors[2 * AT_ONCE];
+    memset(messages, 0, count * sizeof *messages);
+    for (Py_ssize_t each = 0; each < count; each++) {
+        vectors[2 * each] = (struct iovec){(void *)head, ETHER};
+        vectors[2 * each + 1] = (struct iovec){(void *)frames[each].bytes, (size_t)frames[each].size};
+        messages[each].msg_hdr.msg_iov = vectors + 2 * each;
+        messages[each].msg_hdr.msg_iovlen = 2;
+    }
+    Py_BEGIN_ALLOW_THREADS;
+    sent = sendmmsg(sink, messages, (unsigned)count, MSG_DONTWAIT);
+    error = errno;
+    Py_END_ALLOW_THREADS;
+    release_frames(frames, count);
+    return PyLong_FromLong(sent >= 0 ? sent : -error);
+}
+
+/* ---- frames in the slots of a pool ---- */
+
+static PyObject *received(PyObject *module, PyObject *args)
+{
+    PyObject *pool, *sizes, *port, *waited, *mac = NULL;
+    Py_ssize_t slot_bytes;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "YnO!OO:received", &pool, &slot_bytes, &PyList_Type, &sizes, &port, &waited))
+        return NULL;
+    Py_ssize_t count = PyList_Size(sizes), held = PyByteArray_Size(pool);
+    if (slot_bytes < ETHER || count > held / slot_bytes)
+        return refusal("as many slots as the pool has");
+    PyObject *list = PyList_New(count);
+    for (Py_ssize_t each = 0; list != NULL && each < count; each++) {
+        Py_ssize_t size = PyNumber_AsSsize_t(PyList_GetItem(sizes, each), NULL);
+        PyObject *arrival = NULL;
+        if (size >= 0 && size <= slot_bytes - ETHER)
+            arrival = read_slot(PyByteArray_AsString(pool) + each * slot_bytes, size, port, waited, &mac);
+        else if (!PyErr_Occurred())
+            refusal("frames that fit into their slots");
+        if (arrival == NULL || PyList_SetItem(list, each, arrival) < 0)
+            Py_CLEAR(list);
+    }
+    Py_XDECREF(mac);
+    return list;
+}
+
+/* Writes the key of a frame in the forwarding table; returns 0 if it is for the node itself, or not in order. */
+static int key_of(const uint8_t *frame, Py_ssize_t size, uint8_t *key)
+{
+    uint8_t hops = frame[HOPS_AT];
+    if (frame[0] != VERSION || frame[1] >= CONTROL_FROM || (hops & HOPS_MASK) <= 1 ||
+        HEADER + (frame[LENGTH_AT] << 8 | frame[LENGTH_AT + 1]) > size)
+        return 0;
+    memcpy(key, frame + DESTINATION_AT, ENDS);
+    if (hops & SECOND_PATH)
+        key[DESTINATION - 1] ^= 1;
+    return 1;
+}
+
+static PyObject *runs(PyObject *module, PyObject *args)
+{
+    PyObject *pool, *sizes;
+    Py_ssize_t slot_bytes, first = 0, largest = 0;
+    uint8_t key[ENDS] = {0}, run_key[ENDS] = {0};
+    int has_key = 0, had_key = 0;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "YnO!:runs", &pool, &slot_bytes, &PyList_Type, &sizes))
+        return NULL;
+    Py_ssize_t count = PyList_Size(sizes);
+    if (slot_bytes < ETHER + HEADER || count > PyByteArray_Size(pool) / slot_bytes)
+        return refusal("as many slots as the pool has");
+    PyObject *found = PyList_New(0);
+    for (Py_ssize_t slot = 0; found != NULL && slot <= count; slot++) {
+        Py_ssize_t size = slot < count ? PyNumber_AsSsize_t(PyList_GetItem(sizes, slot), NULL) : 0;
+        if (slot < count)
+            has_key = key_of((const uint8_t *)PyByteArray_AsString(pool) + slot * slot_bytes + ETHER, size, key);
+        if (slot && (slot == count || !has_key || !had_key || memcmp(key, run_key, ENDS))) {
+            PyObject *run = Py_BuildValue("nny#n", first, slot - first, run_key, (Py_ssize_t)(had_key ? ENDS : 0), largest);
+            if (run == NULL || PyList_Append(found, run) < 0)
+                Py_CLEAR(found);
+            Py_XDECREF(run);
+            first = slot;
+        }
+        largest = first == slot || size > largest ? size : largest;
+        had_key = has_key;
+        memcpy(run_key, key, ENDS);
+    }
+    if (PyErr_Occurred())
+        Py_CLEAR(found);
+    return found;
+}
+
+/* ---- samples ---- */
+
+/* Returns whether a frame is a sample, and its seal. */
+static int sample_of(const Frame *frame, uint64_t *seal)
+{
+    if (frame->size < SEAL_END || frame->bytes[frame->size - 1] & SAMPLE_BITS)
+        return 0;
+    *seal = 0;
+    for (Py_ssize_t at = frame->size - SEAL_END; at < frame->size - 1; at++)
+        *seal = *seal << 8 | frame->bytes[at];
+    return 1;
+}
+
+static PyObject *samples(PyObject *module, PyObject *args)
+{
+    PyObject *arrivals, *found;
+    Py_ssize_t at, count;
+    uint64_t seal;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "Onn:samples", &arrivals, &at, &count))
+        return NULL;
+    if (at < 0 || count < 0)
+        return refusal("frames that are there");
+    Frame *frames = frames_of(arrivals, at, &count);
+    if (frames == NULL)
+        return NULL;
+    found = PyList_New(0);
+    for (Py_ssize_t each = 0; found != NULL && each < count; each++) {
+        if (!sample_of(frames + each, &seal))
+            continue;
+        PyObject *sample = Py_BuildValue("nK", each, (unsigned long long)seal);
+        if (sample == NULL || PyList_Append(found, sample) < 0)
+            Py_CLEAR(found);
+        Py_XDECREF(sample);
+    }
+    release_frames(frames, count);
+    return found;
+}
+
+/* ---- types and functions ---- */
+
+static PyMethodDef functions[] = {
+    {"received", received, METH_VARARGS, "As slots.received."},
+    {"runs", runs, METH_VARARGS, "As slots.runs."},
+    {"samples", samples, METH_VARARGS, "As slots.samples."},
+    {"send", send_frames, METH_VARARGS, "Send frames of a list from a place on; return how many, or minus the errno."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMethodDef receiver_methods[] = {
+    {"receive", (PyCFunction)receiver_receive, METH_VARARGS, "Return the frames that wait at a socket, as of a port."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot receiver_slots[] = {
+    {Py_tp_new, receiver_new},
+    {Py_tp_dealloc, receiver_free},
+    {Py_tp_methods, receiver_methods},
+    {Py_tp_doc, "Slots for the frames of one system call."},
+    {0, NULL},
+};
+
+static PyType_Slot arrivals_slots[] = {
+    {Py_tp_dealloc, arrivals_free},
+    {Py_sq_length, arrivals_length},
+    {Py_sq_item, arrivals_item},
+    {Py_mp_length, arrivals_length},
+    {Py_mp_subscript, arrivals_subscript},
+    {Py_tp_doc, "Sequence of received frames, each of which is made when it is read."},
+    {0, NULL},
+};
+
+static PyType_Spec receiver_spec = {
+    "gdp.burst.core.Receiver", sizeof(Receiver), 0, Py_TPFLAGS_DEFAULT, receiver_slots};
+static PyType_Spec arrivals_spec = {
+    "gdp.burst.core.Arrivals", sizeof(Arrivals), 0, Py_TPFLAGS_DEFAULT, arrivals_slots};
+
+int add_frames(PyObject *module)
+{
+    PyObject *sansio = PyImport_ImportModule("gdp.sansio");
+    received_frame = sansio == NULL ? NULL : (PyTypeObject *)PyObject_GetAttrString(sansio, "ReceivedFrame");
+    Py_XDECREF(sansio);
+    PyTypeObject *receiver_type = (PyTypeObject *)PyType_FromSpec(&receiver_spec);
+    arrivals_type = (PyTypeObject *)PyType_FromSpec(&arrivals_spec);
+    return received_frame != NULL && receiver_type != NULL && arrivals_type != NULL &&
+           PyModule_AddType(module, receiver_type) == 0 && PyModule_AddFunctions(module, functions) == 0;
+}
