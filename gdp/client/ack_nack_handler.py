@@ -117,7 +117,7 @@ class AckNackHandler:
     def poll_heartbeat(self, now_s: float, trip_s: float) -> bytes:
         """Return the wire form of the Heartbeat that is due; ``trip_s``: how long a reader's answer may take."""
         queue, oldest = self._queue, self._window.cache.oldest
-        sent_number, sent_part = queue.sent
+        (sent_number, sent_part), sent_sequence = queue.sent, queue.sent_sequence
         state = Heartbeat(
             oldest=sent_number if oldest is None else oldest,
             sent_number=sent_number,
@@ -125,8 +125,8 @@ class AckNackHandler:
             starts={},
             description=b"",
             moves=tuple(queue.moves),
-            oldest_sequence=queue.cached_sequence,
-            sent_sequence=queue.sent_sequence,
+            oldest_sequence=sent_sequence if oldest is None else queue.ledger.begin_of(oldest, sent_sequence),
+            sent_sequence=sent_sequence,
             gone=tuple(queue.ledger.gone),
         )
         return self._heartbeats.poll_heartbeat(state, now_s, trip_s)

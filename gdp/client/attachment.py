@@ -36,7 +36,7 @@ from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import Header
 from gdp.frame.kinds import Kind
-from gdp.intervals import NEVER_S, SoftState, renew_after_s
+from gdp.intervals import SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
@@ -343,11 +343,6 @@ class Attachment:
         """Return the monotonic second of the next timer, or None."""
         at_s = [] if self.switch is None else [each.advertisement_at_s for each in self._due_advertisements()]
         return earliest(self.hello_protocol.get_timer(), self._sync.get_timer(), *at_s)
-
-    def early_s(self) -> float:
-        """Return a monotonic second before which ``handle_timer`` sends nothing, not even what is due soon."""
-        due_s = self.get_timer()
-        return min(NEVER_S if due_s is None else due_s, self.hello_protocol.early_s())
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""

@@ -73,6 +73,40 @@ class ServiceOptions(TypedDict, total=False):
     is_session: bool
 
 
+class _Control:
+    """Timers of attachment and diagnostics, which are read again only after something may have changed them.
+
+    Attributes:
+        due_s: monotonic second of the next one, or None; not valid while ``has_changed``.
+        early_s: before this second they have nothing to do, and send nothing together with what others send.
+    """
+
+    def __init__(self, attachment: Attachment, diagnostics: Diagnostics) -> None:
+        self._attachment = attachment
+        self._diagnostics = diagnostics
+        self.due_s: float | None = None
+        self.early_s = -NEVER_S
+        self.has_changed, self._is_settled = True, False
+
+    def touch(self) -> Attachment:
+        """Return the attachment to a caller that may change when something is due."""
+        self.has_changed, self._is_settled = True, False
+        return self._attachment
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Process the timers that are due."""
+        self.touch().handle_timer(now)
+        self._diagnostics.handle_timer(now)
+        self._is_settled = True
+
+    def read_timers(self) -> None:
+        """Set when something is due."""
+        due_s, waiting_s = self._attachment.get_timer(), self._diagnostics.get_timer()
+        self.due_s, self.early_s, self.has_changed = earliest(due_s, waiting_s), -NEVER_S, False
+        if self._is_settled and waiting_s is None:
+            self.early_s = NEVER_S if due_s is None else due_s - self._attachment.hello_protocol.together_s
+
+
 class Participant:
     """Protocol core of one participant.
 
@@ -102,9 +136,6 @@ class Participant:
         self._clock = StallClock()
         self.services = Services(self.publications, self.subscriptions, self._clock)
         self._sent_by: object = None  # the switch that carried the latest frames
-        self._control_due_s: float | None = None  # of attachment and diagnostics, while neither has changed
-        self._has_control_changed, self._has_control_settled = True, False  # ... since they were last called
-        self._control_early_s = -NEVER_S  # before this second they have nothing to do
         self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
         self._source = source
@@ -113,10 +144,11 @@ class Participant:
         self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
         self.diagnostics = Diagnostics(
             identity, policy, self.attachment.fragmenter, settings.first_sequence,
-            lambda frames, _to, _now: self._control().send(frames),
+            lambda frames, _to, _now: self._control.touch().send(frames),
         )  # fmt: skip
         self.diagnostics.register("ping", self._answer_ping, for_foreign=True)
         self.diagnostics.evidence_of = self.attachment.evidence_of
+        self._control = _Control(self.attachment, self.diagnostics)
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped, by reason."""
@@ -130,7 +162,7 @@ class Participant:
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to discover a switch on a port."""
         self._clock.advance(now.mono_s)
-        self._control().hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
+        self._control.touch().hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
     def advertise(
         self,
@@ -148,7 +180,7 @@ class Participant:
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self.publications)
         settings = PublisherSettings(reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options)
         publisher = self.publications.add(topic.name, topic.own_secrets, description, settings)
-        self._control().advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject, Right.PUBLISH, topic.delegation.chain, is_global=is_global, paths=paths
         )
         return publisher
@@ -177,13 +209,13 @@ class Participant:
         if subscription is not None and subscription.right is not Right.READ:
             right = subscription.right
             self._close(self.subscriptions.remove(name))
-        self._control().withdraw(name, right)
+        self._control.touch().withdraw(name, right)
 
     def subscribe(self, topic: Topic, *, paths: int = 1) -> None:
         """Read a topic from now on, from every publisher of it; ``paths`` 2: by two paths from those that want two."""
         self._check(topic, Right.READ, is_free=self.subscriptions.get(topic.name) is None)
         self.subscriptions.add(topic, Right.READ, self._clock.now_s, paths)
-        self._control().advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject, Right.READ, topic.delegation.chain, is_global=False, paths=paths
         )
 
@@ -192,7 +224,7 @@ class Participant:
         subscription = self.subscriptions.get(name)
         if subscription is not None and subscription.right is Right.READ:
             self._close(self.subscriptions.remove(name))
-            self._control().withdraw(name, Right.READ)
+            self._control.touch().withdraw(name, Right.READ)
 
     def renew(self, topic: Topic) -> None:
         """Replace a topic's delegation and secrets, for what is published or read of it."""
@@ -202,7 +234,7 @@ class Participant:
             subscription.topic = topic
             for writer_proxy in subscription.all():
                 writer_proxy.renew(topic.secrets)
-        self._control().renew(topic.name, topic.delegation.chain)
+        self._control.touch().renew(topic.name, topic.delegation.chain)
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames."""
@@ -230,7 +262,7 @@ class Participant:
             elif header.kind in _FOR_US:
                 self._receive_ours(header, arrival, now)
             elif header.kind >= CONTROL_FROM:
-                statement = self._control().receive_control(arrival, header, now)
+                statement = self._control.touch().receive_control(arrival, header, now)
                 if statement is not None:
                     self._reception.hand_out(now.mono_s)  # it may close writer proxies
                     self._take_statement(statement, now)
@@ -251,19 +283,17 @@ class Participant:
         elif header.kind == Kind.INTRODUCTION:
             self.publications.receive_introduction(header, arrival.frame)
         else:
-            self._control()
+            self._control.touch()
             self.diagnostics.receive(header, arrival, now)
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Update the state of a port's link."""
-        self._control().port_changed(port, up, now)
+        self._control.touch().port_changed(port, up, now)
 
     def handle_timer(self, now: Timestamps) -> None:
         """Process the timers that are due."""
-        if self._has_control_changed or now.mono_s >= self._control_early_s:
-            self._control().handle_timer(now)
-            self.diagnostics.handle_timer(now)
-            self._has_control_settled = True
+        if self._control.has_changed or now.mono_s >= self._control.early_s:
+            self._control.handle_timer(now)
         self._clock.advance(now.mono_s)
         self.publications.handle_timer(now.mono_s)
         self._reception.handle_timer(now.mono_s)
@@ -287,13 +317,9 @@ class Participant:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if self._has_control_changed:
-            diagnostics_s = self.diagnostics.get_timer()
-            self._control_due_s = earliest(self.attachment.get_timer(), diagnostics_s)
-            is_idle = self._has_control_settled and diagnostics_s is None
-            self._control_early_s = self.attachment.early_s() if is_idle else -NEVER_S
-            self._has_control_changed = False
-        due_s = self._control_due_s
+        if self._control.has_changed:
+            self._control.read_timers()
+        due_s = self._control.due_s
         if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
             return due_s
         timers, own_s = self._reception.timers, self.publications.next_due()
@@ -316,7 +342,7 @@ class Participant:
         turns; urgent ones go first each time.
         """
         attachment = self.attachment
-        if self.publications.requests:
+        if self.publications.holding:
             self.publications.release_requests(now_s)
         if not attachment.outgoing and (self._scheduler.is_ready or self._reception.reporting):
             self.flush(now_s)
@@ -334,12 +360,7 @@ class Participant:
     def leave(self) -> None:
         """Leave the overlay: close writer proxies, withdraw every name."""
         self._close(self.subscriptions.leave())
-        self._control().withdraw_all()
-
-    def _control(self) -> Attachment:
-        """Return the attachment to a caller that may change when its timer is due."""
-        self._has_control_changed, self._has_control_settled = True, False
-        return self.attachment
+        self._control.touch().withdraw_all()
 
     def _check(self, topic: Topic, right: Right, *, is_free: bool) -> None:
         if right not in topic.delegation.rights or not topic.secrets:
@@ -366,7 +387,7 @@ class Participant:
         publisher = self.publications.add(topic.name, topic.own_secrets, description, settings)
         self.publications.enable_unicast(topic.name, topic.own_secrets, settings)
         self.subscriptions.add(topic, right, self._clock.now_s, paths, is_session=is_session)
-        self._control().advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject,
             right,
             topic.delegation.chain,

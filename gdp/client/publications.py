@@ -41,6 +41,7 @@ class Publications:
 
     Attributes:
         requests: to the servers of each name that is called.
+        holding: those of them with copies that have not begun.
     """
 
     def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
@@ -49,6 +50,7 @@ class Publications:
         self._publishers: dict[Name, Publisher] = {}
         self._private: dict[Name, UnicastStreams] = {}  # by service
         self.requests: dict[Name, RequestStreams] = {}
+        self.holding: dict[RequestStreams, None] = {}
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
@@ -109,7 +111,7 @@ class Publications:
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
-        self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to)
+        self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to, self.holding)
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -124,7 +126,8 @@ class Publications:
         """Stop publishing a name; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
-        self.requests.pop(name, None)
+        if (requests := self.requests.pop(name, None)) is not None:
+            requests.close()
         if publisher is None:
             return False
         self._sequence_registry.put(name, publisher.past)
@@ -156,7 +159,7 @@ class Publications:
 
     def release_requests(self, now_s: float) -> None:
         """Begin the copies of requests that have waited for a faster one to leave."""
-        for requests in self.requests.values():
+        for requests in list(self.holding):
             requests.release(now_s)
 
     def forget(self, service: Name, party: PeerIncarnation) -> None:
@@ -212,7 +215,7 @@ class Publications:
             streams.forget_idle(now_s)
         if now_s >= self._reader_paths.due_s and self._reader_paths.handle_timer(now_s):
             self.scheduler.resume()
-        if self.requests:
+        if self.holding:
             self.release_requests(now_s)
 
     def frames_sent(self, now_s: float) -> None:
@@ -232,7 +235,7 @@ class Publications:
         timers = self._timers
         timer_s = timers.next_due() if timers.touched else timers.due_s
         due_s = min(timer_s, self._reader_paths.due_s, self.scheduler.due_s)
-        for requests in self.requests.values() if self.requests else ():
+        for requests in self.holding:
             due_s = min(due_s, requests.get_timer())
         return due_s
 

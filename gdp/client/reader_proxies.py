@@ -29,7 +29,6 @@ from gdp.names import Name
 
 __all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
 
-_LEASE_S: Final = READER.lease_s
 READERS_MAX: Final = 1_024
 _INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered, and readers given up
 _EPOCHS_KEPT: Final = 2  # the one in use and the one before
@@ -149,13 +148,13 @@ class ReaderProxies:
 
     def silent(self, now_s: float) -> list[bytes]:
         """Return those that have not been heard for ``READER.lease_s``."""
-        return [name for name, reading in self.active.items() if now_s - reading.heard_s > _LEASE_S]
+        return [name for name, reading in self.active.items() if now_s - reading.heard_s > READER.lease_s]
 
     def next_silent(self) -> float:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty; infinity: never."""
         due_s = NEVER_S
         for each in self.active.values():
-            silent_s = each.heard_s + _LEASE_S
+            silent_s = each.heard_s + READER.lease_s
             due_s = silent_s if silent_s < due_s else due_s
             if each.behind_s is not None and each.behind_s + FORGET_S < due_s:
                 due_s = each.behind_s + FORGET_S

@@ -127,12 +127,6 @@ class SendQueue:
         return self.first_waiting if waiting is None else waiting.sequence
 
     @property
-    def cached_sequence(self) -> int:
-        """Return the sequence number of what is cached first, or sent next."""
-        oldest, sent = self._window.cache.oldest, self.sent_sequence
-        return sent if oldest is None else self.ledger.begin_of(oldest, sent)
-
-    @property
     def kept(self) -> int:
         """Return how many messages stay for readers that come later."""
         return max(self.depth, self.awaited)
@@ -244,7 +238,7 @@ class SendQueue:
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
         window, best_effort, messages = self._window, self._best_effort, self._gathered.messages
-        left = max(limit, 1)
+        left = limit if limit > 0 else 1
         frames = best_effort.poll_frames(left) if best_effort.waiting else []
         if not messages or window.has_frames:
             frames += window.frames_to_send(now_s, max(left - len(frames), 1) if frames else left)
@@ -336,9 +330,10 @@ class SendQueue:
 
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool, prefix: bytes = b"") -> Sealed:
         flags = self.flags | _BUNDLE * is_bundle
-        size = len(prefix) + (len(body) if isinstance(body, bytes) else body.message_bytes)
-        if self.has_parity and is_protected(size, mtu):
-            return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES, prefix)
+        if self.has_parity:
+            size = len(prefix) + (len(body) if isinstance(body, bytes) else body.message_bytes)
+            if is_protected(size, mtu):
+                return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES, prefix)
         return self._keys.data.seal(number, flags, body, mtu, prefix)
 
     def _lose(self, sequence: int, messages: int, drop_reason: DropReason, reason: LossReason) -> None:

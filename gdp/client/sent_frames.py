@@ -99,7 +99,7 @@ class SentFrames:
             self.keep(names)
         if again and readers > 1:
             size = sum(map(len, frames[:again]))
-            samples = self._samples(frames[:again])
+            samples = burst.samples(frames, 0, again) if self._counts_losses else ()
             for name in names:
                 self._paths.path(name, now_s).controller.pace.charge(size, now_s)
                 if name in self._readers:
@@ -120,10 +120,13 @@ class SentFrames:
 
     def _add(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, *, is_repair: bool) -> None:
         """Count frames that all leave for the first time, or all again."""
-        before, paths, samples = self._count, self._paths, self._samples(frames)
-        starts = range(0, len(frames), _FLIGHT_FRAMES)
-        sizes = [(sum(map(len, some)), len(some)) for at in starts for some in [frames[at : at + _FLIGHT_FRAMES]]]
-        self._count += len(frames)
+        before, paths, count = self._count, self._paths, len(frames)
+        samples = burst.samples(frames, 0, count) if self._counts_losses else ()  # striped ones would prove no order
+        sizes: list[tuple[int, int]] = []
+        for at in range(0, count, _FLIGHT_FRAMES):
+            flight = frames[at : at + _FLIGHT_FRAMES]
+            sizes.append((sum(map(len, flight)), min(count - at, _FLIGHT_FRAMES)))
+        self._count += count
         self._note_places(frames, before + 1, is_repair=is_repair)
         for name in names:
             path, reader, place = paths.path(name, now_s), self._readers.get(name), before
@@ -137,10 +140,6 @@ class SentFrames:
                 record.place, record.is_repair = place, is_repair
                 reader.flights.append(record)
                 paths.leaving.append(record)
-
-    def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
-        """Return the samples among frames; those of striped ones would prove no order."""
-        return burst.samples(frames, 0, len(frames)) if self._counts_losses else ()
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""

@@ -198,8 +198,9 @@ class Sealer:
         head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
         cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
         return Sealed(
-            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, capacity=capacity
-        )
+            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, size=size,
+            capacity=capacity,
+        )  # fmt: skip
 
 
 class Sealed(Sequence[bytes]):
@@ -214,6 +215,7 @@ class Sealed(Sequence[bytes]):
         parts: int,
         prefix: bytes,
         message: bytes | Sealed,
+        size: int,
         capacity: int,
     ) -> None:
         self._cipher = cipher
@@ -223,14 +225,15 @@ class Sealed(Sequence[bytes]):
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
-            self._message, self.message_bytes = message, len(prefix) + len(message)
+            self._message = message
         else:
-            self._message, self.message_bytes = b"", message.message_bytes
+            self._message = b""
             self._origin = message._origin or message
         self._capacity = capacity
         self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []
-        self.size_bytes = self.message_bytes + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
+        self.message_bytes = size
+        self.size_bytes = size + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
         return self._parts

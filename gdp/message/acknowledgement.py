@@ -17,7 +17,6 @@ from gdp.token_bucket import TokenBucket
 
 __all__ = ["ReaderPosition", "ReaderPositions"]
 
-_LEASE_S: Final = READER.lease_s
 _BEYOND_ALL: Final = 1 << 64  # above every message number
 
 
@@ -141,7 +140,7 @@ class ReaderPositions:
             for name, each in self.active.items()
             if each.acked_at < sent_at
             and (
-                now_s - each.last_progress_s > _LEASE_S
+                now_s - each.last_progress_s > READER.lease_s
                 or (now_s - each.mark_s > self._lag_s and each.acked_at < each.mark_at <= self.most_at)
             )
         ]
