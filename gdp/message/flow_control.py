@@ -78,7 +78,7 @@ class FlowControl:
             return
         trip = self.round_trip
         trip.handle_acknowledged(acked_at, now_s)
-        self._probe_s = PROBES.bounded_s(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
+        self._probe_s = PROBES.pause_s(1, 3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
         self.probe_at_s = now_s + self._probe_s
 
     def restart_probe(self, now_s: float) -> None:

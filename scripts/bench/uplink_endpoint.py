@@ -15,6 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any, Final
 
 from peers.jsonl import read_order, say
@@ -56,18 +57,9 @@ def traffic(settings: Settings, direction: Direction) -> None:
     window = Window(order["start_ns"], order["begin_ns"], order["end_ns"])
     exchange.start(window)
     time.sleep(max(order["drained_ns"] - time.monotonic_ns(), 0) / 1e9)
-    tallies = {
-        name: {
-            "due": tally.due,
-            "sent": tally.sent,
-            "ages_s": list(tally.ages_s.values()),
-            "whole": tally.whole,
-            "broken": tally.broken,
-            "doubled": tally.doubled,
-        }
-        for name, tally in exchange.tallies.items()
-    }
-    say(streams=tallies, refusals=dict(Counter(exchange.refusals)))
+    tallies = exchange.tallies.items()
+    streams_of = {name: {**asdict(tally), "ages_s": list(tally.ages_s.values())} for name, tally in tallies}
+    say(streams=streams_of, refusals=dict(Counter(exchange.refusals)))
     sys.stdout.flush()
     os._exit(0)  # a publisher may still wait; nothing of it is to be kept
 

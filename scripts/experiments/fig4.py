@@ -8,12 +8,12 @@ sudo .venv/bin/python scripts/experiments/fig4.py --replicas 3
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
 from page_text import text_of
+from plot import Bar, Panel, save_bars
 from samples import Sample, Series
 from skeleton import Options
 from tag_cluster import SERVICE, TagCluster
@@ -46,7 +46,7 @@ def measure(options: Options) -> Report:
         findings,
         text_of("fig4"),
         {"replicas": options.replicas, "requests": count},
-        lambda path, title: _draw(path, title, figures),
+        lambda path, title: save_bars(path, title, "", _panels(figures)),
     )
 
 
@@ -63,19 +63,11 @@ def _ask(form: str, replicas: int, count: int) -> tuple[list[Sample], list[float
     return samples, [(now - then) / (count + _WARM_UP) for then, now in zip(before, after, strict=True)]
 
 
-def _draw(path: Path, title: str, figures: Mapping[str, Sequence[float]]) -> None:
-    from pictures import plt, save, tidy
-
-    figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
-    for at, (what, colour) in enumerate(zip(COUNTED, ("#1f6f8b", "#c96f3b", "#99a8b2"), strict=True)):
-        places = [place + 0.25 * at for place in range(len(figures))]
-        axis.barh(places, [each[at] / 1e3 for each in figures.values()], 0.22, color=colour, label=what)
-    axis.set_yticks(range(len(figures)), list(figures), fontsize=8)
-    axis.invert_yaxis()
-    axis.set_xlabel("kB a request", fontsize=8)
-    tidy(axis)
-    axis.legend(fontsize=8, frameon=False, ncols=len(COUNTED), loc="lower left", bbox_to_anchor=(0, 1))
-    save(figure, path, title)
+def _panels(figures: Mapping[str, Sequence[float]]) -> list[Panel]:
+    return [
+        Panel(what, "kB a request", [Bar(form, of[at] / 1e3, ours=form != DIRECT) for form, of in figures.items()])
+        for at, what in enumerate(COUNTED)
+    ]
 
 
 if __name__ == "__main__":

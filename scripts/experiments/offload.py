@@ -19,12 +19,14 @@ import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
 from experiment import OUTPUT, Computed, command_line, run_experiment
 from machine import machine_state
-from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
+from offload_page import CDR, CYCLONE, FAST, JSON, page_of, panels_of
+from plot import save_bars
 from report import progress
 from ros_row import DIRECT_DOMAIN, READY_S, Row
 from skeleton import Options
@@ -88,8 +90,11 @@ def measure(options: Options) -> Computed:
         }
     document = {"slower": SLOWER, "tasks": tasks}
     page = page_of(document)
-    title = "FogROS G: Table I and Figure 5"
-    return Computed("offload", title, document, page, lambda: print(page), lambda at, _: save_picture(at, document))
+
+    def draw(path: Path, title: str) -> None:
+        save_bars(path, title, "", panels_of(document))
+
+    return Computed("offload", "FogROS G: Table I and Figure 5", document, page, lambda: print(page), draw)
 
 
 def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:

@@ -1,18 +1,15 @@
-"""Page and picture of ``offload.py``: FogROS G's Table I and Figure 5, ours below the paper's.
-
-Sans-I/O, but for the picture's file.
-"""
+"""Page and picture of ``offload.py``: FogROS G's Table I and Figure 5, ours below the paper's. Sans-I/O."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from machine import MachineState
 from page_text import text_of
+from plot import Bar, Panel
 from report import markdown_table, percentile
 
 CYCLONE: Final = "ROS 2, Cyclone DDS"
@@ -21,7 +18,6 @@ JSON: Final = "overlay, JSON"
 CDR: Final = "overlay, CDR"
 _CELLS: Final = ("network", "total")
 _SHOWN: Final = (CYCLONE, JSON, CDR)  # in Table I
-_COLOURS: Final = {CYCLONE: "#99a8b2", FAST: "#5d6b75", JSON: "#7fb3c4", CDR: "#1f6f8b"}
 PAPER_ADDED_S: Final = 0.014
 # What the tasks compute here, and how far that is from what the paper computed.
 COMPUTES: Final = {
@@ -85,32 +81,20 @@ def page_of(document: Document) -> str:
     return f"{text}\n"
 
 
-def save_picture(path: Path, document: Document) -> None:
-    """Draw network time by baseline and task, and next to it the time that the overlay adds."""
-    from pictures import plt, save, tidy
-
-    networks = {name: each["network"] for name, each in document["tasks"].items()}
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-    for at, who in enumerate(_COLOURS):
-        times = [1e3 * statistics.median(network["contenders"][who]["there_s"]) for network in networks.values()]
-        places = [place + (at - 1.5) * 0.21 for place in range(len(networks))]
-        left.bar(places, times, 0.19, color=_COLOURS[who], label=who)
-    names = list(networks)
-    paper = [1e3 * PAPER[name].network_s for name in names]
-    left.plot(range(len(names)), paper, "_", ms=30, color="#c96f3b", label="FogROS G, the paper")
-    left.set_xticks(range(len(names)), names, fontsize=8)
-    left.set_title("network, one way, ms (median)", loc="left", fontsize=10)
-    for at, who in enumerate((JSON, CDR)):
-        added = [added_s(network, who, CYCLONE) for network in networks.values()]
-        spread = [[1e3 * (a - low) for a, low, _ in added], [1e3 * (high - a) for a, _, high in added]]
-        places = [place + (at - 0.5) * 0.4 for place in range(len(names))]
-        right.bar(places, [1e3 * a for a, _, _ in added], 0.38, yerr=spread, color=_COLOURS[who], label=who)
-    right.axhline(1e3 * PAPER_ADDED_S, color="#c96f3b", ls="--", lw=0.8, label="FogROS G, average")
-    right.set_xticks(range(len(names)), names, fontsize=8)
-    right.set_title("overlay less ROS 2 on Cyclone DDS, ms; whiskers: rounds", loc="left", fontsize=10)
-    for axis in (left, right):
-        tidy(axis)
-    save(figure, path)
+def panels_of(document: Document) -> list[Panel]:
+    """Return for each task a panel of network times, and next to it one of the time that the overlay adds."""
+    panels = []
+    for name, task in document["tasks"].items():
+        network, paper = task["network"], PAPER[name]
+        times = {who: statistics.median(each["there_s"]) for who, each in network["contenders"].items()}
+        bars = [Bar(who, 1e3 * time_s, ours=who in (JSON, CDR)) for who, time_s in times.items()]
+        bars.append(Bar("FogROS G, the paper", 1e3 * paper.network_s, ours=False))
+        panels.append(Panel(f"{name}: network, one way", "ms, median", bars))
+        added = {who: [1e3 * each for each in added_s(network, who, CYCLONE)] for who in (JSON, CDR)}
+        bars = [Bar(who, middle, least, most) for who, (middle, least, most) in added.items()]
+        bars.append(Bar("FogROS G, average", 1e3 * PAPER_ADDED_S, ours=False))
+        panels.append(Panel(f"{name}: overlay less ROS 2 on Cyclone DDS", "ms; whiskers: rounds", bars))
+    return panels
 
 
 def _rows(name: str, task: Document) -> list[tuple[str, ...]]:

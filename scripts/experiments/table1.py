@@ -16,6 +16,7 @@ from typing import Final
 
 from experiment import Computed, command_line, run_experiment
 from page_text import text_of
+from plot import Bar, Panel, save_bars
 from report import markdown_table, print_table
 from skeleton import Options
 
@@ -98,8 +99,12 @@ def measure(options: Options) -> Computed:
         "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
     }
     title = "Table I: the price of a replica"
+
+    def draw(path: Path, title: str) -> None:
+        save_bars(path, title, f"AWS {region}", [_panel(rows)])
+
     pictured = page(region, rows, needed)
-    return Computed("table1", title, document, pictured, print_tables, lambda path, _: _draw(path, region, rows))
+    return Computed("table1", title, document, pictured, print_tables, draw)
 
 
 def bills(region: str) -> list[Row]:
@@ -195,20 +200,9 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
     return f"{text}\n"
 
 
-def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
-    from pictures import plt, save, tidy
-
-    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
-    for at, colour in enumerate(("#99a8b2", "#5d6b75", "#1f6f8b")):
-        places = [place + (at - 1) * 0.27 for place in range(len(rows))]
-        axis.bar(places, [row.bills[at].of_single for row in rows], 0.25, color=colour, label=rows[0].bills[at].what)
-    axis.axhline(1, color="#222222", lw=0.7)
-    axis.set_xticks(range(len(rows)), [row.type_name for row in rows], fontsize=8)
-    axis.set_ylabel("price, of one on-demand machine")
-    axis.set_title(f"AWS {region}", loc="left", fontsize=10)
-    axis.set_ylim(0, 2.6)
-    tidy(axis, ncols=3, loc="upper left")
-    save(figure, path)
+def _panel(rows: Sequence[Row]) -> Panel:
+    bars = [Bar(row.type_name, row.bills[2].of_single) for row in rows]
+    return Panel("two spot machines", "price, of one on-demand machine", bars)
 
 
 if __name__ == "__main__":

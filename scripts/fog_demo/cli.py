@@ -66,10 +66,7 @@ def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
         console.print(f"{what}: {seconds:.2f} s", highlight=False)
     if as_json:
         document = {
-            "requests": outcome.counts.requests,
-            "failed": outcome.counts.failed,
-            "median_ms": outcome.counts.median_ms,
-            "p99_ms": outcome.counts.p99_ms,
+            **asdict(outcome.counts),
             "by_machine": dict(outcome.counts.by_machine),
             "steps_s": outcome.steps_s,
             "events": [asdict(each) for each in outcome.events],

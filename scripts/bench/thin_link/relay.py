@@ -23,7 +23,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +31,7 @@ from peers.jsonl import say
 
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
-from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
+from gdp.ports.mmsg import SLOTS, MmsgBatch, make_batch
 from gdp.ports.sockets import kernel_drops
 from thin_link.channel import Channel
 from thin_link.conditions import Direction
@@ -71,7 +71,7 @@ class _Relay:
     def __init__(self, sides: tuple[socket.socket, socket.socket], channels: tuple[Channel, Channel]) -> None:
         one, other = sides
         self._ways = (_Way(one, other, channels[0]), _Way(other, one, channels[1]))
-        self._batch: MmsgPool = make_batch(_SLOT_BYTES)
+        self._batch: MmsgBatch = make_batch(_SLOT_BYTES)
         self._drops = [0] * (max(DropReason) + 1)
         self._oversized = 0
         self._late = [0] * (_BUCKETS + 1)  # frames by lateness, in buckets of 10 us
@@ -147,17 +147,9 @@ class _Relay:
         sides = {}
         for side, way in zip(("up", "down"), self._ways, strict=True):
             way.channel.backlog_bytes(now_ns)
-            counters = way.channel.counters
-            sides[side] = {
-                "offered": counters.offered,
-                "queue_drops": counters.queue_drops,
-                "losses": counters.losses,
-                "delivered": counters.delivered,
-                "delivered_bytes": counters.delivered_bytes,
-                "marked_bytes": counters.marked_bytes,
-                "capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns),
-                "depth_bytes": way.channel.take_depths(),
-            }
+            depths = {"depth_bytes": way.channel.take_depths()}
+            capacity = {"capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns)}
+            sides[side] = asdict(way.channel.counters) | capacity | depths
         say(
             oversized=self._oversized,
             refused=sum(self._drops),

@@ -10,6 +10,7 @@ from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from importlib import import_module
 from typing import Final, NoReturn, Protocol
 
 
@@ -20,16 +21,6 @@ class Call:
     success: bool
     message: str
     size: int
-
-
-class Publisher(Protocol):
-    """One topic's publisher."""
-
-    def message(self) -> object:
-        """Return a new, empty message."""
-
-    def publish(self, message: object) -> None:
-        """Publish a message."""
 
 
 class Caller(Protocol):
@@ -48,8 +39,8 @@ Lamp = Callable[[bool], tuple[bool, str]]  # on -> success, message
 class Node(Protocol):
     """A running node: its callbacks come from threads of its own."""
 
-    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Create a publisher of a topic."""
+    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Callable[[object], None]:
+        """Create a publisher of a topic; return what publishes a message."""
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
         """Subscribe to a topic."""
@@ -65,6 +56,13 @@ class Node(Protocol):
 
     def size(self, message: object) -> int:
         """Return the bytes of a message in this ROS's wire form."""
+
+
+def load_type(type_name: str) -> Callable[..., object]:
+    """Return the class of a type of messages or services, such as ``std_msgs/msg/String``, of this process's ROS."""
+    package, kind, name = type_name.split("/")
+    found: Callable[..., object] = getattr(import_module(f"{package}.{kind}"), name)
+    return found
 
 
 _STDOUT: Final = 1

@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 from proxy.bridge.core.topic_stats import percentile
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
-from ring.nodes.node import Call, Node, Order, Orders, say
+from ring.nodes.node import Call, Node, Order, Orders, load_type, say
 
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25
@@ -38,14 +38,15 @@ class _Pace:
 
 def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
     """Send greetings until GO, publish ``count`` messages, report, and continue after another GO."""
-    out = node.publisher(of.topic, of.type_name, latched=of.latched)
+    send = node.publisher(of.topic, of.type_name, latched=of.latched)
+    make = load_type(of.type_name)
     size = 0
     sent = list[str]()
 
     def publish(number: int) -> object:
-        message = out.message()
+        message = make()
         of.fill(message, number, time.time_ns(), node.fit)
-        out.publish(message)
+        send(message)
         return message
 
     def publish_counted(number: int) -> None:

@@ -4,33 +4,20 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from importlib import import_module
 from io import BytesIO
 from typing import Final
 
 import rospy
 
-from ring.nodes.node import Call, Caller, Lamp, Publisher
+from ring.nodes.node import Call, Caller, Lamp, load_type
 
 _QUEUE: Final = 100
-
-
-class _Publisher:
-    def __init__(self, topic: str, type_name: str, *, latched: bool) -> None:
-        self._kind = _load(type_name)
-        self._publisher = rospy.Publisher(topic, self._kind, queue_size=_QUEUE, latch=latched)
-
-    def message(self) -> object:
-        return self._kind()
-
-    def publish(self, message: object) -> None:
-        self._publisher.publish(message)
 
 
 class _Caller:
     def __init__(self, name: str, type_name: str) -> None:
         self._name = name
-        self._call = rospy.ServiceProxy(name, _load(type_name))
+        self._call = rospy.ServiceProxy(name, load_type(type_name))
 
     def wait(self, seconds: float) -> bool:
         try:
@@ -54,18 +41,20 @@ class Ros1Node:
     def __init__(self, name: str) -> None:
         rospy.init_node(name, disable_signals=True)
 
-    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Create a publisher of a topic."""
-        return _Publisher(topic, type_name, latched=latched)
+    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Callable[[object], None]:
+        """Create a publisher of a topic; return what publishes a message."""
+        made = rospy.Publisher(topic, load_type(type_name), queue_size=_QUEUE, latch=latched)
+        publish: Callable[[object], None] = made.publish
+        return publish
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
         """Subscribe to a topic."""
         del latched  # the publisher decides it
-        rospy.Subscriber(topic, _load(type_name), take, buff_size=1 << 22, tcp_nodelay=True)
+        rospy.Subscriber(topic, load_type(type_name), take, buff_size=1 << 22, tcp_nodelay=True)
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
         """Create a ``SetBool`` server."""
-        rospy.Service(name, _load(type_name), lambda request: lamp(request.data))
+        rospy.Service(name, load_type(type_name), lambda request: lamp(request.data))
 
     def caller(self, name: str, type_name: str) -> Caller:
         """Create a ``SetBool`` client."""
@@ -84,9 +73,3 @@ def _size(message: object) -> int:
     buffer = BytesIO()
     message.serialize(buffer)  # type: ignore[attr-defined]  # every message of genpy has it
     return buffer.tell()
-
-
-def _load(type_name: str) -> type:
-    package, kind, name = type_name.split("/")
-    found: type = getattr(import_module(f"{package}.{kind}"), name)
-    return found

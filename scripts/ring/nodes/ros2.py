@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from array import array
 from collections.abc import Callable
-from importlib import import_module
 from typing import Final, Protocol, cast
 
 import rclpy
@@ -14,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
-from ring.nodes.node import Call, Caller, Lamp, Publisher
+from ring.nodes.node import Call, Caller, Lamp, load_type
 
 _DEPTH: Final = 50  # some seconds of pictures: Fast DDS may need three to request a lost sample
 
@@ -24,21 +23,9 @@ class _SetBool(Protocol):
     Response: Callable[..., object]
 
 
-class _Publisher:
-    def __init__(self, node: rclpy.node.Node, topic: str, type_name: str, profile: QoSProfile) -> None:
-        self._kind = _load(type_name)
-        self._publisher = node.create_publisher(self._kind, topic, profile)
-
-    def message(self) -> object:
-        return self._kind()
-
-    def publish(self, message: object) -> None:
-        self._publisher.publish(message)
-
-
 class _Caller:
     def __init__(self, node: rclpy.node.Node, name: str, type_name: str) -> None:
-        self._kind = _load(type_name)
+        self._kind = load_type(type_name)
         self._request = cast("_SetBool", self._kind).Request
         self._client = node.create_client(self._kind, name)
 
@@ -68,17 +55,19 @@ class Ros2Node:
         executor.add_node(self._node)
         threading.Thread(target=executor.spin, name="spin", daemon=True).start()
 
-    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Create a reliable publisher of a topic."""
-        return _Publisher(self._node, topic, type_name, _profile(latched=latched))
+    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Callable[[object], None]:
+        """Create a reliable publisher of a topic; return what publishes a message."""
+        made = self._node.create_publisher(load_type(type_name), topic, _profile(latched=latched))
+        publish: Callable[[object], None] = made.publish
+        return publish
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
         """Subscribe to a topic."""
-        self._node.create_subscription(_load(type_name), topic, take, _profile(latched=latched))
+        self._node.create_subscription(load_type(type_name), topic, take, _profile(latched=latched))
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
         """Create a ``SetBool`` server."""
-        kind = _load(type_name)
+        kind = load_type(type_name)
         make = cast("_SetBool", kind).Response
 
         def answer(request: object, response: object) -> object:
@@ -105,9 +94,3 @@ def _profile(*, latched: bool) -> QoSProfile:
     if latched:
         return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     return QoSProfile(depth=_DEPTH)
-
-
-def _load(type_name: str) -> type:
-    package, kind, name = type_name.split("/")
-    found: type = getattr(import_module(f"{package}.{kind}"), name)
-    return found
