@@ -6,10 +6,9 @@
     .venv/bin/python scripts/supply/release.py verify --key keys/release/owner.pub dist
 
 ``build`` takes the commit, not the work tree, so uncommitted changes are not in it. The same commit and the same
-setuptools give the same bytes. The key is one of ``gdp keygen owner``: ECDSA P-256. The signature is DER over the bytes
-of SHA256SUMS, so openssl and sha256sum verify it without this project and its packages. Exit: 0 done, 1 it does not
-verify, 2 wrong usage.
-
+setuptools and compiler give the same bytes. The key is one of ``gdp keygen owner``: ECDSA P-256. The signature is DER
+over the bytes of SHA256SUMS, so openssl and sha256sum verify it without this project and its packages. Exit: 0 done, 1
+it does not verify, 2 wrong usage.
 """
 
 from __future__ import annotations
