@@ -41,15 +41,15 @@ class Backoff:
     equal: int = 1
     growing: int = _GROWING_MAX
 
-    def pause_s(self, tries: int) -> float:
-        """Return the seconds to wait after so many tries; 0 counts as 1."""
+    def pause_s(self, tries: int, estimate_s: float = 0.0) -> float:
+        """Return the seconds to wait after so many tries; 0 counts as 1.
+
+        Args:
+            estimate_s: of the first pause, where an answer takes longer than ``first_s`` (RFC 6298, section 2.4).
+        """
         if tries > self.growing:
             return self.most_s
-        return min(self.first_s * 2.0 ** (max(tries - 1, 0) // self.equal), self.most_s)
-
-    def bounded_s(self, estimate_s: float) -> float:
-        """Return an estimate of the first pause, within the first one and the bound (RFC 6298, section 2.4)."""
-        return min(max(estimate_s, self.first_s), self.most_s)
+        return min(max(estimate_s, self.first_s) * 2.0 ** (max(tries - 1, 0) // self.equal), self.most_s)
 
     def after_s(self, pause_s: float) -> float:
         """Return the pause after one of this length."""

@@ -23,7 +23,7 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.ports import raw, sockets
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.mmsg import PlainBatch
+from gdp.ports.mmsg import MmsgBatch
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
@@ -60,16 +60,16 @@ EXPECTED: WeakKeyDictionary[Plane, int] = WeakKeyDictionary()  # frames that a p
 MakePlane = Callable[[Sequence[str], Table | None], Plane]
 
 
-def _plain(ifnames: Sequence[str], table: Table | None) -> Plane:
-    """Raw plane as it is where the C library cannot be called."""
+def _by_ctypes(ifnames: Sequence[str], table: Table | None) -> Plane:
+    """Raw plane as it is where no compiler built the burst core."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(raw, "make_batch", PlainBatch)
+        patch.setattr(raw, "make_batch", MmsgBatch)
         return RawPlane(ifnames, table)
 
 
 KINDS: dict[str, MakePlane] = {
     "raw": RawPlane,
-    "raw-plain": _plain,
+    "raw-ctypes": _by_ctypes,
     "scapy": ScapyPlane,
     "kernel": KernelPlane,
     "kernel-no-peer": partial(KernelPlane, peer=False),
@@ -77,7 +77,7 @@ KINDS: dict[str, MakePlane] = {
 }
 
 
-ALIKE = ("raw-plain", "kernel-no-peer", "kernel-clsact")  # each differs from another kind in a part of its way
+ALIKE = ("raw-ctypes", "kernel-no-peer", "kernel-clsact")  # each differs from another kind in a part of its way
 EVERY_KIND = pytest.mark.parametrize("make", list(KINDS.values()), ids=list(KINDS), indirect=True)
 
 

@@ -15,7 +15,7 @@ import resource
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Container, Generator, Iterable, Mapping
+from collections.abc import Collection, Container, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -97,11 +97,27 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Files:
 
 
 class _Files(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
-    """Files are units of work; those of ``_SPLIT`` are as many units as they have tests."""
+    """Files are units of work; those of ``_SPLIT`` are as many units as they have tests.
+
+    Some files compute, others wait. While the other workers compute more than files do on average, a worker gets the
+    longest file that computes less, otherwise the longest that computes more: the cores are busy from begin to end.
+    """
+
+    def __init__(self, config: pytest.Config, log: Any) -> None:
+        super().__init__(config, log)
+        self._known = _known()
+        self._shares: dict[object, float] = {}  # by worker: cores that its last unit keeps busy
 
     def _split_scope(self, nodeid: str) -> str:
         file = _file_of(nodeid)
         return nodeid if file in _SPLIT else file
+
+    def _assign_work_unit(self, node: Any) -> None:
+        others = [share for each, share in self._shares.items() if each is not node]
+        unit = _next_unit(self.workqueue, self._known, others)
+        self._shares[node] = _share(self._known, [unit])
+        self.workqueue.move_to_end(unit, last=False)
+        super()._assign_work_unit(node)
 
 
 class _Seconds:
@@ -197,6 +213,19 @@ def _known() -> dict[str, list[float]]:
 def _write(path: Path, files: Mapping[str, list[float]]) -> None:
     rows = ",\n".join(f"  {json.dumps(name)}: [{wall:.1f}, {spent:.1f}]" for name, (wall, spent) in files.items())
     path.write_text(f"{{\n{rows}\n}}\n", encoding="utf-8")
+
+
+def _next_unit(queue: Collection[str], known: Mapping[str, Sequence[float]], others: Collection[float]) -> str:
+    """Return the unit of work for a worker; ``others``: how many cores each other worker keeps busy."""
+    usual = _share(known, queue)
+    is_idle = sum(others) <= usual * len(others)
+    return next((unit for unit in queue if (_share(known, [unit]) > usual) is is_idle), next(iter(queue)))
+
+
+def _share(known: Mapping[str, Sequence[float]], units: Iterable[str]) -> float:
+    """Return how many cores the files of some units of work keep busy."""
+    rows = [known.get(file, _UNKNOWN) for file in {*map(_file_of, units)}]
+    return sum(processor_s for _, processor_s in rows) / max(sum(wall_s for wall_s, _ in rows), 0.1)
 
 
 def _file_of(nodeid: str) -> str:

@@ -1,10 +1,10 @@
-"""Budgets of folders: what takes half more than the other folders of its run is over its budget."""
+"""Budgets of folders: what takes half more than the other folders of its run is over its budget. Order of files."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.pool import _is_over, _lesser, _pace, folder_of
+from tests.pool import _is_over, _lesser, _next_unit, _pace, folder_of
 
 BUDGETS = {"tests/attacks": 100.0, "tests/journeys": 200.0, "netns_tests": 300.0, "tests/vectors": 1.0}
 
@@ -31,3 +31,17 @@ def test_a_folder_is_that_of_its_package() -> None:
     assert folder_of("tests/gdp/switch/test_table.py") == "tests/gdp/switch"
     assert folder_of("tests/attacks/test_joins.py") == "tests/attacks"
     assert folder_of("netns_tests/test_ring.py") == "netns_tests"
+
+
+def test_a_worker_waits_while_others_compute_and_computes_while_they_wait() -> None:
+    known = {
+        "waits.py": [9.0, 1.0],
+        "computes.py": [8.0, 8.0],
+        "waits_less.py": [2.0, 0.1],
+        "computes_less.py": [1.0, 1.0],
+    }
+    queue = ["waits.py::one", "computes.py", "waits_less.py", "computes_less.py"]  # the longest first
+    assert _next_unit(queue, known, []) == "computes.py"
+    assert _next_unit(queue, known, [0.1, 0.2]) == "computes.py"
+    assert _next_unit(queue, known, [0.1, 1.0]) == "waits.py::one"
+    assert _next_unit(queue[1::2], known, [1.0, 1.0]) == "computes.py"

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Sequence
-from itertools import islice
+from itertools import count, islice
 from typing import Final
 
 from cryptography.exceptions import InvalidTag
@@ -74,9 +74,9 @@ class MessageCipher:
         payloads: list[bytes] = []
         header, additional, size = bytearray(head), bytearray(), -1
         encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1
-        for part in range(first, end):
-            at, is_last = part * capacity - len(prefix), part == last
+        for part, at in zip(range(first, end), count(first * capacity - len(prefix), capacity), strict=False):
             plain = message[at : at + capacity] if part else (prefix + message[:capacity])[:capacity]
+            is_last = part == last
             if len(plain) != size or is_last:
                 size = len(plain)
                 header[FLAGS_AT] = head[FLAGS_AT] | _LAST * is_last
@@ -99,10 +99,10 @@ class MessageCipher:
             return None
 
     def open_run(
-        self, head: bytes, length: int, first: int, count: int, arrivals: Sequence[ReceivedFrame], at: int,
+        self, head: bytes, length: int, first: int, parts: int, arrivals: Sequence[ReceivedFrame], at: int,
         running: hashlib._Hash | None, plaintext: Plaintext, /,
     ) -> int:  # fmt: skip
-        """Open at most ``count`` consecutive parts from ``first`` on, in ``arrivals[at:]``; return how many.
+        """Open at most ``parts`` consecutive parts from ``first`` on, in ``arrivals[at:]``; return how many.
 
         A frame that does not begin, to the bit, as its part should ends the run, as does an altered one.
 
@@ -110,21 +110,23 @@ class MessageCipher:
             length: payload bytes of each part, none of which is the last.
             plaintext: to which that of the parts is appended.
         """
+        plains: list[bytes] = []
         payloads: list[bytes] = []
         decrypt, end, nonce = self._aead.decrypt, HEADER_BYTES + length, head[NUMBER_AT:PART_AT]
         before, behind = head[:LENGTH_AT] + _LENGTH.pack(length) + head[NUMBER_AT:PART_AT], head[PARTS_AT:]
         additional_behind = head[PARTS_AT:HEADER_BYTES]
         additional = before[:HOPS_AT] + before[HOPS_AT + 1 :]
-        for part, arrival in zip(range(first, first + count), islice(arrivals, at, None), strict=False):
+        for part, arrival in zip(range(first, first + parts), islice(arrivals, at, None), strict=False):
             frame, number = arrival.frame, part.to_bytes(4, "big")
             if not frame.startswith(before + number + behind):
                 break
             payload = frame[BODY_AT:end]
             try:
-                plaintext.append(decrypt(nonce + number, payload, additional + number + additional_behind))
+                plains.append(decrypt(nonce + number, payload, additional + number + additional_behind))
             except InvalidTag:
                 break
             payloads.append(payload)
+        plaintext.append(b"".join(plains))
         if running is not None:
             running.update(b"".join(payloads))
         return len(payloads)

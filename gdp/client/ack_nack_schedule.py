@@ -45,7 +45,7 @@ class AckNackSchedule:
         self._total_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
         self._has_come = False  # something has, since the report before
-        self._missing_s = REPORT_DELAY_S  # until what is missing is requested again
+        self._requests = 1  # of what is missing, with the next one, while nothing came
 
     def count(self, size: int, frames: int, receipts: int, number: int, part: int, came_s: float) -> None:
         """Count received bytes that no report confirms yet.
@@ -96,11 +96,10 @@ class AckNackSchedule:
 
     def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
         """Schedule the report after one that is sent now: ever later while something is missing and nothing comes."""
-        is_repeated = is_missing and not self._has_come
-        self._missing_s = _MISSING.after_s(self._missing_s) if is_repeated else _MISSING.first_s
+        self._requests = self._requests + 1 if is_missing and not self._has_come else 1
         if is_missing:
             self._clean_bytes = 0
-        self.due_s = now_s + (self._missing_s if is_missing else self.idle_s)
+        self.due_s = now_s + (_MISSING.pause_s(self._requests) if is_missing else self.idle_s)
 
     def _is_owed(self) -> bool:
         """Return whether enough bytes came for a report; the threshold grows while nothing is missing.

@@ -11,9 +11,9 @@ Sans-I/O. A participant builds on this, and so does a RIB.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import RightEvidence
@@ -39,7 +39,7 @@ from gdp.frame.kinds import Kind
 from gdp.intervals import SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
-from gdp.requests import Backoff
+from gdp.requests import Backoff, Requests
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.advertisement import MS, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
@@ -50,13 +50,15 @@ from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
-_ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
-_RENEWAL_AGAIN: Final = 1 / 12  # of a lease, until a renewal is acknowledged; the pause doubles, up to a third
+_FIRST_S: Final = 0.5  # until the first acknowledgement
+_FIRST: Final = Backoff(_FIRST_S, _FIRST_S)
+_RENEWAL_AGAIN: Final = 1 / 12  # of a lease: a renewal has some five frames, and is lost with any of them
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
 _IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnation may prove ended at any moment
 _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT: Final = SoftState(1_800, periods=4)  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
+_Key: TypeAlias = tuple[Name, Right]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -69,11 +71,9 @@ class PendingAdvertisement:
     is_global: bool
     paths: int = 1
     is_session: bool = False
-    advertisement_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
     sent_sequence: int = 0  # of the newest advertisement that was sent
-    renewals: int = 0  # sent since the last acknowledgement
     join_sequence: int = -1  # of the newest join for it that came from this switch
     joins: dict[int, Join] = field(default_factory=dict)  # the newest from this switch, by path
 
@@ -82,15 +82,10 @@ class PendingAdvertisement:
         """Return whether the overlay has accepted or rejected it."""
         return self.is_taken or self.refused is not None
 
-    def next_pause_s(self, renewals: Backoff) -> float:
-        """Count an advertisement that is sent now; return the seconds until it is repeated, unless it is acknowledged.
-
-        A renewal has some five frames, and is lost with any of them.
-        """
-        if not self.is_acknowledged:
-            return _ADVERTISEMENT_AGAIN_S
-        self.renewals += 1
-        return renewals.pause_s(self.renewals)
+    @property
+    def key(self) -> _Key:
+        """Return the name and the right, of which a node makes one advertisement."""
+        return self.subject.name, self.right
 
 
 class Attachment:
@@ -113,7 +108,7 @@ class Attachment:
         self._policy = policy
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
-        first_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * settings.lease_s)
+        first_s = min(_FIRST_S, _RENEWAL_AGAIN * settings.lease_s)
         self._renewals = Backoff(first_s, renew_after_s(settings.lease_s))
         self._sequence = settings.first_sequence
         self.started = settings.first_sequence
@@ -125,7 +120,8 @@ class Attachment:
         self.hello_protocol = HelloProtocol(
             identity, policy, self.fragmenter, settings, rtcert_for=self._rtcert_for if is_rib else None
         )
-        self._advertisements: dict[tuple[Name, Right], PendingAdvertisement] = {}
+        self._advertisements: dict[_Key, PendingAdvertisement] = {}
+        self._requests = Requests[_Key]()
         self._own: PendingAdvertisement | None = None  # of the node's own name
         self.switch: Neighbour | None = None
         self._switch_nonce = b""  # of the session with it
@@ -184,9 +180,11 @@ class Attachment:
             paths: over how many disjoint paths its frames are to travel.
             is_session: a session secret may authenticate its unicast streams.
         """
-        each = self._advertisements[subject.name, right] = PendingAdvertisement(
+        each = PendingAdvertisement(
             subject=subject, right=right, chain=chain, is_global=is_global, paths=paths, is_session=is_session
         )
+        self._advertisements[each.key] = each
+        self._requests.start(each.key, 0.0)
         if right is Right.ATTACH:
             self._own = each
 
@@ -201,10 +199,12 @@ class Attachment:
         """Replace the delegation of an advertised name by a newer one, and advertise it at once."""
         for (its, _), each in self._advertisements.items():
             if its == name:
-                each.chain, each.advertisement_at_s, each.refused = chain, 0.0, None
+                each.chain, each.refused = chain, None
+                self._requests.hasten(each.key, 0.0)
 
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
+        self._requests.cancel((name, right))
         if self._advertisements.pop((name, right), None) is not None and self.switch is not None:
             withdrawal = Withdrawal(name, right, self._next_sequence())
             self.say(Kind.WITHDRAW, withdrawal.to_wire(self._identity.name, self._identity.key))
@@ -331,21 +331,28 @@ class Attachment:
         self._sync.handle_timer(now.mono_s)
         if self.switch is None:
             return
-        for each in self._due_advertisements():
-            if each.advertisement_at_s <= now.mono_s:
-                each.advertisement_at_s = now.mono_s + each.next_pause_s(self._renewals)
-                self.say(Kind.ADVERTISE, self._advertisement_wire(each, now))
-                each.sent_sequence = self._sequence
+        due = self._poll_due(now.mono_s)
+        for key in [key for key in self._advertisements if key in due]:  # the node's own name first
+            each = self._advertisements[key]
+            self._requests.sent(key, now.mono_s, self._renewals if each.is_acknowledged else _FIRST)
+            self.say(Kind.ADVERTISE, self._advertisement_wire(each, now))
+            each.sent_sequence = self._sequence
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        at_s = [] if self.switch is None else [each.advertisement_at_s for each in self._due_advertisements()]
-        return earliest(self.hello_protocol.get_timer(), self._sync.get_timer(), *at_s)
+        if self.switch is None:
+            due_s = None
+        elif self._own is not None and self.is_in_use:
+            due_s = self._requests.due_s(self._own.key)
+        else:
+            due_s = self._requests.next_due()
+        return earliest(self.hello_protocol.get_timer(), self._sync.get_timer(), due_s)
 
-    def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
-        """Return the advertisements that may be sent: only the node's own name while another has this identity."""
-        own = self._own
-        return (own,) if own is not None and own.refused is DropReason.IN_USE else self._advertisements.values()
+    def _poll_due(self, now_s: float) -> list[_Key]:
+        """Return the advertisements to send now: only the node's own name while another has this identity."""
+        if self._own is None or not self.is_in_use:
+            return self._requests.poll_due(now_s)
+        return [self._own.key] if self._requests.due_s(self._own.key) <= now_s else []
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
@@ -374,8 +381,8 @@ class Attachment:
                 # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
                 # first. Without a RIB the others are valid on this switch only.
                 is_own = each.right is Right.ATTACH
-                at_s = advertisement_at_s if is_own else advertisement_at_s + _ADVERTISEMENT_AGAIN_S
-                each.advertisement_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
+                self._requests.start(each.key, advertisement_at_s if is_own else advertisement_at_s + _FIRST_S)
+                each.is_taken, each.refused, each.join_sequence = False, None, -1
                 each.joins.clear()
 
     def _advertisement_wire(self, each: PendingAdvertisement, now: Timestamps) -> bytes:
@@ -452,29 +459,29 @@ class Attachment:
     def _apply_ack(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
         if ack.refused is None:
             # a RIB that is new acknowledges what it receives from the switch; that renews no lease
-            if not each.is_taken or (each.renewals and ack.sequence >= each.sent_sequence):
-                each.advertisement_at_s, each.renewals = now_s + renew_after_s(self._lease_s), 0
+            if not each.is_taken or ack.sequence >= each.sent_sequence:
+                self._requests.answered(each.key, now_s + renew_after_s(self._lease_s))
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:
                 for other in self._advertisements.values():
                     if not other.is_acknowledged:
-                        other.advertisement_at_s = min(other.advertisement_at_s, now_s)
+                        self._requests.hasten(other.key, now_s)
             return
         self.refusals[ack.refused] += 1
-        each.is_taken, each.renewals = False, 0
+        each.is_taken = False
         if ack.refused is DropReason.STALE:
             self._sequence = self.started = max(self._sequence, ack.sequence)
-            each.advertisement_at_s = now_s  # an earlier incarnation of ours was ahead: retry above its number
+            pause_s = 0.0  # an earlier incarnation of ours was ahead: retry above its number
         elif ack.refused is DropReason.IN_USE and each.right is Right.ATTACH:
             if each.refused is not ack.refused:
                 self._in_use_s = now_s
             each.refused = ack.refused
-            each.advertisement_at_s = now_s + (_IN_USE_SOON_S if now_s < self._in_use_s + _IN_USE_S else _IN_USE_S)
+            pause_s = _IN_USE_SOON_S if now_s < self._in_use_s + _IN_USE_S else _IN_USE_S
             self.clashes += 1
         else:
             each.refused = ack.refused
-            # it may be accepted later; frequent repetition does not help
-            each.advertisement_at_s = now_s + renew_after_s(self._lease_s)
+            pause_s = renew_after_s(self._lease_s)  # it may be accepted later; frequent repetition does not help
+        self._requests.start(each.key, now_s + pause_s)
 
     def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
         if neighbour is self.switch:

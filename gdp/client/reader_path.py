@@ -212,8 +212,7 @@ class ReaderPath:
         """
         if not self.controller.rate.inflight:
             return
-        timeout_s = _TIMEOUTS.bounded_s(_TIMEOUT_TRIPS * self._trip_s) * 2 ** min(self._timeouts, _DOUBLINGS_MAX)
-        timeout_s = min(timeout_s, _TIMEOUTS.most_s)
+        timeout_s = _TIMEOUTS.pause_s(min(self._timeouts, _DOUBLINGS_MAX) + 1, _TIMEOUT_TRIPS * self._trip_s)
         if now_s - self._confirmed_s >= timeout_s:
             self._timeouts += 1
             self.controller.timed_out(now_s)

@@ -26,14 +26,13 @@ from gdp.intervals import FORGET_S, NEVER_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart
 from gdp.names import Name
+from gdp.requests import Backoff
 
 __all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
 
 READERS_MAX: Final = 1_024
 _INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered, and readers given up
 _EPOCHS_KEPT: Final = 2  # the one in use and the one before
-_SUSPENSION_MIN_LAGS: Final = 2
-_SUSPENSION_MAX_LAGS: Final = 16
 
 
 class ReaderTimeouts(NamedTuple):
@@ -122,6 +121,7 @@ class ReaderProxies:
         self._topic = topic
         self._source = source
         self._patience = patience
+        self._suspensions = Backoff(2 * patience.lag_s, 16 * patience.lag_s)
         self.active: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
@@ -195,9 +195,8 @@ class ReaderProxies:
     def suspend_again(self, name: bytes, now_s: float) -> None:
         """Exclude a reader from the window for a penalty time, each time for longer."""
         reading = self.active[name]
-        lags = min(_SUSPENSION_MIN_LAGS << reading.suspensions, _SUSPENSION_MAX_LAGS)
-        reading.out_until_s = now_s + lags * self._patience.lag_s
-        reading.suspensions = min(reading.suspensions + 1, _SUSPENSION_MAX_LAGS)
+        reading.suspensions += 1
+        reading.out_until_s = now_s + self._suspensions.pause_s(reading.suspensions)
 
     def record_key(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
         """Note the key of one incarnation of a reader, proven by its introduction or advertisement.

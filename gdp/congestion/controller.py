@@ -34,6 +34,7 @@ from gdp.congestion.delivery_rate import DeliveryRate, Flight
 from gdp.congestion.pacer import Pacer
 from gdp.congestion.path_model import FIRST_RTT_S, PathModel
 from gdp.congestion.states import TRANSITIONS, Signal, State
+from gdp.requests import Backoff
 
 __all__ = ["PathController"]
 
@@ -61,7 +62,7 @@ _FALL_SHARE: Final = 0.7
 _DRAIN_QUEUES: Final = 4  # so many times the wanted queue is drained at once
 _STANDING_S: Final = 0.005  # a shorter queue is no competitor
 _EMPTY_SHARE: Final = 0.1  # of the highest queue; Copa, section 2.2
-_PROBE_S: Final = (10.0, 60.0)  # first pause before a probe, and the longest one
+_PROBES: Final = Backoff(10.0, 60.0)
 _PROBE_SHARE: Final = 0.5
 _CLAIM_S, _ALONE_S = 10.0, 2.0
 _TRIAL_S, _TRIAL_SHARE, _TRIAL_ROUNDS = 10.0, 0.8, 6
@@ -115,7 +116,7 @@ class PathController:
         self._cubic: Cubic | None = None
         self._lost_until_s = 0.0
         self._claims_until_s = 0.0
-        self._probe_pause_s = _PROBE_S[0]
+        self._probes = 1  # with the next one, since the path or the other flow was new
         self._probe_at_s = self._probe_begun_s = 0.0
         self._shared_rate, self._trial_rounds, self._was_alone = 0.0, 0, False
 
@@ -346,7 +347,7 @@ class PathController:
     def _try_alone(self, now_s: float, *, is_used: bool) -> None:
         """Find out after a competition whether the other flow takes what this one has given up."""
         if now_s - self._entered_s > _TRIAL_S:
-            self._cubic, self._probe_pause_s, self._shared_rate = None, _PROBE_S[0], 0.0
+            self._cubic, self._probes, self._shared_rate = None, 1, 0.0
         elif is_used:
             self._trial_rounds += 1
             is_less = self.model.recent_bytes_s < _TRIAL_SHARE * self._shared_rate
@@ -426,9 +427,9 @@ class PathController:
                 self._cubic = Cubic(max(self.window, self._half_window()) / self._mtu, now_s)
             else:
                 self._cubic.resume(now_s - self._probe_begun_s)
-                self._probe_pause_s = min(2 * self._probe_pause_s, _PROBE_S[1])
+                self._probes += 1
             self.window = self._cubic.window * self._mtu
-            self._probe_at_s = now_s + self._probe_pause_s
+            self._probe_at_s = now_s + _PROBES.pause_s(self._probes)
         elif self.state is State.PROBE:
             self._probe_begun_s, self._probe_from_s = now_s, self.model.standing_s
             self._shared_rate = max(self._shared_rate, self.model.recent_bytes_s)

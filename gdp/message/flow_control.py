@@ -77,7 +77,7 @@ class FlowControl:
         self._quiet_s = now_s
         trip = self.round_trip
         trip.handle_acknowledged(acked_at, now_s)
-        self._probe_s = PROBES.bounded_s(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
+        self._probe_s = PROBES.pause_s(1, 3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
 
     def restart_probe(self, now_s: float) -> None:
         """Restart the probe timer: nothing is under way."""

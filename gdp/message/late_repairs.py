@@ -39,11 +39,13 @@ from gdp.limits import NACKS_PER_REPORT, REPAIR_S, REPAIRS_ABOVE_PARTS, REPORT_D
 from gdp.message.acknack import MissingRange
 from gdp.message.flow_control import RoundTripEstimator
 from gdp.message.reassembly import SCAN_PARTS, Reassembler
+from gdp.requests import Backoff
 
 __all__ = ["HOLD_S", "LateRepairs"]
 
 HOLD_S: Final = 0.3  # for which a complete message waits for an older one
 _TRIES: Final = 6  # requests for the same fragments, if nothing comes
+_REPEATS: Final = Backoff(REPORT_DELAY_S, 32 * REPORT_DELAY_S)  # until a repair was measured
 _UNANSWERED: Final = 2  # messages in a row that were requested, and got nothing: this writer does not repair
 _MESSAGES_MAX: Final = 64  # incomplete messages that are repaired; of more, the one that is needed last is not
 _REQUESTS_MAX: Final = 32  # of one message that wait for their repairs
@@ -349,7 +351,7 @@ class LateRepairs:
         """Return when a request is repeated."""
         repair = self._repair
         if repair.rtt_s is None:
-            return request.last_s + REPORT_DELAY_S * (1 << request.tries - 1)
+            return request.last_s + _REPEATS.pause_s(request.tries)
         return request.last_s + max(repair.rtt_s + max(4 * repair.deviation_s, _MARGIN_S), REPORT_DELAY_S)
 
     def _next_s(self, entry: _Incomplete) -> float:

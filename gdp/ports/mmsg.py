@@ -18,7 +18,7 @@ import errno
 import socket
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from gdp import burst
 from gdp.errors import DropReason
@@ -27,7 +27,7 @@ from gdp.frame.kinds import ETHERTYPE
 from gdp.ports.sockets import waited_s
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["SLOTS", "CompiledBatch", "MmsgBatch", "MmsgPool", "make_batch", "put_one", "send_failure"]
+__all__ = ["SLOTS", "CompiledBatch", "MmsgBatch", "make_batch", "put_one", "send_failure"]
 
 SLOTS: Final = 64
 _TAKE_BYTES: Final = 128 << 10  # approximate size of one batch, so that urgent frames wait only briefly
@@ -44,36 +44,6 @@ _SEND_ERRORS: Final = {
 def send_failure(number: int) -> tuple[DropReason, bool]:
     """Return the drop reason for the errno of a send, and whether the frames after it may still be sent."""
     return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
-
-
-class MmsgPool(Protocol):
-    """A pool of ``SLOTS`` slots.
-
-    Attributes:
-        pool: the slots, contiguous.
-        slot_bytes: size of one slot; a longer frame arrives truncated.
-    """
-
-    pool: bytearray
-    slot_bytes: int
-
-    def receive(self, source: socket.socket) -> list[int]:
-        """Fill slots with the frames that arrived, without waiting; return their bytes after each Ethernet header."""
-
-    def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
-        """Return the frames that arrived at a port's socket, without waiting."""
-
-    def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames (from the GDP header on) from the caller's memory.
-
-        Returns how many were sent; the others are counted in ``drops``.
-        """
-
-    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send the slots ``first`` to ``first + count``, last filled by ``receive``, under new addresses.
-
-        Returns how many were sent; the others are counted in ``drops``.
-        """
 
 
 def _take_max(slot_bytes: int) -> int:
@@ -118,7 +88,12 @@ class _MmsgHdr(ctypes.Structure):
 
 
 class MmsgBatch:
-    """``MmsgPool`` over ``recvmmsg`` and ``sendmmsg``, through ctypes."""
+    """Pool of ``SLOTS`` slots, over ``recvmmsg`` and ``sendmmsg`` through ctypes.
+
+    Attributes:
+        pool: the slots, contiguous.
+        slot_bytes: size of one slot; a longer frame arrives truncated.
+    """
 
     def __init__(self, slot_bytes: int) -> None:
         library = ctypes.CDLL(None, use_errno=True)
@@ -160,7 +135,7 @@ class MmsgBatch:
         self._sizes = memoryview(self._out_vectors).cast("B").cast("L")[3::4]  # size_t
 
     def receive(self, source: socket.socket) -> list[int]:
-        """Receive the frames that wait at a socket; return their bytes after each Ethernet header, as ``MmsgPool``."""
+        """Fill slots with the frames that arrived, without waiting; return their bytes after each Ethernet header."""
         got = self._receive(source.fileno(), self._in_at, self._take_max, _DONTWAIT, None)
         if got <= 0:  # no frames, or the device went down: the link monitor reports it
             return []
@@ -172,12 +147,15 @@ class MmsgBatch:
         return sizes
 
     def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
-        """Return the frames that arrived at a port's socket, as ``MmsgPool``."""
+        """Return the frames that arrived at a port's socket, without waiting."""
         sizes = self.receive(source)
         return burst.received(self.pool, self.slot_bytes, sizes, port, waited_s(source)) if sizes else []
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
+        """Send frames (from the GDP header on) from the caller's memory, to one pair of addresses.
+
+        Returns how many were sent; the others are counted in ``drops``.
+        """
         left = 0
         for first in range(0, len(frames), SLOTS):
             some = frames[first : first + SLOTS]
@@ -189,7 +167,7 @@ class MmsgBatch:
         return left
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many were sent."""
+        """Send the slots ``first`` to ``first + count``, last filled by ``receive``, as ``send``."""
         return self._submit(sink, self._out_at, first, count, macs, drops)
 
     def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
@@ -205,19 +183,19 @@ class MmsgBatch:
 
 
 class CompiledBatch(MmsgBatch):
-    """``MmsgPool`` over the burst core: frames stay where the kernel wrote them until they are read."""
+    """``MmsgBatch`` over the burst core: frames stay where the kernel wrote them until they are read."""
 
     def __init__(self, slot_bytes: int) -> None:
         super().__init__(slot_bytes)
         self._receiver = burst.SYSTEM_CALLS.Receiver(slot_bytes, self._take_max)
 
     def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
-        """Return the frames that arrived at a port's socket, as ``MmsgPool``."""
+        """Return the frames that arrived at a port's socket, as ``MmsgBatch``."""
         arrivals: Sequence[ReceivedFrame] = self._receiver.receive(source.fileno(), port)
         return arrivals
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
+        """Send frames to one pair of addresses; return how many were sent, as ``MmsgBatch``."""
         send, head = burst.SYSTEM_CALLS.send, (macs + _ETHERTYPE)[:ETHER_BYTES]
         return _send_all(lambda at: send(sink.fileno(), frames, at, head), 0, len(frames), drops)
 
@@ -232,6 +210,6 @@ def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) ->
     return 1
 
 
-def make_batch(slot_bytes: int) -> MmsgPool:
+def make_batch(slot_bytes: int) -> MmsgBatch:
     """Return a pool over the burst core in use."""
     return MmsgBatch(slot_bytes) if burst.SYSTEM_CALLS is None else CompiledBatch(slot_bytes)

@@ -31,7 +31,7 @@ from gdp.frame.codec import (
 from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
-from gdp.ports.mmsg import MmsgPool, make_batch, put_one
+from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import Port, ReceivedFrame
 from gdp.ports.sockets import (
@@ -81,7 +81,7 @@ class RawPlane(NetdevPlane):
         self._sockets_by_class: dict[TrafficClass, dict[int, socket.socket]] = {
             traffic_class: {} for traffic_class in _CLASSES
         }  # by port
-        self._batch: MmsgPool = make_batch(OVERHEAD_BYTES)
+        self._batch: MmsgBatch = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
         self._resting: dict[int, tuple[socket.socket, float]] = {}  # sockets that pause until then, by file descriptor
         super().__init__(ifnames, table)

@@ -163,7 +163,8 @@ def _receive_relay(state: RibCoreState, statement: Statement, now: Timestamps) -
     if not (member.role.is_switch or member.role is Role.RIB):
         raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
     statement.verify(member.key)
-    state.lower.record_alive(member.name, now.mono_s)
+    if member.role is Role.RIB:
+        state.lower.record_alive(member.name, now.mono_s)
     inner = parse(relayed.statement)
     if (handle := _RELAYED.get(inner.type)) is None:
         raise StatementError(DropReason.MALFORMED, f"a RIB takes no relayed {inner.type.value}")

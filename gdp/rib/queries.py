@@ -38,7 +38,8 @@ def receive_query(state: RibCoreState, statement: Statement, now: Timestamps) ->
     if not (member.role.is_switch or member.role is Role.RIB):
         raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
     statement.verify(member.key)
-    state.lower.record_alive(member.name, now.mono_s)
+    if member.role is Role.RIB:
+        state.lower.record_alive(member.name, now.mono_s)
     query = Query.from_fields(statement.fields)
     if query.name == state.identity.name:
         state.outbox.send_none(query.name, member.name)  # a probe for a sign of life

@@ -6,6 +6,7 @@ as the key says.
 
 from __future__ import annotations
 
+from gdp.burst import VARIANT
 from gdp.sansio import Timestamps
 from gdp.state.diagnostic_control import Row, TableSource
 from gdp.state.node_state import NodeState
@@ -64,6 +65,7 @@ def _links(state: NodeState) -> list[Row]:
             "cost": min(costs.get(port.ifname, ()), default=None),
             "neighbors": len(costs.get(port.ifname, ())),
             "mac": port.mac.hex(":"),
+            "burst_core": VARIANT,
         }
         for index, port in sorted(state.plane.ports.items())
     ]

@@ -193,7 +193,7 @@ class SwitchCore:
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Add a port, or update the MTU or cost of one that is up."""
         self._rest_due_s = None
-        self._flooding.look_at_clock(now)
+        self.state.now = now
         changes = self.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
         for change in changes:
             self._neighbour_changed(change, now.mono_s)
@@ -203,44 +203,47 @@ class SwitchCore:
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Handle a change of a port's link."""
         self._rest_due_s = None
-        self._flooding.look_at_clock(now)
+        self.state.now = now
         for change in self.hello_protocol.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
         self._path_updates.follow(now.mono_s)  # at once: frames over this link would be lost
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Handle frames that the data plane punted."""
-        has_others = False
-        self._flooding.look_at_clock(now)
+        has_control = has_data = False
+        self.state.now = now
         for arrival in arrivals:
             try:
                 header = decode(arrival.frame)
                 if header.kind == Kind.KEEPALIVE:
                     self._take_keepalive(arrival, header, now)
+                elif header.kind >= CONTROL_FROM:
+                    has_control |= self._receive_control(arrival, header, now)
                 else:
-                    has_others |= self._receive_frame(arrival, header, now)
+                    has_data |= self._receive_data(arrival, header, now)
             except RemoteError as error:
-                has_others = True
+                has_control = True
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not stop the switch
-                has_others = True
+                has_control = True
                 self.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
         if recosted := self.hello_protocol.neighbours.poll_costs():
-            has_others = True
+            has_control = True
             for change in recosted:
                 self._neighbour_changed(change, now.mono_s)
-        if has_others:
-            self._rest_due_s = None
+        if has_control:  # neighbours, links and identities change by nothing else
             self.rib_client.presence.answer(now.mono_s)
-            self.diagnostics.answer_waiting(now)
             self._flooding.tell_of_conflicts(now.mono_s)
             self._path_updates.plan(now.mono_s)
+        if has_control or has_data:
+            self._rest_due_s = None
+            self.diagnostics.answer_waiting(now)
 
     def handle_timer(self, now: Timestamps) -> None:
         """Run the timers that are due."""
         now_s = now.mono_s
-        self._flooding.look_at_clock(now)
+        self.state.now = now
         lost = self.hello_protocol.drop_silent(now_s)
         for change in lost:
             self._neighbour_changed(change, now_s)
@@ -337,27 +340,31 @@ class SwitchCore:
 
     def _take_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
         neighbour = self.hello_protocol.receive_keepalive(arrival, header, now)
+        if neighbour.name in self.rib_client.presence.open:
+            self.rib_client.presence.answer(now.mono_s)
         if neighbour.role.is_switch:
             self._flooding.compare(neighbour, now.mono_s)
 
-    def _receive_frame(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> bool:
-        """Handle a frame other than a keepalive; return False if it is a fragment whose statement is not complete."""
-        if header.kind >= CONTROL_FROM:
-            if header.kind not in _CONTROL:
-                raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
-            if header.kind == Kind.COOKIE:
-                self.hello_protocol.receive_cookie(arrival, header)
-                return True
-            if header.kind == Kind.HELLO:
-                wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
-            else:
-                self._sender(arrival)  # unknown senders get no state
-                wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
-            if wire is not None:
-                statement = parse(wire)
-                with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
-                    self._take_control(arrival, header.kind, statement, now)
-            return wire is not None
+    def _receive_control(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> bool:
+        """Handle a neighbour's control frame; return False if it is a fragment whose statement is not complete."""
+        if header.kind not in _CONTROL:
+            raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
+        if header.kind == Kind.COOKIE:
+            self.hello_protocol.receive_cookie(arrival, header)
+            return True
+        if header.kind == Kind.HELLO:
+            wire = self.hello_protocol.reception.join(arrival, header, now.mono_s)
+        else:
+            self._sender(arrival)  # unknown senders get no state
+            wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
+        if wire is not None:
+            statement = parse(wire)
+            with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
+                self._take_control(arrival, header.kind, statement, now)
+        return wire is not None
+
+    def _receive_data(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> bool:
+        """Handle a frame that is for a name; return False if it is a fragment whose statement is not complete."""
         neighbour = self._sender(arrival)  # their frames cause no response and no query
         if header.kind == Kind.DIAGNOSTIC_REQUEST and header.hops_left & HOPS_MASK <= 1:
             if self.state.trees.of_topic(Name(header.destination)):
@@ -372,7 +379,8 @@ class SwitchCore:
             sought = self.unicast.miss(header, frame, neighbour, now.mono_s)
             if sought is not None and self.resolver.cache.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
-            self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
+            if header.destination in self.relocations.moved_names:
+                self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
         return True
 
     def _take_control(self, arrival: ReceivedFrame, kind: int, statement: Statement, now: Timestamps) -> None:

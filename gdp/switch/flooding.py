@@ -63,7 +63,6 @@ class Flooding:
         self._answers: dict[tuple[bytes, Scope], int] = {}  # by incarnation: how often it exceeded our sequence number
         self.is_displaced = False
         self._conflicts_seen = 0
-        self._unix_ahead_s = 0.0  # wall clock minus monotonic clock
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
@@ -78,10 +77,6 @@ class Flooding:
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope does not renew the other
         self._synced_s: dict[tuple[int, Name], float] = {}
         self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other digests
-
-    def look_at_clock(self, now: Timestamps) -> None:
-        """Take over the wall clock, before anything is originated."""
-        self._unix_ahead_s = now.unix_s - now.mono_s
 
     def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> bool:
         """Handle a link state that a neighbour passed on; return whether it was news.
@@ -246,6 +241,7 @@ class Flooding:
             return
         self._said[scope] = said
         self._sequence += 1
+        now = self._state.now
         state = LinkState(
             origin=self._state.me,
             domain=self._domain,
@@ -257,7 +253,7 @@ class Flooding:
             members=members,
             incarnation_id=self._incarnation_id,
             refused=refused,
-            said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
+            said_unix_s=max(int(now_s + (now.unix_s - now.mono_s)), 0),
             is_leaf=self._is_leaf,
         ).fitted(self._state.identity.membership)
         wire = self._state.signed_wire(state)

@@ -137,7 +137,7 @@ class LocalAdvertisements:
         Args:
             trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
         """
-        interval_s = _RELAYS.bounded_s(_ROUND_TRIPS * trip_s)
+        interval_s = _RELAYS.pause_s(1, _ROUND_TRIPS * trip_s)
         # behind a slow link the relays of all names are a queue of their own, for which the next ones must not count
         repeats, due = Backoff(interval_s, interval_s if interval_s == _RELAYS.first_s else _RELAYS.most_s), []
         for key in self._relays.poll_due(now_s):

@@ -78,17 +78,20 @@ class LocationUpdates:
             location = replace(before, expires_s=max(before.expires_s, location.expires_s))
         self._state.dependents.note_place(location)
         self._state.resolver.receive_location(location, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
+        has_readers = location.right in HEARS.values()
+        names = dict.fromkeys((location.name, location.advertiser))
         if before is None or (before.switch, before.domain) != (location.switch, location.domain):
-            self._unicast.remove(location.name)
-            self._unicast.remove(location.advertiser)
-            self._multicast.publisher_moved(location, now_s)
+            self._unicast.remove(*names)
+            if has_readers:
+                self._multicast.publisher_moved(location, now_s)
             if was_here and not is_ours:
                 self._relocations.moved(location, statement, now_s)
-        self._multicast.publisher_found(location, now_s)
-        if before is None or before.advertisement != location.advertisement:
-            for at, reader in self._state.readers.of(location.name).items():
-                self.send_to_reader(at, reader.advertisement.right, location, now_s)
-        for name in (location.name, location.advertiser):
+        if has_readers:
+            self._multicast.publisher_found(location, now_s)
+            if before is None or before.advertisement != location.advertisement:
+                for at, reader in self._state.readers.of(location.name).items():
+                    self.send_to_reader(at, reader.advertisement.right, location, now_s)
+        for name in names:
             self._unicast.release(name, now_s)
 
     def receive_relocation(self, statement: Statement, now: Timestamps) -> None:

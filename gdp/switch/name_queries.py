@@ -4,8 +4,11 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A query is repeated until a response comes. A name that attached readers want, or that frames are sent to, is watched:
 its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. A link that loses
-frames loses both this renewal and the RIB's updates, so the renewal is repeated, too (``gdp/requests.py``). Queries for
-new names pass the query window (``query_window.py``).
+frames loses both this renewal and the RIB's updates, so the renewal is repeated, too (``gdp/requests.py``).
+
+At most ``WINDOW`` queries for new names are in flight, so that a switch queries at the pace at which the RIB responds.
+Otherwise repeated queries would lengthen the queue at the RIB, and no response would come in time. Names that wait for
+the window are served round robin by owner.
 
 An answer may not help the frames that wait: the node was attached here and is silent, which the RIB does not know yet.
 They ask again. So a query follows the one before after ``RETRY_S`` at the soonest, answered or not. A RIB that does not
@@ -20,16 +23,17 @@ from typing import Final
 
 from gdp.intervals import ADVERTISEMENT, NEVER_S
 from gdp.limits import PENDING_S
+from gdp.message.fair_queue import FairQueue
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
-from gdp.switch.query_window import QueryWindow
 
-__all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX", "NameQueries"]
+__all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX", "WINDOW", "NameQueries"]
 
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
 _QUERIES: Final = Backoff(RETRY_S, 2.0, equal=TRIES_MAX)
 _RENEWALS: Final = 3  # repeated soon; on a link whose queue is full, more would keep it full
+WINDOW: Final = 128  # a tenth of a second's work of a RIB
 QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
 BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
 USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
@@ -60,7 +64,8 @@ class NameQueries:
         self._use_renewals = Backoff(RETRY_S, watch_s / 2, growing=_RENEWALS)
         self._queries: dict[Name, _Query] = {}
         self._requests = Requests[Name]()
-        self._window = QueryWindow()
+        self._new = FairQueue[Name]()  # names that wait for the window, by owner
+        self._in_flight: set[Name] = set()  # in the window
         self._watches = 0
 
     def __len__(self) -> int:
@@ -81,7 +86,7 @@ class NameQueries:
         if query is None:
             if len(self._queries) - self._watches < QUERIES_MAX:
                 self._add(name, _Query(since_s=now_s, owner=owner), NEVER_S)
-                self._window.put(owner, name)
+                self._new.put(owner, name)
         elif not self._requests.is_open(name):
             self._requests.start(name, max(now_s, query.sent_s + RETRY_S))
 
@@ -95,7 +100,7 @@ class NameQueries:
         if query is None:
             query = self._add(name, _Query(since_s=now_s), now_s)
         if not query.is_watch:
-            self._window.cancel(query.owner, name)
+            self._new.discard(query.owner, name)
             query.is_watch = True
             self._requests.hasten(name, now_s)
             self._watches += 1
@@ -132,7 +137,7 @@ class NameQueries:
         if not self._is_needed(query, now_s):
             self._remove(name)
             return
-        self._window.answered(name)
+        self._in_flight.discard(name)
         self._requests.answered(name, now_s + self._renewals(query).most_s)
 
     def receive_unknown(self, name: Name, rib: Name, now_s: float, others: AbstractSet[Name]) -> None:
@@ -169,20 +174,24 @@ class NameQueries:
             self._remove(name)
             if is_open:
                 failed.append(name)
-        while len(queries) < BATCH_MAX and self._window.is_ready:
-            name = self._window.pop()
+        while len(queries) < BATCH_MAX and self._is_window_ready():
+            name = self._new.pop()
             query = self._queries[name]
             if now_s >= query.since_s + PENDING_S:  # the frame that needs it has expired
                 self._remove(name)
                 failed.append(name)
                 continue
-            self._window.sent(name)
+            self._in_flight.add(name)
             queries.append((name, self._sent(name, query, now_s)))
         return queries, failed
 
     def next_due(self) -> float | None:
         """Return a monotonic second that is no later than the next query, or None."""
-        return float("-inf") if self._window.is_ready else self._requests.next_due()
+        return -NEVER_S if self._is_window_ready() else self._requests.next_due()
+
+    def _is_window_ready(self) -> bool:
+        """Return whether a new name waits and the window has space for it."""
+        return bool(self._new) and len(self._in_flight) < WINDOW
 
     def _sent(self, name: Name, query: _Query, now_s: float) -> float:
         """Record one try of a query; return for how many seconds the RIB shall watch its name."""
@@ -204,6 +213,6 @@ class NameQueries:
         return query
 
     def _remove(self, name: Name) -> None:
-        self._window.cancel(self._queries.pop(name).owner, name)
-        self._window.answered(name)
+        self._new.discard(self._queries.pop(name).owner, name)
+        self._in_flight.discard(name)
         self._requests.cancel(name)

@@ -52,10 +52,6 @@ class PendingFrames:
         waiting = _PendingFrame(frame, now_s + PENDING_S if until_s is None else until_s, owner)
         self._by_name.setdefault(name, deque()).append(waiting)
 
-    def is_waiting(self, name: bytes) -> bool:
-        """Return whether frames wait for a name."""
-        return name in self._by_name
-
     def release(self, name: bytes) -> list[tuple[bytes, float, bytes]]:
         """Remove and return, in order, the frames that wait for a name, each with its ``until_s`` and owner."""
         waiting = self._by_name.pop(name, deque())

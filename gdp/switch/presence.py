@@ -28,18 +28,22 @@ class _Question:
 
 
 class PresenceAnswers:
-    """Open questions of RIBs about attached nodes."""
+    """Open questions of RIBs about attached nodes.
+
+    Attributes:
+        open: by the node that each is about.
+    """
 
     def __init__(self, state: ForwardingState, unicast: Unicast) -> None:
         self._state = state
         self._unicast = unicast
-        self._open: dict[Name, _Question] = {}
+        self.open: dict[Name, _Question] = {}
 
     def handle_question(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
         """Handle a RIB's verified question; the node receives it, too, if it is there."""
-        if len(self._open) >= _OPEN_MAX and presence.node not in self._open:
+        if len(self.open) >= _OPEN_MAX and presence.node not in self.open:
             return  # the RIB repeats its question
-        self._open[presence.node] = _Question(presence, rib, now_s)
+        self.open[presence.node] = _Question(presence, rib, now_s)
         held = self._state.attached.get(presence.node, presence.node)
         if held is not None and held.advertisement.incarnation == presence.incarnation:
             self._state.outbox.say_at(held.port, held.mac, Kind.ADVERTISE_ACK, wire)
@@ -47,10 +51,10 @@ class PresenceAnswers:
 
     def answer(self, now_s: float) -> None:
         """Answer the questions that can be answered; cheap when none is open."""
-        for question in list(self._open.values()):
+        for question in list(self.open.values()):
             is_there = self._is_there(question)
             if is_there is not None:
-                del self._open[question.presence.node]
+                del self.open[question.presence.node]
                 answer = replace(question.presence, is_answer=True, is_there=is_there)
                 wire = self._state.signed_wire(answer)
                 self._unicast.send_statement(Kind.RIB_REQUEST, wire, question.rib, now_s)

@@ -63,7 +63,11 @@ class _Moved:
 
 
 class Relocations:
-    """Handles the nodes of one switch that came from, or went to, another switch."""
+    """Handles the nodes of one switch that came from, or went to, another switch.
+
+    Attributes:
+        moved_names: that went to another switch, and until when frames for them are redirected.
+    """
 
     def __init__(self, state: ForwardingState, multicast: MulticastTrees, unicast: Unicast) -> None:
         self._state = state
@@ -73,7 +77,7 @@ class Relocations:
         self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose responses are accepted, until when
         self._departed: OrderedDict[_Key, float] = OrderedDict()
         self._moved: OrderedDict[_Key, _Moved] = OrderedDict()
-        self._moved_names: dict[Name, float] = {}  # of ``_moved``, until when
+        self.moved_names: dict[Name, float] = {}
         self._said: OrderedDict[tuple[Name, int, bytes], float] = OrderedDict()
 
     def arrived(self, advertisement: Advertisement, now_s: float) -> None:
@@ -111,9 +115,9 @@ class Relocations:
         """Record the new location of a node; redirect the switches that take its topic from here."""
         until_s = now_s + GRACE_S
         _remember(self._moved, (location.name, location.advertiser), _Moved(statement, until_s))
-        if len(self._moved_names) > 2 * _REMEMBERED_MAX:
-            self._moved_names = {name: end_s for name, end_s in self._moved_names.items() if end_s > now_s}
-        self._moved_names[location.name] = until_s
+        if len(self.moved_names) > 2 * _REMEMBERED_MAX:
+            self.moved_names = {name: end_s for name, end_s in self.moved_names.items() if end_s > now_s}
+        self.moved_names[location.name] = until_s
         for at in self._multicast.below(location.name, location.advertiser):
             self._state.outbox.say_at(*at, Kind.REDIRECT, statement)
 
@@ -122,7 +126,7 @@ class Relocations:
 
         For ``GRACE_S`` no table entry exists for such a node, so that each of its frames is punted here.
         """
-        if self._moved_names.get(destination, 0.0) <= now_s:
+        if self.moved_names.get(destination, 0.0) <= now_s:
             return
         self._unicast.remove(destination)
         if not neighbour.role.is_switch:

@@ -114,10 +114,10 @@ class RibClient:
 
     def _rib_for(self, name: Name, now_s: float) -> Name | None:
         """Return the RIB to query for a name."""
+        if not self._others:
+            return self.rib
         passed_over = self._state.resolver.queries.passed_over(name)
         left = [rib for rib in self._others if rib.name not in passed_over] or self._others
-        if not left:
-            return self.rib
         known = self._state.resolver.cache.of(name, now_s)
         sources, domains = {place.source[0] for place in known if place.source}, {place.domain for place in known}
         avoided = {rib for rib, until_s in self._avoided.items() if until_s > now_s}

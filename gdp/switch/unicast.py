@@ -113,10 +113,11 @@ class Unicast:
         """Return whether ``refresh_more`` has work left."""
         return bool(self._stale)
 
-    def remove(self, name: Name) -> None:
-        """Remove the entries to a name whose location has changed, negative ones included."""
-        for key in list(self._keys_of.get(name, ())):
-            self._uninstall(key)
+    def remove(self, *names: Name) -> None:
+        """Remove the entries to names whose location has changed, negative ones included."""
+        for name in names:
+            for key in list(self._keys_of.get(name, ())):
+                self._uninstall(key)
 
     def entry_removed(self, key: bytes) -> _Installed | None:
         """Forget an entry that is not in the table any more; return why it stood there, if it was one of these."""

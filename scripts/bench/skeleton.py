@@ -16,11 +16,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from machine import ROOT, MachineState, RefusedError, machine_state, require_trust, require_writable
+from machine import ROOT, MachineState, RefusedError, calibration, machine_state, require_trust, require_writable
 from plot import Panel, require_plot, save_bars
 from report import Rounds, Settings, Target, progress, show, write_json
 
@@ -183,7 +183,9 @@ def perform(options: Options, measure: Callable[[Options], Outcome]) -> None:
         if is_saved and hasattr(options, "allow_load"):
             _require_page(options, state)
         RunRegistry().sweep()  # remains of a killed run
+        calibrated = calibration()
         outcome = measure(options)
+    outcome = replace(outcome, settings={**outcome.settings, **calibrated})
     finish(outcome, options, state, time.monotonic() - begun_s, is_saved=is_saved, is_drawn=is_drawn)
 
 

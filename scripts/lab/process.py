@@ -30,7 +30,7 @@ _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0
 _ANSWER_S: Final = 600.0
 _FINISH_S: Final = 60.0
-_PAUSE_S: Final = 0.02
+_PAUSE_S: Final = 0.05
 
 Event = dict[str, Any]  # a line of JSON by which a process reports
 T = TypeVar("T")

@@ -44,7 +44,18 @@ SUMS = "SHA256SUMS"
 SIGNATURE = "SHA256SUMS.sig"
 LOCK = "requirements/run.lock"
 _LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9][\w.+\-]*)\Z")
-_BACKEND = "import sys, setuptools.build_meta as b; out = sys.argv[1]; b.build_sdist(out); b.build_wheel(out)"
+# The wheel has the burst core, which serves every later Python of its architecture; the source archive has its source.
+_BACKEND = """
+import pathlib, setuptools, setuptools.build_meta as backend, subprocess, sys
+out, options = sys.argv[1], None
+backend.build_sdist(out)
+if pathlib.Path("gdp/burst").exists():
+    subprocess.run(["make", "--silent", "-C", "gdp/burst", f"PYTHON={sys.executable}"], check=True)
+    pathlib.Path("MANIFEST.in").write_text("include gdp/burst/core.abi3.so\\n")
+    setuptools.Distribution.has_ext_modules = lambda _: True
+    options = {"--build-option": ["--py-limited-api=cp310"]}
+backend.build_wheel(out, options)
+"""
 
 
 class ReleaseError(Exception):

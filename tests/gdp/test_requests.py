@@ -29,6 +29,11 @@ def test_the_first_pauses_may_be_equal() -> None:
     assert [Backoff(1.0, 9.0, equal=3).pause_s(tries) for tries in range(1, 8)] == [1, 1, 1, 2, 2, 2, 4]
 
 
+def test_pauses_double_from_an_estimate_within_the_first_one_and_the_bound() -> None:
+    assert [PAUSES.pause_s(tries, 1.25) for tries in (0, 1, 2, 3)] == [1.25, 1.25, 2.5, 3.0]
+    assert [PAUSES.pause_s(1, estimate_s) for estimate_s in (0.1, 99.0)] == [0.5, 3.0]
+
+
 def test_pauses_may_grow_a_few_times_only() -> None:
     assert [Backoff(1.0, 9.0, growing=2).pause_s(tries) for tries in range(1, 5)] == [1, 2, 9, 9]
 

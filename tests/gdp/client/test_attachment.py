@@ -84,6 +84,22 @@ def test_a_renewal_is_repeated_with_longer_pauses_until_it_is_acknowledged() -> 
     assert pauses_s == pytest.approx([0.5, 1.0, 2.0, 4.0], abs=0.05)
 
 
+def test_while_another_node_has_its_identity_a_node_advertises_its_own_name_alone_and_the_others_later() -> None:
+    world = ring()
+    advertisement_without_delegation(world)
+    attachment, other, own = world.members[ROBOT].attachment, of(world, Right.PUBLISH), of(world, Right.ATTACH)
+    before = own.sent_sequence, other.sent_sequence
+    own.refused = DropReason.IN_USE
+    attachment.renew(own.subject.name, own.chain)
+    own.refused = DropReason.IN_USE
+    attachment.renew(other.subject.name, ())
+    attachment.handle_timer(world.network.now)
+    assert (own.sent_sequence > before[0], other.sent_sequence) == (True, before[1])
+    own.refused = None
+    attachment.handle_timer(world.network.now)
+    assert other.sent_sequence > before[1]
+
+
 def test_a_node_whose_clock_went_back_finds_its_way_past_its_earlier_life() -> None:
     world = ring()
     member = world.restart_member(ROBOT)

@@ -50,7 +50,7 @@ UPPER = NodeKeys.generate(Role.RIB, "upper").join(CLOUD, DAY)
 OTHER_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc2").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 NAME = CAMERA.name
-FILES_OF_A_STATEMENT = {"advertisement": 8, "withdrawal": 9}  # they only fall
+FILES_OF_A_STATEMENT = {"advertisement": 7, "withdrawal": 8}  # they only fall
 
 
 def at(mono_s: float, unix_s: float = NOW) -> Timestamps:

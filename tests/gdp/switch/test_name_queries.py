@@ -7,8 +7,7 @@ from itertools import pairwise
 from gdp.intervals import ADVERTISEMENT
 from gdp.limits import PENDING_S
 from gdp.names import Name
-from gdp.switch.name_queries import BATCH_MAX, QUERIES_MAX, RETRY_S, TRIES_MAX, NameQueries
-from gdp.switch.query_window import WINDOW
+from gdp.switch.name_queries import BATCH_MAX, QUERIES_MAX, RETRY_S, TRIES_MAX, WINDOW, NameQueries
 from tests.gdp.switch.net import name
 
 TOPIC = name("topic")

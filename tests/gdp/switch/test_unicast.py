@@ -19,7 +19,7 @@ from tests.journeys.flows import ROBOT, SERVER, flowing, ring
 from tests.visited import visited
 
 ABSENT = Name(b"?" * 32)
-FILES_OF_A_MISS = 24  # all that run in the calls that carry it; it only falls
+FILES_OF_A_MISS = 18  # all that run in the calls that carry it; it only falls
 
 
 def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = Kind.ACKNACK) -> None:

@@ -120,6 +120,22 @@ def test_its_exit_status_and_its_errors_are_its_own(start: Start) -> None:
     assert errors.endswith("ValueError: as asked\n")
 
 
+def test_it_ends_as_an_interpreter_does(start: Start) -> None:
+    with start([sys.executable, PROBE, "--end"], stdout=subprocess.PIPE, text=True) as process:
+        out, _ = process.communicate(timeout=60)
+    assert (process.returncode, out) == (7, "in a thread\nat its end\n")
+
+
+def test_an_output_that_nothing_reads_is_an_error(start: Start) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    with start([sys.executable, PROBE], stdout=writes, stderr=subprocess.PIPE, text=True) as process:
+        os.close(writes)
+        errors = process.communicate(timeout=60)[1]
+    assert "BrokenPipeError" in errors
+    assert process.returncode != 0
+
+
 @pytest.mark.parametrize("how", ["forked", "executed"])
 def test_it_dies_with_its_caller(how: str) -> None:
     leash = ["setpriv", "--pdeathsig", "KILL", "--"]
@@ -160,4 +176,3 @@ def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
     assert not forked.can_run(program, dict(os.environ), tmp_path)
     assert not forked.can_run(program, {**os.environ, "PYTHONPATH": str(tmp_path)}, ROOT)
     assert not forked.can_run(program, {**os.environ, "PYTHONHASHSEED": "7"}, ROOT)
-    forked.close()
