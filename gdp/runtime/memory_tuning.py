@@ -24,8 +24,8 @@ _LARGE_BYTES: Final = 32 << 20  # the largest value that glibc accepts
 def tune_memory() -> None:
     """Keep the heap at the size that messages need, and exclude the objects of the start from garbage collection.
 
-    The start leaves a few dozen objects of garbage, which are not worth a search. Frames and messages form no cycles, so the collector would find nothing among them. Repeated scans of all modules
-    would only delay some of them.
+    The start leaves a few dozen objects of garbage, which are not worth a search. Frames and messages form no cycles,
+    so the collector would find nothing among them. Repeated scans of all modules would only delay some of them.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:  # glibc only; other libraries need no tuning
