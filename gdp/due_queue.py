@@ -19,6 +19,9 @@ __all__ = ["DueQueue", "earliest"]
 _SLACK: Final = 64  # void entries that are not yet worth a rebuild
 
 K = TypeVar("K")
+_Entry = list[Any]  # a list, because it is compared, and its time moves
+_PLACE, _RANK, _KEY, _DUE = range(4)  # second at which the heap has it, rank, key, second at which it is due
+_VOID: Final = -NEVER_S  # another entry of its key is valid
 
 
 class DueQueue(Generic[K]):
@@ -30,72 +33,93 @@ class DueQueue(Generic[K]):
 
     def __init__(self, *, is_sorted: bool = False) -> None:
         self._is_sorted = is_sorted
-        self._due_s: dict[K, float] = {}
-        self._place_s: dict[K, float] = {}  # time of its valid heap entry
-        self._heap: list[tuple[float, Any, K]] = []
+        self._entries: dict[K, _Entry] = {}  # the valid one of each key
+        self._waiting = 0  # entries that are due at some time
+        self._heap: list[_Entry] = []
         self._order = count()
 
     def __len__(self) -> int:
-        return len(self._due_s)
+        return self._waiting
 
     def __contains__(self, key: K) -> bool:
-        return key in self._due_s
+        return self.due_s(key) < NEVER_S
 
     def due_s(self, key: K) -> float:
         """Return when a key is due; infinity: it does not wait."""
-        return self._due_s.get(key, NEVER_S)
+        entry = self._entries.get(key)
+        return NEVER_S if entry is None else float(entry[_DUE])
 
     def put(self, key: K, at_s: float | None) -> None:
         """Have a key due at a second, instead of when it was before; None or infinity: never."""
         if at_s is None or at_s == NEVER_S:
             self.discard(key)
             return
-        self._due_s[key] = at_s
-        if at_s < self._place_s.get(key, NEVER_S):
-            self._stand(key, at_s)
+        entry = self._entries.get(key)
+        if entry is None or entry[_DUE] == NEVER_S:
+            self._waiting += 1
+            self._entries.pop(key, None)  # the order is that in which keys began to wait
+            if entry is not None:
+                self._entries[key] = entry
+        if entry is None or at_s < entry[_PLACE]:
+            if entry is not None:
+                entry[_DUE] = _VOID
+            entry = self._entries[key] = [at_s, key if self._is_sorted else next(self._order), key, at_s]
+            heapq.heappush(self._heap, entry)
+            if len(self._heap) > 4 * self._waiting + _SLACK:
+                self._rebuild()
+        else:
+            entry[_DUE] = at_s
 
     def discard(self, key: K) -> None:
         """Remove a key, if it waits."""
-        self._due_s.pop(key, None)
+        entry = self._entries.get(key)
+        if entry is not None and entry[_DUE] != NEVER_S:
+            entry[_DUE] = NEVER_S
+            self._waiting -= 1
 
     def clear(self) -> None:
         """Remove every key."""
-        for each in (self._due_s, self._place_s, self._heap):
-            each.clear()
+        self._entries.clear()
+        self._heap.clear()
+        self._waiting = 0
 
     def next_due(self) -> float | None:
         """Return when the first key is due, or None."""
-        while self._heap:
-            at_s, _, key = self._heap[0]
-            due_s = self._due_s.get(key)
-            if self._place_s.get(key) == at_s == due_s:
+        heap = self._heap
+        while heap:
+            entry = heap[0]
+            at_s: float
+            due_s: float
+            at_s, _, key, due_s = entry
+            if due_s == at_s:
                 return at_s
-            heapq.heappop(self._heap)
-            if self._place_s.get(key) == at_s:
-                del self._place_s[key]
-                if due_s is not None:
-                    self._stand(key, due_s)
+            if due_s in (NEVER_S, _VOID):
+                heapq.heappop(heap)
+                if due_s == NEVER_S:
+                    del self._entries[key]
+            else:
+                entry[_PLACE], entry[_RANK] = due_s, key if self._is_sorted else next(self._order)
+                heapq.heapreplace(heap, entry)
         return None
 
     def poll_due(self, now_s: float, most: int | None = None) -> list[K]:
         """Remove and return the keys that are due, the first one first."""
         found: list[K] = []
         while (most is None or len(found) < most) and (due_s := self.next_due()) is not None and due_s <= now_s:
-            key = heapq.heappop(self._heap)[2]
-            del self._place_s[key], self._due_s[key]
+            key = heapq.heappop(self._heap)[_KEY]
+            del self._entries[key]
+            self._waiting -= 1
             found.append(key)
         return found
 
-    def _stand(self, key: K, at_s: float) -> None:
-        self._place_s[key] = at_s
-        heapq.heappush(self._heap, (at_s, self._rank(key), key))
-        if len(self._heap) > 4 * len(self._due_s) + _SLACK:
-            self._place_s = dict(self._due_s)
-            self._heap = [(due_s, self._rank(each), each) for each, due_s in self._due_s.items()]
-            heapq.heapify(self._heap)
-
-    def _rank(self, key: K) -> Any:
-        return key if self._is_sorted else next(self._order)
+    def _rebuild(self) -> None:
+        """Drop the void entries."""
+        waiting = [(each, entry[_DUE]) for each, entry in self._entries.items() if entry[_DUE] != NEVER_S]
+        ranks = [each if self._is_sorted else next(self._order) for each, _ in waiting]
+        entries = zip(waiting, ranks, strict=True)
+        self._entries = {each: [due_s, rank, each, due_s] for (each, due_s), rank in entries}
+        self._heap = list(self._entries.values())
+        heapq.heapify(self._heap)
 
 
 def earliest(*moments: float | None) -> float | None:

@@ -5,7 +5,7 @@ Sans-I/O; imports nothing of this project. A time of one mechanism alone is in i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 NEVER_S: Final = float("inf")
@@ -23,15 +23,15 @@ class SoftState:
     Attributes:
         refresh_s: between two sends.
         periods: for which it is kept; a whole one less may be lost in a row.
+        lease_s: how long it is kept after it was last sent.
     """
 
     refresh_s: float
     periods: float = 3.5
+    lease_s: float = field(init=False)
 
-    @property
-    def lease_s(self) -> float:
-        """Return how long it is kept after it was last sent."""
-        return self.periods * self.refresh_s
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lease_s", self.periods * self.refresh_s)
 
 
 class Rate(NamedTuple):

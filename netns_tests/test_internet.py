@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from gdp.control.endpoints import Endpoint
-from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 from gdp.ports.sockets import large_buffers
 from internet.access import TRAITS, Access
@@ -115,7 +114,7 @@ def borders(laboratory: Laboratory) -> tuple[Host, Host]:
     return laboratory.add_host("border1", site), laboratory.add_host("border2", site)
 
 
-def attach(laboratory: Laboratory, access: Access, label: str = "robot", **options: bool) -> Host:
+def attach(laboratory: Laboratory, access: Access, label: str = "robot", **options: float) -> Host:
     return laboratory.add_host(label, laboratory.add_site(f"of-{label}", access, **options))
 
 
@@ -350,10 +349,9 @@ def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
 def test_a_delay_line_delays_both_directions_and_loses_nothing(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED, has_line=True)
+    robot = attach(laboratory, Access.PORT_RESTRICTED, delay_ms=30.0, jitter_ms=5.0)
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
         public = observe(probe, border)
-        robot.site().set_delay(30.0, jitter_ms=5.0)
         started_s = time.monotonic()
         probe.send(border.local, b"there")
         assert border.wait(b"there", PATIENCE_S) == public
@@ -371,16 +369,11 @@ def send_many(sender: UdpProbe, receiver: UdpProbe, count: int) -> None:
         sender.send(receiver.local, b"%d" % number)
 
 
-def test_a_delay_without_a_delay_line_is_refused(laboratory: Laboratory) -> None:
-    with pytest.raises(LocalError, match="no delay line"):
-        laboratory.add_site("home", Access.PUBLIC).set_delay(1.0)
-
-
 def keep_laboratory(runs: str) -> None:
     """Make a laboratory with a host, print what it left, and wait; a process of its own."""
     run = RunRegistry(Path(runs)).start()
     made = Laboratory(run)
-    made.add_host("robot", made.add_site("home", Access.DOUBLE_NAT, has_line=True))
+    made.add_host("robot", made.add_site("home", Access.DOUBLE_NAT, delay_ms=1.0))
     print(run.directory, *run.record.namespaces, flush=True)
     signal.pause()
 

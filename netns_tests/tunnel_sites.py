@@ -55,11 +55,11 @@ class Site:
         self._stack.callback(device.close)
         return device
 
-    def connect(self, device: WireGuardDevice, other: Site, *, is_dialling: bool, keepalive_s: int = 25) -> None:
+    def connect(self, device: WireGuardDevice, other: Site, *, is_dialling: bool) -> None:
         """Add the other site as a peer, and make the VXLAN link to it."""
         endpoint = other.endpoint if is_dialling else None
         with self.entered():
-            device.set_peer(other.public_key, inner=other.inner, endpoint=endpoint, keepalive_s=keepalive_s)
+            device.set_peer(other.public_key, inner=other.inner, endpoint=endpoint, keepalive_s=25)
             self.make_link(device.ifname, other)
 
     def make_link(self, underlay: str, other: Site) -> None:
@@ -110,7 +110,7 @@ def two_sites() -> Iterator[tuple[Site, Site]]:
         one.close()
 
 
-def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = "") -> None:
+def until(is_true: Callable[[], bool], *devices: WireGuardDevice) -> None:
     """Serve these devices, as a switch does, until this is true."""
     poll_s = time.monotonic() + POLL_S
 
@@ -124,7 +124,7 @@ def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = ""
         for device in ready:
             device.handle_events()
 
-    process.until(is_true, what or "it did not come about", PATIENCE_S, meanwhile=serve)
+    process.until(is_true, patience_s=PATIENCE_S, meanwhile=serve)
 
 
 def payload(number: int) -> bytes:

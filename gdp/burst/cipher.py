@@ -76,16 +76,18 @@ class MessageCipher:
         encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1
         for part, at in zip(range(first, end), count(first * capacity - len(prefix), capacity), strict=False):
             plain = message[at : at + capacity] if part else (prefix + message[:capacity])[:capacity]
-            is_last = part == last
-            if len(plain) != size or is_last:
-                size = len(plain)
+            _PART.pack_into(header, PART_AT, part)
+            length, is_last = len(plain), part == last
+            if length != size or is_last:
+                size = length
                 header[FLAGS_AT] = head[FLAGS_AT] | _LAST * is_last
                 _LENGTH.pack_into(header, LENGTH_AT, SALT_BYTES + size + TAG_BYTES + signature_bytes * is_last)
                 additional = header[:HOPS_AT] + header[HOPS_AT + 1 : HEADER_BYTES]
-            _PART.pack_into(header, PART_AT, part)
-            _PART.pack_into(additional, PART_AT - 1, part)
-            payloads.append(encrypt(header[NUMBER_AT:PARTS_AT], plain, additional))
-            frames.append(b"".join((header, payloads[-1])))
+            else:
+                _PART.pack_into(additional, PART_AT - 1, part)
+            payload = encrypt(header[NUMBER_AT:PARTS_AT], plain, additional)
+            payloads.append(payload)
+            frames.append(bytes(header) + payload)
         if running is not None:
             running.update(b"".join(payloads))
         return frames

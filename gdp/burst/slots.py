@@ -62,7 +62,10 @@ def runs(pool: bytearray, slot_bytes: int, sizes: list[int]) -> list[tuple[int, 
 
 def samples(frames: Sequence[ReceivedFrame] | Sequence[bytes], at: int, count: int) -> list[tuple[int, int]]:
     """Return place and seal of each sample among ``frames[at : at + count]``, the first of which has place 0."""
-    some = [each if isinstance(each, bytes) else each.frame for each in frames[at : at + count]]
-    return [
-        (place, int.from_bytes(frame[-9:-1], "big")) for place, frame in enumerate(some) if not frame[-1] & _SAMPLE_BITS
-    ]
+    found: list[tuple[int, int]] = []
+    some: Sequence[ReceivedFrame | bytes] = frames[at : at + count]
+    for place, each in enumerate(some):
+        frame = each if isinstance(each, bytes) else each.frame
+        if not frame[-1] & _SAMPLE_BITS:
+            found.append((place, int.from_bytes(frame[-9:-1], "big")))
+    return found

@@ -6,19 +6,16 @@ possible words and ends; typer does that part.
 
 from __future__ import annotations
 
-import os
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from typer.completion import get_completion_inspect_parameters
 
 from gdp.cli import options
 from gdp.cli.output import show
-from gdp.stores.keyring import NODE_CERTIFICATE
 
-__all__ = ["PROGRAMS", "allow_completion", "complete_node", "completion", "completion_script"]
+__all__ = ["PROGRAMS", "complete_node", "completion", "completion_script"]
 
 PROGRAMS: Final = (
     "gdp",
@@ -119,14 +116,10 @@ def completion(shell: Annotated[Shell, typer.Argument(help="Your shell.")], as_j
         typer.echo(script, nl=False)
 
 
-def allow_completion(program: str) -> None:
-    """Prepare the answer to a shell that completes this program's words; otherwise do nothing."""
-    if os.environ.get(f"_{program.upper().replace('-', '_')}_COMPLETE"):
-        get_completion_inspect_parameters()  # registers the shells
-
-
 def complete_node(incomplete: str) -> list[str]:
     """Return the directories of nodes that begin with a text, two levels deep."""
+    from gdp.stores.keyring import NODE_CERTIFICATE  # it loads what reads keys
+
     folder, _, begin = incomplete.rpartition("/")
     base = Path(folder or ("/" if incomplete.startswith("/") else "."))
     patterns = (f"{begin}*/{NODE_CERTIFICATE}", f"{begin}*/*/{NODE_CERTIFICATE}")

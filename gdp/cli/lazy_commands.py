@@ -25,15 +25,17 @@ class LazyCommand:
 
     Attributes:
         target: ``module:attribute``; the attribute is a function, or an application with commands of its own.
+        summary: for the help of the group, which loads no command.
         no_args_is_help: whether a function without arguments prints its help.
         settings: of the context of a function.
-        help: of a function that stands for more than one command; by default its docstring.
+        is_placeholder: a function that stands for more than one command; its help is the summary.
     """
 
     target: str
+    summary: str
     no_args_is_help: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
-    help: str | None = None
+    is_placeholder: bool = False
 
     def import_as(self, name: str) -> Any:
         """Return the command, named ``name``, with the option ``--version`` on it and on all below it."""
@@ -45,9 +47,12 @@ class LazyCommand:
         else:
             only = typer.Typer(add_completion=False)
             settings = dict(self.settings)
-            only.command(name, help=self.help, no_args_is_help=self.no_args_is_help, context_settings=settings)(
-                ungrouped(found)
-            )
+            only.command(
+                name,
+                help=self.summary if self.is_placeholder else None,
+                no_args_is_help=self.no_args_is_help,
+                context_settings=settings,
+            )(ungrouped(found))
             command = get_command(only)
         command.name = name
         return with_version(command)
@@ -66,6 +71,10 @@ class LazyCommands(MutableMapping[str, Any]):
     def __init__(self, known: Mapping[str, LazyCommand]) -> None:
         self._known = dict(known)
         self.loaded: dict[str, Any] = {}
+
+    def summaries(self) -> list[tuple[str, str]]:
+        """Return each name with what its command is for, without a load."""
+        return [(name, each.summary) for name, each in self._known.items()]
 
     def __getitem__(self, name: str) -> Any:
         """Return a command.

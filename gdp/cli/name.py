@@ -12,9 +12,8 @@ import typer
 
 from gdp.cli import options
 from gdp.cli.output import show
-from gdp.crypto.subject import Subject
 from gdp.metadata import hidden
-from gdp.stores.keyring import load_public_key
+from gdp.names import name_of
 
 __all__ = ["name"]
 
@@ -40,12 +39,20 @@ def name(
       gdp name --kind topic --name /camera/image --type sensor_msgs/msg/Image --owner owner.pub --salt-file camera.salt
     """
     metadata = described.metadata(kind)
-    subject = Subject.of(metadata, load_public_key(owner).compressed if owner is not None else b"")
+    owner_key = b"" if owner is None else _owner_key(owner)
+    digest = metadata.digest()
+    found = name_of(digest, owner_key)
     result = {
-        "name": subject.name.to_text(),
-        "short": subject.name.short,
-        "digest": subject.digest.hex(),
-        "owner": subject.owner_key.hex() or None,
+        "name": found.to_text(),
+        "short": found.short,
+        "digest": digest.hex(),
+        "owner": owner_key.hex() or None,
         "metadata": hidden(metadata),
     }
-    show(result, as_json=as_json, plain=subject.name.to_text())
+    show(result, as_json=as_json, plain=found.to_text())
+
+
+def _owner_key(file: Path) -> bytes:
+    from gdp.stores.keyring import load_public_key  # it loads what reads keys
+
+    return load_public_key(file).compressed

@@ -13,14 +13,16 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeVar, get_args
 
 import orjson
 import typer
-from pydantic import BaseModel
 
 from gdp.errors import ConfigError, GdpError, LocalError
 from gdp.terminal import echo
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 __all__ = [
     "WRONG",
@@ -93,7 +95,7 @@ class Logs(NamedTuple):
     ] = Format.TEXT
 
 
-_Settings = TypeVar("_Settings", bound=BaseModel)
+_Settings = TypeVar("_Settings", bound="BaseModel")
 
 
 @contextlib.contextmanager

@@ -8,15 +8,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
+from typing import TYPE_CHECKING
 
 from gdp.cli.salt import NAME_SALT
-from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.metadata import SALT
 from gdp.state.columns import columns
 from gdp.terminal import echo
-from gdp.trust.grants import EPOCH_MAX
-from gdp.trust.right import Right
+
+if TYPE_CHECKING:  # a short command loads nothing of keys
+    from gdp.crypto.validity import Validity
+    from gdp.trust.right import Right
 
 __all__ = [
     "epochs_from_text",
@@ -82,6 +84,8 @@ def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
     Raises:
         LocalError: an unknown right.
     """
+    from gdp.trust.right import Right
+
     known = {right.value: right for right in Right}
     for text in texts:
         if text not in known:
@@ -95,6 +99,8 @@ def epochs_from_text(text: str) -> list[int]:
     Raises:
         LocalError: anything else.
     """
+    from gdp.trust.grants import EPOCH_MAX
+
     epochs: set[int] = set()
     for part in text.split(","):
         first, dash, last = part.partition("-")

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, get_type_hints
 
 import typer
 
-from gdp.cli.completion import allow_completion
 from gdp.cli.version import HELP, versioned
 from gdp.errors import GdpError
 from gdp.terminal import echo
@@ -52,12 +52,20 @@ class Program(typer.Typer):
             arguments: as after the program's name; by default those of this process.
             name: of the program, if another one starts it.
         """
-        allow_completion(name or self._name)
+        _allow_completion(name or self._name)
         try:
             versioned(self)(args=None if arguments is None else list(arguments), prog_name=name or self._name)
         except GdpError as error:
             echo(f"error: {error}", err=True)
             sys.exit(2)
+
+
+def _allow_completion(program: str) -> None:
+    """Prepare the answer to a shell that completes this program's words; otherwise do nothing."""
+    if os.environ.get(f"_{program.upper().replace('-', '_')}_COMPLETE"):
+        from typer.completion import get_completion_inspect_parameters
+
+        get_completion_inspect_parameters()  # registers the shells
 
 
 def ungrouped(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,26 +1,23 @@
 """``gdp-relay`` command.
 
-I/O.
+I/O. A command loads what a node needs when it runs one, so that its help comes at once.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gdp.cli.node import Check, Config, Json, Logs, report, running
 from gdp.cli.output import show
 from gdp.cli.program import Program
-from gdp.config.relay_config import RelayConfig
-from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity
 from gdp.intervals import ANSWER_S
-from gdp.management.control_client import ask_node
-from gdp.nodes.membership import load_member
-from gdp.nodes.relay import Relay, relay_control_path, run_relay
-from gdp.ports.tap import tap_name
-from gdp.state.control_protocol import Command
+
+if TYPE_CHECKING:
+    from gdp.config.relay_config import RelayConfig
+    from gdp.crypto.identity import Identity
+    from gdp.nodes.relay import Relay
 
 __all__ = ["main"]
 
@@ -45,6 +42,13 @@ def relay(
     With the section server it is a border's end, with borders it is a member's end. Each connection has a TAP device,
     which has a carrier only while the connection is open.
     """
+    from gdp.config.relay_config import RelayConfig
+    from gdp.crypto.certificates import Role
+    from gdp.management.control_client import ask_node
+    from gdp.nodes.membership import load_member
+    from gdp.nodes.relay import relay_control_path, run_relay
+    from gdp.state.control_protocol import Command
+
     with running(logs):
         settings = RelayConfig.load(config)
         if check or status:
@@ -59,6 +63,8 @@ def relay(
 
 
 def _report_check(identity: Identity, settings: RelayConfig, *, json: bool) -> None:
+    from gdp.ports.tap import tap_name
+
     devices = {each.peer.to_text(): tap_name(identity.name, each.peer) for each in settings.borders}
     port = None if settings.server is None else settings.server.port
     text = f"configuration good: relay of {identity.role.value} {identity.name.short}, server port {port or 'none'}"

@@ -14,7 +14,6 @@ from typing import Final
 import typer
 
 from gdp.errors import LocalError
-from gdp.stores.files import read_private
 
 __all__ = ["PROMPT", "Secret"]
 
@@ -56,6 +55,8 @@ class Secret:
             is_terminal = sys.stdin.isatty()
             text = typer.prompt(self.name.capitalize(), hide_input=True, err=True) if is_terminal else sys.stdin.read()
         else:
+            from gdp.stores.files import read_private
+
             where = str(file)
             try:
                 text = read_private(file).decode()

@@ -1,6 +1,6 @@
 """``gdp-switch`` command.
 
-I/O.
+I/O. A command loads what a node needs when it runs one, so that its help comes at once.
 """
 
 from __future__ import annotations
@@ -10,19 +10,16 @@ import logging
 import os
 import pwd
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gdp.cli.node import Check, FoundConfig, Json, Logs, emit_wait, report, running, with_plane
 from gdp.cli.program import Program
-from gdp.config.config import SwitchConfig
-from gdp.config.found_config import find_switch_config
-from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity
-from gdp.enrolment.addresses import default_directory
-from gdp.nodes.membership import load_member
-from gdp.nodes.switch import run_switch
+
+if TYPE_CHECKING:
+    from gdp.config.config import SwitchConfig
+    from gdp.crypto.identity import Identity
 
 __all__ = ["main"]
 
@@ -51,9 +48,14 @@ def switch(
     --config it looks for the switch.yaml of this machine: here, in a folder here, as gdp lab leaves it, and where gdp
     join puts it.
     """
+    from gdp.nodes.switch import run_switch
+
     with running(logs):
         settings = with_plane(_settings(config, iface or []), data_plane)
         if check:
+            from gdp.crypto.certificates import Role
+            from gdp.nodes.membership import load_member
+
             identity, _ = load_member(settings.identity, settings.domain, Role.SWITCH)
             _report_check(identity, len(settings.ports), json=json)
             return
@@ -66,6 +68,9 @@ def switch(
 
 def _settings(config: Path | None, ifaces: list[str]) -> SwitchConfig:
     """Return the configuration of a given file, or of the one that this machine has, with the ports of the line."""
+    from gdp.config.config import SwitchConfig
+    from gdp.config.found_config import find_switch_config
+
     if config is not None:
         return SwitchConfig.load(config).with_ifaces(ifaces)
     found = find_switch_config(ifaces, Path.cwd(), _machine_folders())
@@ -76,6 +81,8 @@ def _settings(config: Path | None, ifaces: list[str]) -> SwitchConfig:
 
 def _machine_folders() -> list[Path]:
     """Return where joining a domain puts the files of this machine; behind sudo also for the user who called it."""
+    from gdp.enrolment.addresses import default_directory
+
     is_root = os.geteuid() == 0
     folders = [default_directory("", is_root=is_root, state_home=os.environ.get("XDG_STATE_HOME", ""))]
     caller = os.environ.get("SUDO_UID", "")

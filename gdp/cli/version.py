@@ -5,7 +5,6 @@ I/O.
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -15,13 +14,15 @@ import typer
 from typer.main import get_command
 
 import gdp
+from gdp.cli.coercion import defer_coercion
 from gdp.terminal import echo
 
 __all__ = ["HELP", "Version", "versioned", "with_version"]
 
 _SHOULD_BE: Final = "Input should be "  # prefix of pydantic, which some versions of the library use
 _USAGE_ERROR: Final[Any] = typer.BadParameter.__mro__[2]  # ClickException, whose module differs among versions
-HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-commands inherit them
+# Context settings, which sub-commands inherit; lines of the help are as wide as the terminal.
+HELP: Final = {"help_option_names": ["-h", "--help"], "max_content_width": 1_000}
 
 
 def _print_and_end(context: typer.Context, is_wanted: bool) -> None:
@@ -52,7 +53,9 @@ def _run(main: Callable[..., Any], *arguments: Any, **settings: Any) -> None:
     try:
         code = main(*arguments, **settings, standalone_mode=False)
     except _USAGE_ERROR as error:
-        if type(error).__name__ != "NoArgsIsHelpError":  # that one has printed the help
+        if type(error).__name__ == "NoArgsIsHelpError":
+            echo(error.format_message())
+        else:
             echo(f"error: {error.format_message().replace(_SHOULD_BE, 'expected ')}", err=True)
             if (context := getattr(error, "ctx", None)) is not None:
                 echo(f"Try '{context.command_path} -h' for help.", err=True)
@@ -66,19 +69,16 @@ def _run(main: Callable[..., Any], *arguments: Any, **settings: Any) -> None:
 def with_version(command: Callable[..., Any]) -> Callable[..., Any]:
     """Return a command with the option ``--version`` on it and on all below it that are loaded.
 
-    The lines of a paragraph of their help are joined, so that they break at the width of the terminal alone.
+    Their help breaks at the width of the terminal alone.
     """
     option = _option()
     for each in _all_of(command):
-        each.help = _joined(each.help or "")
+        each.short_help = each.short_help or (each.help or "").partition("\n\n")[0]  # whole in the help of its group
+        each.rich_markup_mode = None  # the help as text: a frame around it takes longer than most commands
         if not any("--version" in param.opts for param in each.params):
             each.params.append(option)
+        defer_coercion(each)
     return command
-
-
-def _joined(text: str) -> str:
-    paragraphs = inspect.cleandoc(text).split("\n\n")
-    return "\n\n".join(each if each.startswith("\b") else each.replace("\n", " ") for each in paragraphs)
 
 
 def _option() -> Any:

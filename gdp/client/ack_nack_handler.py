@@ -64,7 +64,7 @@ class AckNackHandler:
     @property
     def sent(self) -> int:
         """Return how many messages have left, not counting those that some reader is known not to get."""
-        return self._queue.ledger.confirmed(self._queue.sequences[0])
+        return self._queue.ledger.confirmed(self._queue.sent_sequence)
 
     @property
     def reader_lost(self) -> int:
@@ -88,13 +88,14 @@ class AckNackHandler:
         if is_new:
             self._drop(name)
             reader.sequence = sequence or self._readers.confirmed.get(name) or queue.first_waiting
-        if AckNackFlag.BYE in acknack.flags:
+        if acknack.flags is AckNackFlag.BYE:
             self.forget(name)
             if not self._readers.all():
                 ledger.give_up(max(sequence, reader.sequence), ledger.last, LossReason.NO_READER)
             return
-        acknack = self._translate(acknack)
-        if AckNackFlag.NEW in acknack.flags:
+        if queue.moves:
+            acknack = self._translate(acknack)
+        if acknack.flags is AckNackFlag.NEW:
             self._start(name, acknack, now_s)
             return
         reader.start = None
@@ -105,16 +106,18 @@ class AckNackHandler:
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
         reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
-        (sent, _), (sequence, _) = queue.sent, queue.sequences
+        if acknack.sequence >= queue.sent_sequence:
+            return
+        sent, _ = queue.sent
         is_stuck = now_s - reader.advanced_s >= READER.refresh_s
         is_settled = queue.is_acknowledged or is_stuck or now_s - self._sent_frames.last_s > _SETTLED_S
-        if acknack.sequence < sequence and is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
+        if is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
 
     def poll_heartbeat(self, now_s: float, trip_s: float) -> bytes:
         """Return the wire form of the Heartbeat that is due; ``trip_s``: how long a reader's answer may take."""
         queue, oldest = self._queue, self._window.cache.oldest
-        (sent_number, sent_part), (sent_sequence, oldest_sequence) = queue.sent, queue.sequences
+        (sent_number, sent_part), sent_sequence = queue.sent, queue.sent_sequence
         state = Heartbeat(
             oldest=sent_number if oldest is None else oldest,
             sent_number=sent_number,
@@ -122,7 +125,7 @@ class AckNackHandler:
             starts={},
             description=b"",
             moves=tuple(queue.moves),
-            oldest_sequence=oldest_sequence,
+            oldest_sequence=sent_sequence if oldest is None else queue.ledger.begin_of(oldest, sent_sequence),
             sent_sequence=sent_sequence,
             gone=tuple(queue.ledger.gone),
         )
@@ -270,7 +273,8 @@ class AckNackHandler:
 
     def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers.active[name], self._window, self._queue
-        self.lose_ended(window.poll_cancelled(acknack))
+        if acknack.missing:
+            self.lose_ended(window.poll_cancelled(acknack))
         oldest = queue.oldest
         if not (name in window.readers.active or name in window.readers.suspended) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before

@@ -107,6 +107,8 @@ class AckNackSchedule:
         A writer's congestion window has grown by what was reported since the last loss, and must never run empty. At
         first the writer knows nothing of the path, and two frames are enough.
         """
+        if self._unreported_bytes < _FIRST_BYTES:
+            return False
         first_bytes = max(self._total_bytes // 8, _FIRST_BYTES)
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
         return self._unreported_bytes >= min(first_bytes, every_bytes)

@@ -59,6 +59,7 @@ _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT: Final = SoftState(1_800, periods=4)  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
 _Key: TypeAlias = tuple[Name, Right]
+_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 
 
 @dataclass(slots=True, kw_only=True)
@@ -97,6 +98,7 @@ class Attachment:
 
     Attributes:
         switch: that this node is attached to; None: there is none.
+        outgoing: the frames to send next.
         started: number above those of earlier incarnations here, as far as known.
         clashes: signs of another node with this identity.
         conflict_at: switch of a newer node with this identity, once it was reported.
@@ -131,7 +133,7 @@ class Attachment:
         self._sync = RevocationSync(
             identity, policy.revoked, self.hello_protocol.neighbours, self._say_revoked, settings.first_sequence
         )
-        self._out: list[OutgoingFrames] = []
+        self.outgoing: list[OutgoingFrames] = []
         self._in_use_s = 0.0  # since when another node with this identity is accepted instead
         self.clashes = 0
         self.conflict_at: Name | None = None
@@ -218,7 +220,7 @@ class Attachment:
     def send(self, frames: list[bytes]) -> None:
         """Send frames to the switch; without one they are counted as lost."""
         if self.switch is not None:
-            self._out.append(OutgoingFrames(self.switch.port, self.switch.mac, frames))
+            self.outgoing.append(_tuple(OutgoingFrames, (self.switch.port, self.switch.mac, frames)))
         else:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 
@@ -327,7 +329,7 @@ class Attachment:
         if self.hello_protocol.drop_silent(now.mono_s):
             self._choose_switch(now.mono_s)
         self.reassembler.drop_expired(now.mono_s)
-        self._out += self.hello_protocol.hellos_to_send(now.mono_s)
+        self.outgoing += self.hello_protocol.hellos_to_send(now.mono_s)
         self._sync.handle_timer(now.mono_s)
         if self.switch is None:
             return
@@ -356,7 +358,7 @@ class Attachment:
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
-        out, self._out = self._out, []
+        out, self.outgoing = self.outgoing, []
         return out
 
     def _choose_switch(self, now_s: float) -> None:

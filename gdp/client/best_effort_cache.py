@@ -17,6 +17,7 @@ from typing import Final
 
 from gdp.client.send_options import SendOptions
 from gdp.frame.codec import NUMBER_AT
+from gdp.intervals import NEVER_S
 from gdp.limits import REPAIR_S, REPAIRS_ABOVE_PARTS
 from gdp.message.acknack import MissingRange
 from gdp.message.history_cache import CachedMessage, HistoryCache
@@ -67,10 +68,10 @@ class BestEffortCache(HistoryCache):
 
     def record_sent(self, frames: Sequence[bytes], now_s: float) -> None:
         """Add frames that are sent for the first time now, in order; the cost depends on the count of messages."""
-        at = 0 if self._is_enabled else len(frames)
-        while at < len(frames):
+        at, end = 0, len(frames) if self._is_enabled else 0
+        while at < end:
             number, part, parts = _NUMBER_PART_PARTS.unpack_from(frames[at], NUMBER_AT)
-            count = min(parts - part, len(frames) - at)
+            count = min(parts - part, end - at)
             if parts > REPAIRS_ABOVE_PARTS:
                 self._add(number, part, frames[at : at + count], now_s)
             at += count
@@ -136,9 +137,9 @@ class BestEffortCache(HistoryCache):
         for number in [number for number, each in self.messages.items() if len(each.frames[0]) > mtu]:
             self.remove(number)
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second after which nothing needs to be cached, or None: nothing is."""
-        return self.messages[next(reversed(self.messages))].until_s if self.messages else None
+    def get_timer(self) -> float:
+        """Return the monotonic second after which nothing needs to be cached; infinity: nothing is."""
+        return self.messages[next(reversed(self.messages))].until_s if self.messages else NEVER_S
 
     def close(self) -> None:
         """Drop everything."""

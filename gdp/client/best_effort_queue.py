@@ -38,28 +38,26 @@ class BestEffortQueue:
     Attributes:
         deadline_s: a message that cannot leave whole within this time is too late. None: it is too late after
             ``FRESH_S``, if a newer one waits.
+        waiting: frames and content of each message, the oldest first.
     """
 
     def __init__(self, deadline_s: float | None = None) -> None:
         self.deadline_s = deadline_s
-        self._queue = deque[tuple[Sealed, Carried]]()
+        self.waiting = deque[tuple[Sealed, Carried]]()
         self._held_bytes = 0
         self._part = 0  # of the oldest: the first that has not been sent
-
-    def __len__(self) -> int:
-        return len(self._queue)
 
     @property
     def oldest(self) -> Carried | None:
         """Return the content that is sent next, or None."""
-        return self._queue[0][1] if self._queue else None
+        return self.waiting[0][1] if self.waiting else None
 
     def add(self, frames: Sealed, carried: Carried) -> list[Carried]:
         """Queue a message, or a bundle; return what was dropped for it."""
-        self._queue.append((frames, carried))
+        self.waiting.append((frames, carried))
         self._held_bytes += frames.size_bytes
         gone = []
-        while self._held_bytes > WINDOW_BYTES and len(self._queue) > 1:
+        while self._held_bytes > WINDOW_BYTES and len(self.waiting) > 1:
             gone.append(self._let_oldest_go())
         return gone
 
@@ -74,55 +72,57 @@ class BestEffortQueue:
         """
         self._set_times(now_s)
         unstarted, gone = 1 if self._part else 0, list[Carried]()
-        while len(self._queue) > unstarted:
-            frames, carried = self._queue[unstarted]
+        while len(self.waiting) > unstarted:
+            frames, carried = self.waiting[unstarted]
             added_s = now_s if carried.added_s is None else carried.added_s
-            has_newer = is_followed or len(self._queue) > unstarted + 1
+            has_newer = is_followed or len(self.waiting) > unstarted + 1
             if not is_expired(now_s - added_s, frames.size_bytes, self.deadline_s, bytes_s, has_newer=has_newer):
                 break
-            del self._queue[unstarted]
+            del self.waiting[unstarted]
             self._held_bytes -= frames.size_bytes
             gone.append(carried)
         return gone
 
     def drop_all(self) -> list[Carried]:
         """Drop all messages; return their contents, without one of which a frame was taken."""
-        gone = [carried for _, carried in self._queue][1 if self._part else 0 :]
-        self._queue.clear()
+        gone = [carried for _, carried in self.waiting][1 if self._part else 0 :]
+        self.waiting.clear()
         self._held_bytes = self._part = 0
         return gone
 
     def poll_frames(self, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames, in order, sealed as they are taken."""
         frames: list[bytes] = []
-        while self._queue and len(frames) < limit:
-            oldest, first = self._queue[0][0], self._part
-            taken = oldest[first : first + limit - len(frames)]
+        while self.waiting and limit > 0:
+            oldest, first = self.waiting[0][0], self._part
+            taken = oldest[first : first + limit]
             frames += taken
-            self._part += len(taken)
+            count = len(taken)
+            limit -= count
+            self._part += count
             if self._part == len(oldest):
                 self._let_oldest_go()
         return frames
 
     def requeue(self, mtu: int) -> list[tuple[bytes, Carried]]:
         """Return everything, to be sealed again, if something is too large for its path; else nothing."""
-        if all(frames.largest <= mtu for frames, _ in self._queue):
+        if all(frames.largest <= mtu for frames, _ in self.waiting):
             return []
-        taken = [(frames.message()[SEQUENCE_BYTES:], carried) for frames, carried in self._queue]
-        self._queue.clear()
+        taken = [(frames.message()[SEQUENCE_BYTES:], carried) for frames, carried in self.waiting]
+        self.waiting.clear()
         self._held_bytes = self._part = 0
         return taken
 
     def _set_times(self, now_s: float) -> None:
         """Let messages without a time wait from now on; they are the newest ones."""
-        for at in range(len(self._queue) - 1, -1, -1):
-            frames, carried = self._queue[at]
+        for at in range(len(self.waiting) - 1, -1, -1):
+            frames, carried = self.waiting[at]
             if carried.added_s is not None:
                 return
-            self._queue[at] = frames, carried._replace(added_s=now_s)
+            self.waiting[at] = frames, carried._replace(added_s=now_s)
 
     def _let_oldest_go(self) -> Carried:
-        frames, carried = self._queue.popleft()
+        frames, carried = self.waiting.popleft()
         self._held_bytes -= frames.size_bytes
         self._part = 0
         return carried

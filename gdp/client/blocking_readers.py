@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from gdp.intervals import NEVER_S
+
 __all__ = ["PROGRESS_BYTES", "BlockingReaders", "PathState"]
 
 PROGRESS_BYTES: Final = 256 << 10
@@ -41,41 +43,41 @@ class BlockingReaders:
 
     Args:
         lag_s: how long a reader may hold back the others.
+
+    Attributes:
+        blocks: of the readers that are measured.
     """
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._blocks: dict[bytes, _Block] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._blocks)
+        self.blocks: dict[bytes, _Block] = {}
 
     def record(self, paths: Sequence[PathState], now_s: float) -> None:
         """Note the paths that govern, while something waits for them or begins to leave."""
         free = sum(each.allowance > 0 for each in paths)
         blocking = {each.reader for each in paths if each.allowance <= 0 < free == len(paths) - 1}
         sent_bytes = {each.reader: each.sent_bytes for each in paths}
-        for name, block in self._blocks.items():
+        for name, block in self.blocks.items():
             if block.is_blocking:
                 block.blocked_s += now_s - block.checked_s
             block.checked_s, block.is_blocking = now_s, name in blocking
             block.sent_bytes = sent_bytes.get(name, block.sent_bytes)
-        for name in blocking - self._blocks.keys():
-            self._blocks[name] = _Block(now_s, sent_bytes[name], now_s, sent_bytes[name])
+        for name in blocking - self.blocks.keys():
+            self.blocks[name] = _Block(now_s, sent_bytes[name], now_s, sent_bytes[name])
 
     def slow(self, now_s: float) -> list[bytes]:
         """Return the readers that must no longer block the others; all are measured again after the lag."""
         slow = []
-        for name, block in list(self._blocks.items()):
+        for name, block in list(self.blocks.items()):
             if now_s - block.since_s < self._lag_s:
                 continue
-            del self._blocks[name]
+            del self.blocks[name]
             blocked_s = block.blocked_s + (now_s - block.checked_s if block.is_blocking else 0.0)
             is_obstacle = blocked_s >= _BLOCKED_SHARE * (now_s - block.since_s)
             if is_obstacle and block.sent_bytes - block.first_bytes < PROGRESS_BYTES:
                 slow.append(name)
         return slow
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which a reader may be too slow, or None."""
-        return min(block.since_s for block in self._blocks.values()) + self._lag_s if self._blocks else None
+    def get_timer(self) -> float:
+        """Return the monotonic second at which a reader may be too slow; infinity: none is measured."""
+        return min((block.since_s for block in self.blocks.values()), default=NEVER_S) + self._lag_s

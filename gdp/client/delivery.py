@@ -30,6 +30,7 @@ from gdp.names import Name
 __all__ = ["NOT_BEGUN", "Delivered", "Delivery", "Ended"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
+_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 _OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
 
 
@@ -91,6 +92,9 @@ class Delivery:
         losses: messages that were lost.
         delivered: messages that were delivered.
         delivered_bytes: size of what was to be delivered.
+        ready: messages for the application, in order.
+        gap_until_s: best effort, two paths: until then the slower one may bring what is missing; infinity: no gap.
+        held: Heartbeats, and when what they say of missing messages counts.
     """
 
     def __init__(
@@ -116,13 +120,13 @@ class Delivery:
         self._publisher = publisher
         self._incarnation = incarnation
         self._budget = budget
-        self._ready: list[Delivered] = []
+        self.ready: list[Delivered] = []
         self._gone: tuple[LostRange, ...] = ()  # that the writer reports as lost for every reader
         self._skipped: LossReason | None = None  # why the next gap is skipped; None: unknown
         self._waiting: dict[int, ReassembledMessage] = {}  # behind a gap, by number
-        self._gap_until_s = NEVER_S  # best effort, two paths: until then the slower one may bring what is missing
-        self._gap_at = 0  # ... and the number that is missing
-        self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
+        self.gap_until_s = NEVER_S
+        self._gap_at = 0  # number that is missing
+        self.held: deque[tuple[float, Heartbeat]] = deque()
 
     def begin_stream(self, status: Heartbeat, start: StreamStart, before: Ended, *, is_latched: bool) -> None:
         """Begin at the publisher's start, and count what came between that and the last message read before."""
@@ -158,7 +162,10 @@ class Delivery:
                 self._skip_to(number)
             self._unpack(reassembled)
             self.expected = number + 1
-            self._deliver(now_s)
+            if self._waiting:
+                self._deliver(now_s)
+            else:
+                self.gap_until_s = NEVER_S
         elif self._put(reassembled):
             self.known = max(self.known, min(int.from_bytes(reassembled.head, "big"), NUMBER_MAX) + 1)
             if not self.is_reliable:
@@ -188,25 +195,21 @@ class Delivery:
         if self.is_reliable or lag_s <= 0:
             self._apply_progress(status, now_s)
         else:
-            self._held.append((now_s + lag_s, status))
+            self.held.append((now_s + lag_s, status))
 
     def handle_timer(self, now_s: float) -> None:
         """Go on without what neither path nor a repair brought in time."""
-        while self._held and self._held[0][0] <= now_s:
-            self._apply_progress(self._held.popleft()[1], now_s)
-        is_released = self._late.give_up(now_s)
-        if self._gap_until_s <= now_s:
+        while self.held and self.held[0][0] <= now_s:
+            self._apply_progress(self.held.popleft()[1], now_s)
+        late = self._late
+        is_released = (late.incomplete or late.hold_s <= now_s) and late.give_up(now_s)
+        if self.gap_until_s <= now_s:
             numbers = self._numbers
             if numbers and numbers[0] < self._late.hold(numbers, now_s):
                 self._skip_to(numbers[0])
             self._deliver(now_s)
         elif is_released:
             self._deliver(now_s)
-
-    def get_timer(self) -> float:
-        """Return the monotonic second of the next ``handle_timer``; infinity: none."""
-        held_s = self._held[0][0] if self._held else NEVER_S
-        return held_s if held_s < self._gap_until_s else self._gap_until_s
 
     def finish(self) -> None:
         """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""
@@ -220,18 +223,18 @@ class Delivery:
         """Release all memory."""
         for number in self._numbers:
             self._pop(number)
-        self._gap_until_s = NEVER_S
-        self._held.clear()
+        self.gap_until_s = NEVER_S
+        self.held.clear()
 
     def poll(self) -> list[Delivered]:
         """Remove and return the messages that are ready, in order."""
-        ready, self._ready = self._ready, []
+        ready, self.ready = self.ready, []
         return ready
 
     def _deliver(self, now_s: float) -> None:
         """Deliver the consecutive messages, and without a reliable writer those behind a gap that nothing fills."""
         waiting = self._waiting
-        gap_until_s, self._gap_until_s = self._gap_until_s, NEVER_S
+        gap_until_s, self.gap_until_s = self.gap_until_s, NEVER_S
         if not self.is_live or not waiting:
             return
         while self.expected in waiting:
@@ -242,7 +245,7 @@ class Delivery:
         lag_s, free_to = self._lag_s(), self._late.hold(self._numbers, now_s)
         if lag_s > 0:
             is_same = self._gap_at == self.expected and now_s < gap_until_s < NEVER_S
-            self._gap_at, self._gap_until_s = self.expected, gap_until_s if is_same else now_s + lag_s
+            self._gap_at, self.gap_until_s = self.expected, gap_until_s if is_same else now_s + lag_s
         elif free := [number for number in self._numbers if number < free_to]:
             self._skip_to(free[-1] + 1)
 
@@ -304,25 +307,29 @@ class Delivery:
 
     def _unpack(self, reassembled: ReassembledMessage) -> None:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
-        sequence, messages = int.from_bytes(reassembled.head, "big"), [reassembled.message]
-        self.delivered_bytes += len(reassembled.message)
-        if len(reassembled.head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
+        number, flags, body, parts, hops, head = reassembled
+        sequence, messages, count = int.from_bytes(head, "big"), [body], 1
+        self.delivered_bytes += len(body)
+        if len(head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
             self._data.drops[DropReason.MALFORMED] += 1
             return
-        if reassembled.flags & _BUNDLE:
+        if flags & _BUNDLE:
             try:
-                messages = unpack(reassembled.message)
+                messages = unpack(body)
             except RemoteError as error:
                 self._data.drops[error.reason] += 1
                 return
-        otherwise, self._skipped = self._skipped or self._gap_reason, None
-        self._lose_until(sequence, otherwise)
-        self.sequence = max(self.sequence, sequence + len(messages))
-        self.delivered += len(messages)
-        number, way = reassembled.number, (reassembled.parts, reassembled.hops)
+            count = len(messages)
+        if self.sequence < sequence:
+            self._lose_until(sequence, self._skipped or self._gap_reason)
+        self._skipped = None
+        end = sequence + count
+        self.sequence = end if end > self.sequence else self.sequence
+        self.delivered += count
+        publisher, incarnation = self._publisher, self._incarnation
         for place, message in enumerate(messages):
-            at = place, sequence + place
-            self._ready.append(Delivered(self._publisher, self._incarnation, number, message, *way, *at))
+            delivered = publisher, incarnation, number, message, parts, hops, place, sequence + place
+            self.ready.append(_tuple(Delivered, delivered))
 
     @property
     def _gap_reason(self) -> LossReason:

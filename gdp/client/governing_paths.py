@@ -41,6 +41,7 @@ class GoverningPaths:
         share: of what the path carries, 0 to 1; the other topics that wait have the rest.
         seen_s: when ``allowance`` was last asked.
         second_until_s: monotonic second until which there is a second path, as far as known here.
+        limit_bytes_s: bytes a second that may leave by the settings; None: any.
     """
 
     def __init__(
@@ -62,16 +63,18 @@ class GoverningPaths:
         self.seen_s = 0.0
         self.share = 1.0
         self.second_until_s = float("-inf")
-        self._limit_bytes_s: float | None = None
+        self.limit_bytes_s: float | None = None
+        self._only: tuple[list[bytes], list[ReaderPath]] = ([], [])  # the only reader, and its path
+        self._only_at = -1  # ... as long as nothing has changed since
         self._limit: TokenBucket | None = None
         self.set_options(settings.options)
 
     def set_options(self, options: SendOptions) -> None:
         """Change how many bits may leave in a second."""
         bytes_s = None if options.max_bits_s is None else options.max_bits_s / 8
-        if bytes_s != self._limit_bytes_s:
+        if bytes_s != self.limit_bytes_s:
             self._limit = None if bytes_s is None else TokenBucket(bytes_s, max(bytes_s * _LIMIT_BURST_S, 1.0))
-            self._limit_bytes_s = bytes_s
+            self.limit_bytes_s = bytes_s
 
     def has_second(self, now_s: float) -> bool:
         """Return whether frames are to leave by two paths, and there are two."""
@@ -91,15 +94,15 @@ class GoverningPaths:
         if self._limit is not None and self._limit.left(now_s) <= 0:
             return 0
         self.seen_s, urgent = now_s, self._is_urgent
-        if self.is_doubled(now_s - _ALONE_FROM_S):
+        if self._count > 1 and self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._governing()
-        if len(paths) == 1 and not self.blocking:
+        if paths and not paths[1:] and not self.blocking.blocks:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
         if self._fastest_governs:
             return max(allowances, default=_ALL)
-        if self.blocking or (len(allowances) > 1 and min(allowances) <= 0):
+        if self.blocking.blocks or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
         return min(allowances, default=_ALL)
 
@@ -142,34 +145,36 @@ class GoverningPaths:
     @property
     def bytes_s(self) -> float | None:
         """Return the bytes a second that this topic may expect of its path; None: not measured, and no limit."""
-        rate = min((rate for path in self._measured() if (rate := path.controller.model.bytes_s)), default=0.0)
-        shares = [rate * self.share] if rate else []
-        if self._limit_bytes_s is not None:
-            shares.append(self._limit_bytes_s)
-        return min(shares, default=None)
+        rate = 0.0
+        for path in self._measured():
+            measured = path.controller.model.bytes_s
+            rate = measured if measured and (not rate or measured < rate) else rate
+        if not rate or self.limit_bytes_s is None:
+            return rate * self.share if rate else self.limit_bytes_s
+        return min(rate * self.share, self.limit_bytes_s)
 
     @property
     def capacity_bytes_s(self) -> float | None:
         """Return how many bytes a second the narrowest path carries; None: not measured."""
-        rates = (path.controller.model.capacity_bytes_s for path in self._measured())
-        return min((rate for rate in rates if rate), default=None)
+        rates = [path.controller.model.capacity_bytes_s for path in self._measured()]
+        return min([rate for rate in rates if rate], default=None)
 
     @property
     def loss(self) -> float:
         """Return the share of frames that were lost lately on the worst path, 0 to 1; 0 also if nothing is measured."""
-        return max((path.controller.model.loss for path in self._measured()), default=0.0)
+        return max([path.controller.model.loss for path in self._measured()], default=0.0)
 
     @property
     def rtt_s(self) -> float | None:
         """Return the smoothed round trip of the longest path in seconds; None: not measured."""
-        trips = (path.controller.model.rtt_s for path in self._measured())
-        return max((trip for trip in trips if trip is not None), default=None)
+        trips = [path.controller.model.rtt_s for path in self._measured()]
+        return max([trip for trip in trips if trip is not None], default=None)
 
     @property
     def base_rtt_s(self) -> float | None:
         """Return the round trip of the longest path while it is empty, in seconds; None: not measured."""
-        measured = (path.controller for path in self._measured() if path.controller.model.rtt_s is not None)
-        return max((controller.model.base_rtt_s for controller in measured), default=None)
+        models = [path.controller.model for path in self._measured()]
+        return max([model.base_rtt_s for model in models if model.rtt_s is not None], default=None)
 
     def patience_s(self, now_s: float) -> float:
         """Return how long the answer of the slowest reader may take."""
@@ -213,6 +218,8 @@ class GoverningPaths:
 
         One that began with a later message than the last of them does not.
         """
+        if self._only_at == self._readers.changes + self._paths.changes:
+            return self._only[0]
         names, window = self._present(), self._window
         if len(frames) <= again or len(names) < 2 or not self._queue.is_acknowledged:
             return names
@@ -229,10 +236,16 @@ class GoverningPaths:
 
     def _governing(self) -> list[ReaderPath]:
         """Return the paths to the readers that may govern, the slowest of which does; of requests the fastest does."""
-        return self._paths.governing(self.names(), self.seen_s)
+        if self._only_at == self._readers.changes + self._paths.changes:
+            return self._only[1]
+        names = self.names()
+        paths = self._paths.governing(names, self.seen_s)
+        if len(self._readers.active) == 1:
+            self._only, self._only_at = (names, paths), self._readers.changes + self._paths.changes
+        return paths
 
     def _measured(self) -> list[ReaderPath]:
-        return self._paths.governing(self.fastest() if self._fastest_governs else self.names(), self.seen_s)
+        return self._paths.governing(self.fastest(), self.seen_s) if self._fastest_governs else self._governing()
 
     def _record_blocks(self, now_s: float) -> None:
         """Note which readers hold back the others."""

@@ -63,11 +63,10 @@ class HeartbeatSchedule:
         """Request another Heartbeat if the description is to be repeated now."""
         self.wanted |= self._again_s <= now_s
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which a Heartbeat may be sent or will be wanted, or None."""
+    def get_timer(self) -> float:
+        """Return the monotonic second at which a Heartbeat may be sent or will be wanted; infinity: never."""
         at_s = self._at_s if self.wanted else self._again_s
-        at_s = min(at_s, self._remind_s) if self.is_reminder_wanted else at_s
-        return None if at_s == NEVER_S else at_s
+        return min(at_s, self._remind_s) if self.is_reminder_wanted else at_s
 
     def is_due(self, now_s: float) -> bool:
         """Return whether a Heartbeat is wanted and may be sent."""

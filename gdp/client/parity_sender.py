@@ -100,6 +100,7 @@ class ParitySender:
         is_enabled: as set.
         sent: parity frames that left.
         margin: parity frames of a block beyond those that independent losses need.
+        waiting: parity frames that have not left.
     """
 
     def __init__(self, *, keys: KeyEpochs, budget: CopyBudget, is_enabled: bool) -> None:
@@ -111,12 +112,9 @@ class ParitySender:
         self._number, self._part = -1, 0  # the message under way, and the part that is sent next
         self._frames: list[bytes] = []  # of its present span
         self._made = 0  # parity frames of this message
-        self._waiting = deque[bytes]()
+        self.waiting = deque[bytes]()
         self._at_once = 0  # of them leave whatever the limit
         self._requested: OrderedDict[int, bool] = OrderedDict()  # messages with parity: whether a reader lacks some
-
-    def __len__(self) -> int:
-        return len(self._waiting)
 
     @property
     def is_available(self) -> bool:
@@ -162,9 +160,9 @@ class ParitySender:
 
     def poll_frames(self, limit: int) -> list[bytes]:
         """Remove and return at most ``limit`` parity frames, and those that leave at once."""
-        if not self._waiting:
+        if not self.waiting:
             return []
-        frames = [self._waiting.popleft() for _ in range(min(max(limit, self._at_once), len(self._waiting)))]
+        frames = [self.waiting.popleft() for _ in range(min(max(limit, self._at_once), len(self.waiting)))]
         self.sent += len(frames)
         self._at_once = max(self._at_once - len(frames), 0)
         return frames
@@ -172,11 +170,11 @@ class ParitySender:
     def cancel(self, number: int) -> None:
         """Drop the parity frames of a message that is cancelled."""
         cancelled = number.to_bytes(8, "big")
-        self._waiting = deque(each for each in self._waiting if each[_NUMBER] != cancelled)
+        self.waiting = deque(each for each in self.waiting if each[_NUMBER] != cancelled)
 
     def clear(self) -> None:
         """Drop the parity frames that wait: there is no reader any more."""
-        self._waiting.clear()
+        self.waiting.clear()
 
     def _add(self, span: range, parts: int, loss: float, path_bytes_s: float | None, now_s: float) -> None:
         """Queue the parity of a span, as far as the budget allows."""
@@ -200,9 +198,9 @@ class ParitySender:
             for block, count, of_block in zip(blocks, counts, shards, strict=True):
                 if index < count:
                     body = Parity(block.first, index, count, of_block[index]).to_wire()
-                    self._waiting.append(seal(self._number, self._made, parts, flags, body))
+                    self.waiting.append(seal(self._number, self._made, parts, flags, body))
                     self._made += 1
-        self._at_once = min(self._at_once + len(self._waiting), _AT_ONCE)
+        self._at_once = min(self._at_once + len(self.waiting), _AT_ONCE)
         self._remember(self._number)
 
     def _remember(self, number: int) -> None:

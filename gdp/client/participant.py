@@ -39,6 +39,7 @@ from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.intervals import NEVER_S
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
@@ -70,6 +71,40 @@ class ServiceOptions(TypedDict, total=False):
     paths: int
     options: SendOptions
     is_session: bool
+
+
+class _Control:
+    """Timers of attachment and diagnostics, which are read again only after something may have changed them.
+
+    Attributes:
+        due_s: monotonic second of the next one, or None; not valid while ``has_changed``.
+        early_s: before this second they have nothing to do, and send nothing together with what others send.
+    """
+
+    def __init__(self, attachment: Attachment, diagnostics: Diagnostics) -> None:
+        self._attachment = attachment
+        self._diagnostics = diagnostics
+        self.due_s: float | None = None
+        self.early_s = -NEVER_S
+        self.has_changed, self._is_settled = True, False
+
+    def touch(self) -> Attachment:
+        """Return the attachment to a caller that may change when something is due."""
+        self.has_changed, self._is_settled = True, False
+        return self._attachment
+
+    def handle_timer(self, now: Timestamps) -> None:
+        """Process the timers that are due."""
+        self.touch().handle_timer(now)
+        self._diagnostics.handle_timer(now)
+        self._is_settled = True
+
+    def read_timers(self) -> None:
+        """Set when something is due."""
+        due_s, waiting_s = self._attachment.get_timer(), self._diagnostics.get_timer()
+        self.due_s, self.early_s, self.has_changed = earliest(due_s, waiting_s), -NEVER_S, False
+        if self._is_settled and waiting_s is None:
+            self.early_s = NEVER_S if due_s is None else due_s - self._attachment.hello_protocol.together_s
 
 
 class Participant:
@@ -109,10 +144,11 @@ class Participant:
         self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
         self.diagnostics = Diagnostics(
             identity, policy, self.attachment.fragmenter, settings.first_sequence,
-            lambda frames, _to, _now: self.attachment.send(frames),
+            lambda frames, _to, _now: self._control.touch().send(frames),
         )  # fmt: skip
         self.diagnostics.register("ping", self._answer_ping, for_foreign=True)
         self.diagnostics.evidence_of = self.attachment.evidence_of
+        self._control = _Control(self.attachment, self.diagnostics)
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped, by reason."""
@@ -126,7 +162,7 @@ class Participant:
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to discover a switch on a port."""
         self._clock.advance(now.mono_s)
-        self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
+        self._control.touch().hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
     def advertise(
         self,
@@ -144,7 +180,7 @@ class Participant:
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self.publications)
         settings = PublisherSettings(reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options)
         publisher = self.publications.add(topic.name, topic.own_secrets, description, settings)
-        self.attachment.advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject, Right.PUBLISH, topic.delegation.chain, is_global=is_global, paths=paths
         )
         return publisher
@@ -173,13 +209,13 @@ class Participant:
         if subscription is not None and subscription.right is not Right.READ:
             right = subscription.right
             self._close(self.subscriptions.remove(name))
-        self.attachment.withdraw(name, right)
+        self._control.touch().withdraw(name, right)
 
     def subscribe(self, topic: Topic, *, paths: int = 1) -> None:
         """Read a topic from now on, from every publisher of it; ``paths`` 2: by two paths from those that want two."""
         self._check(topic, Right.READ, is_free=self.subscriptions.get(topic.name) is None)
         self.subscriptions.add(topic, Right.READ, self._clock.now_s, paths)
-        self.attachment.advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject, Right.READ, topic.delegation.chain, is_global=False, paths=paths
         )
 
@@ -188,7 +224,7 @@ class Participant:
         subscription = self.subscriptions.get(name)
         if subscription is not None and subscription.right is Right.READ:
             self._close(self.subscriptions.remove(name))
-            self.attachment.withdraw(name, Right.READ)
+            self._control.touch().withdraw(name, Right.READ)
 
     def renew(self, topic: Topic) -> None:
         """Replace a topic's delegation and secrets, for what is published or read of it."""
@@ -198,14 +234,14 @@ class Participant:
             subscription.topic = topic
             for writer_proxy in subscription.all():
                 writer_proxy.renew(topic.secrets)
-        self.attachment.renew(topic.name, topic.delegation.chain)
+        self._control.touch().renew(topic.name, topic.delegation.chain)
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames."""
         self._clock.advance(now.mono_s)
         reception = self._reception
-        at = 0
-        while at < len(arrivals):
+        at, count = 0, len(arrivals)
+        while at < count:
             if reception.under_way is not None:
                 writer_proxy, subscription = reception.under_way
                 taken = writer_proxy.receive_run(arrivals, at, now.mono_s)
@@ -215,7 +251,8 @@ class Participant:
                     continue
             self._receive_one(arrivals[at], now)
             at += 1
-        reception.hand_out(now.mono_s)
+        if reception.fed:
+            reception.hand_out(now.mono_s)
 
     def _receive_one(self, arrival: ReceivedFrame, now: Timestamps) -> None:
         try:
@@ -225,7 +262,7 @@ class Participant:
             elif header.kind in _FOR_US:
                 self._receive_ours(header, arrival, now)
             elif header.kind >= CONTROL_FROM:
-                statement = self.attachment.receive_control(arrival, header, now)
+                statement = self._control.touch().receive_control(arrival, header, now)
                 if statement is not None:
                     self._reception.hand_out(now.mono_s)  # it may close writer proxies
                     self._take_statement(statement, now)
@@ -246,16 +283,17 @@ class Participant:
         elif header.kind == Kind.INTRODUCTION:
             self.publications.receive_introduction(header, arrival.frame)
         else:
+            self._control.touch()
             self.diagnostics.receive(header, arrival, now)
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Update the state of a port's link."""
-        self.attachment.port_changed(port, up, now)
+        self._control.touch().port_changed(port, up, now)
 
     def handle_timer(self, now: Timestamps) -> None:
         """Process the timers that are due."""
-        self.attachment.handle_timer(now)
-        self.diagnostics.handle_timer(now)
+        if self._control.has_changed or now.mono_s >= self._control.early_s:
+            self._control.handle_timer(now)
         self._clock.advance(now.mono_s)
         self.publications.handle_timer(now.mono_s)
         self._reception.handle_timer(now.mono_s)
@@ -263,23 +301,31 @@ class Participant:
 
     def flush(self, now_s: float) -> None:
         """Pass frames and reports that are ready to the switch."""
-        if self.attachment.switch is None:
+        switch, scheduler = self.attachment.switch, self._scheduler
+        if switch is None:
             return
-        self._clock.advance(now_s)
-        if self.attachment.switch is not self._sent_by:
-            self._sent_by = self.attachment.switch
+        if now_s != self._clock.now_s:
+            self._clock.advance(now_s)
+        if switch is not self._sent_by:
+            self._sent_by = switch
             self.publications.attachment_changed(now_s)
         if self._reception.reporting:
             self._reception.report(now_s)
-        for frames in self._scheduler.poll_turn(now_s):
-            self.attachment.send(frames)
+        if scheduler.is_ready or scheduler.uncounted is not None or now_s >= scheduler.due_s:
+            for frames in scheduler.poll_turn(now_s):
+                self.attachment.send(frames)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        due_s = self.attachment.get_timer(), self.diagnostics.get_timer()
+        if self._control.has_changed:
+            self._control.read_timers()
+        due_s = self._control.due_s
         if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
-            return earliest(*due_s)
-        return earliest(*due_s, self.publications.next_due(), self._reception.timers.next_due())
+            return due_s
+        timers, own_s = self._reception.timers, self.publications.next_due()
+        read_s = timers.next_due() if timers.touched else timers.due_s
+        own_s = own_s if own_s < read_s else read_s
+        return own_s if due_s is None or own_s < due_s else due_s
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
@@ -295,13 +341,12 @@ class Participant:
         So the first frames of a large message are under way while the next ones are being sealed. The topics take
         turns; urgent ones go first each time.
         """
-        out = self.attachment.frames_to_send()
-        if self.publications.requests:
+        attachment = self.attachment
+        if self.publications.holding:
             self.publications.release_requests(now_s)
-        if not out and (self._scheduler or self._reception.reporting):
+        if not attachment.outgoing and (self._scheduler.is_ready or self._reception.reporting):
             self.flush(now_s)
-            out = self.attachment.frames_to_send()
-        return out
+        return attachment.frames_to_send() if attachment.outgoing else []
 
     def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: sealing them took time."""
@@ -315,7 +360,7 @@ class Participant:
     def leave(self) -> None:
         """Leave the overlay: close writer proxies, withdraw every name."""
         self._close(self.subscriptions.leave())
-        self.attachment.withdraw_all()
+        self._control.touch().withdraw_all()
 
     def _check(self, topic: Topic, right: Right, *, is_free: bool) -> None:
         if right not in topic.delegation.rights or not topic.secrets:
@@ -342,7 +387,7 @@ class Participant:
         publisher = self.publications.add(topic.name, topic.own_secrets, description, settings)
         self.publications.enable_unicast(topic.name, topic.own_secrets, settings)
         self.subscriptions.add(topic, right, self._clock.now_s, paths, is_session=is_session)
-        self.attachment.advertisement(
+        self._control.touch().advertisement(
             topic.delegation.subject,
             right,
             topic.delegation.chain,

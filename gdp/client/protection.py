@@ -101,7 +101,8 @@ class Protection:
             self._sent_frames.loss.forget(reader)
         elif self.copies.is_enabled and acknack.next_number:
             self._sent_frames.loss.handle_report(reader, acknack.next_number, acknack.next_part, acknack.frames)
-        self.parity.handle_report({each.number for each in acknack.missing})
+        if acknack.missing:
+            self.parity.handle_report({each.number for each in acknack.missing})
         self._measure_loss(now_s)
 
     def request_late(self, reader: bytes, acknack: AckNack, now_s: float) -> None:
@@ -112,43 +113,50 @@ class Protection:
 
     def poll_frames(self, now_s: float, limit_bytes: int, heartbeats: list[bytes]) -> list[bytes]:
         """Return Heartbeats and about ``limit_bytes`` of other frames, as they leave now; with 0 nothing new does."""
-        paths, repaired = self._paths, self.repairs
-        is_doubled, self.has_more = paths.is_doubled(now_s), False
+        paths, parity, again = self._paths, self.parity, 0
+        is_doubled, self.has_more = not self._has_one_path and paths.is_doubled(now_s), False
         before, sent, after = list[bytes](), list[bytes](), list[bytes]()
         if limit_bytes > 0:
-            limit = max(limit_bytes // ((self._queue.mtu or MTU_MIN_BYTES) * (2 if is_doubled else 1)), 1)
-            before = self.parity.poll_frames(limit)
-            sent = self._poll_data(now_s, limit - len(before))
+            left = limit_bytes // ((self._queue.mtu or MTU_MIN_BYTES) * (2 if is_doubled else 1)) or 1
+            if parity.waiting:
+                before = parity.poll_frames(left)
+                left -= len(before)
+            repaired = self._window.retransmissions + self.late.retransmissions
+            sent = self._poll_data(now_s, left)
+            again = self._window.retransmissions + self.late.retransmissions - repaired
             if self._loss is not None:
-                self.parity.handle_sent(sent, self._loss, paths.capacity_bytes_s, now_s)
-            left = limit - len(before) - len(sent)
-            self.has_more = left <= len(self.parity)
-            after = self.parity.poll_frames(max(left, 0))
+                parity.handle_sent(sent, self._loss, paths.capacity_bytes_s, now_s)
+            left -= len(sent)
+            self.has_more = left <= 0
+            if parity.waiting:
+                self.has_more = left <= len(parity.waiting)
+                after = parity.poll_frames(max(left, 0))
             if not is_doubled:
-                again = self.repairs - repaired
-                self._sent_frames.leave(sent, paths.confirming(sent, again), now_s, again)
-            paths.charge_limit(chain(before, sent, after), now_s)
+                self._sent_frames.leaving = sent, paths.confirming(sent, again), now_s, again
+            if paths.limit_bytes_s is not None:
+                paths.charge_limit(chain(before, sent, after), now_s)
         frames = heartbeats + before + sent + after
         if frames:
             self._sent_frames.last_s = now_s
-        copies = self._poll_copies(sent, now_s)
+        copies = self._poll_copies(sent, now_s) if self.copies.is_enabled or now_s >= self.copies.due_s else []
         if extra := copies + before + after:  # no reader confirms them
             paths.charge(sum(map(len, extra)), now_s)
         frames += copies
-        if not paths.has_second(now_s):
+        if self._has_one_path or not paths.has_second(now_s):
             return frames
         if self._striper is None:
             return [*frames, *map(second_path_copy, frames)]
-        return self._striper.stripe(frames, len(heartbeats) + self.repairs - repaired, self._readers.names())
+        return self._striper.stripe(frames, len(heartbeats) + again, self._readers.names())
 
     def _poll_data(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames; those that were sent before come first."""
         if limit <= 0:
             return []
-        frames = self.late.frames_to_send(now_s, limit)
-        if len(frames) < limit:
-            new = self._queue.frames_to_send(now_s, limit - len(frames))
-            if not self._queue.is_acknowledged:
+        frames = self.late.frames_to_send(now_s, limit) if self.late.messages else []
+        left = limit - len(frames) if frames else limit
+        if left > 0:
+            new = self._queue.frames_to_send(now_s, left)
+            if new and not self._queue.is_acknowledged:
                 self.late.record_sent(new, now_s)
             frames += new
         if self._window.governing is None or len(frames) >= limit:
@@ -179,4 +187,5 @@ class Protection:
         """
         trip_s = self._paths.base_rtt_s if self.parity.is_enabled else None
         self._loss = self._measured_loss(now_s) if trip_s is not None and trip_s >= RTT_MIN_S else None
-        self._queue.has_parity = self.parity.is_wanted(self._loss, trip_s, self._queue.options.deadline_s)
+        deadline_s = self._queue.options.deadline_s
+        self._queue.has_parity = self._loss is not None and self.parity.is_wanted(self._loss, trip_s, deadline_s)

@@ -25,7 +25,6 @@ from gdp.client.unicast_stream import Party, PeerIncarnation
 from gdp.client.unicast_streams import UnicastStreams
 from gdp.control.join import Join
 from gdp.crypto.control_seal import topic_of
-from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.frame.codec import Header
 from gdp.message.loss import LossReason
@@ -42,6 +41,7 @@ class Publications:
 
     Attributes:
         requests: to the servers of each name that is called.
+        holding: those of them with copies that have not begun.
     """
 
     def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
@@ -50,6 +50,7 @@ class Publications:
         self._publishers: dict[Name, Publisher] = {}
         self._private: dict[Name, UnicastStreams] = {}  # by service
         self.requests: dict[Name, RequestStreams] = {}
+        self.holding: dict[RequestStreams, None] = {}
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
@@ -110,7 +111,7 @@ class Publications:
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
         public, paths_to = self._publishers[name], self._reader_paths
-        self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to)
+        self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to, self.holding)
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -125,7 +126,8 @@ class Publications:
         """Stop publishing a name; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
-        self.requests.pop(name, None)
+        if (requests := self.requests.pop(name, None)) is not None:
+            requests.close()
         if publisher is None:
             return False
         self._sequence_registry.put(name, publisher.past)
@@ -157,7 +159,7 @@ class Publications:
 
     def release_requests(self, now_s: float) -> None:
         """Begin the copies of requests that have waited for a faster one to leave."""
-        for requests in self.requests.values():
+        for requests in list(self.holding):
             requests.release(now_s)
 
     def forget(self, service: Name, party: PeerIncarnation) -> None:
@@ -205,29 +207,37 @@ class Publications:
 
     def handle_timer(self, now_s: float) -> None:
         """Process the timers that are due."""
-        for publisher in self._timers.poll_due(now_s):
+        timers = self._timers
+        for publisher in timers.poll_due(now_s) if timers.touched or now_s >= timers.due_s else ():
             publisher.handle_timer(now_s)
             self.scheduler.add(publisher)
-        for streams in self._private.values():
+        for streams in self._private.values() if self._private else ():
             streams.forget_idle(now_s)
-        if self._reader_paths.handle_timer(now_s):
+        if now_s >= self._reader_paths.due_s and self._reader_paths.handle_timer(now_s):
             self.scheduler.resume()
-        self.release_requests(now_s)
+        if self.holding:
+            self.release_requests(now_s)
 
     def frames_sent(self, now_s: float) -> None:
         """Count the frames polled last, which left at ``now_s``."""
-        self.scheduler.count_sent()
-        self._reader_paths.frames_sent(now_s)
+        if self.scheduler.uncounted is not None:
+            self.scheduler.count_sent()
+        if self._reader_paths.leaving:
+            self._reader_paths.frames_sent(now_s)
 
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
         self._reader_paths.attachment_changed(now_s)
         self.scheduler.resume()
 
-    def next_due(self) -> float | None:
-        """Return the monotonic second of the next timer, or None."""
-        requests = [each.get_timer() for each in self.requests.values()] if self.requests else ()
-        return earliest(self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due(), *requests)
+    def next_due(self) -> float:
+        """Return the monotonic second of the next timer; infinity: none."""
+        timers = self._timers
+        timer_s = timers.next_due() if timers.touched else timers.due_s
+        due_s = min(timer_s, self._reader_paths.due_s, self.scheduler.due_s)
+        for requests in self.holding:
+            due_s = min(due_s, requests.get_timer())
+        return due_s
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

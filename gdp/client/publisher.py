@@ -28,7 +28,6 @@ from gdp.client.send_options import RELIABLE, PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
-from gdp.due_queue import earliest
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.intervals import NEVER_S
@@ -148,8 +147,9 @@ class Publisher:
     @property
     def is_wanted(self) -> bool:
         """Return whether a message published now is for a reader, or for one that may return to its window."""
-        may_return = self.confirms and self._window.readers.suspended
-        return self.queue.mtu is not None and bool(self.matched.active or may_return)
+        queue = self.queue
+        is_read = self.matched.active or (queue.is_acknowledged and self._window.readers.suspended)
+        return queue.mtu is not None and bool(is_read)
 
     @property
     def confirms(self) -> bool:
@@ -272,7 +272,7 @@ class Publisher:
             return None
         self.queue.add(message, gather_bytes=WINDOW_BYTES if self.matched.active else BUNDLE_BYTES, added_s=now_s)
         self.published(self)
-        return self.messages
+        return self.queue.ledger.messages
 
     def skip(self, reason: LossReason, now_s: float | None = None) -> None:
         """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason."""
@@ -295,8 +295,10 @@ class Publisher:
 
         Errors are counted.
         """
-        self.sent_frames.count()
-        self.queue.drop_aged(now_s)
+        if self.sent_frames.leaving is not None:
+            self.sent_frames.count()
+        if self.queue.options.history_age_s is not None:
+            self.queue.drop_aged(now_s)
         is_old = header.epoch != self._keys.epoch
         try:
             secret = self._keys.secret_of(header.epoch, now_s)
@@ -315,7 +317,8 @@ class Publisher:
         path = self._node_paths.get(source)
         trip_s = 0.0 if path is None else path.trip_s
         self.acknowledgements.handle_acknack(source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
-        self.protection.request_late(source, report, now_s)
+        if report.missing:
+            self.protection.request_late(source, report, now_s)
         self._heartbeats.is_reminder_wanted |= is_old  # it has not received the new epoch yet
         return True
 
@@ -331,20 +334,16 @@ class Publisher:
         self._heartbeats.wanted |= self._window.probe_due(now_s)
         self._heartbeats.handle_timer(now_s)
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second of the next timer, or None."""
-        window, protection = self._window, self.protection
-        due_s = earliest(
-            window.next_probe(),
-            window.readers.next_slow(),
-            self.matched.next_silent(),
-            protection.late.get_timer(),
-            self.governing_paths.blocking.get_timer(),
-            self._awaits_until_s if self._awaits_until_s < NEVER_S else None,
-        )
+    def get_timer(self) -> float:
+        """Return the monotonic second of the next timer; infinity: none."""
+        protection, blocking = self.protection, self.governing_paths.blocking
+        due_s = self._awaits_until_s
+        if protection.late.messages or blocking.blocks:
+            due_s = min(due_s, protection.late.get_timer(), blocking.get_timer())
+        of_readers = self._window.get_timer(), self.matched.next_silent()
         if not self.matched.active or self.queue.mtu is None:
-            return due_s
-        return earliest(due_s, self._heartbeats.get_timer(), protection.copies.get_timer())
+            return min(due_s, *of_readers)
+        return min(due_s, *of_readers, self._heartbeats.get_timer(), protection.copies.due_s)
 
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.
@@ -353,7 +352,8 @@ class Publisher:
         follows, before another publisher asks what the same paths permit.
         """
         queue, mtu = self.queue, self.queue.mtu
-        self.sent_frames.count()
+        if self.sent_frames.leaving is not None:
+            self.sent_frames.count()
         self.has_more = False
         if mtu is None or not self.matched.active:
             self.protection.copies.clear()
@@ -361,15 +361,18 @@ class Publisher:
             if not self.matched.active:
                 queue.drop_unread()
             return []
-        queue.drop_aged(now_s)
-        queue.seal_deferred()
+        if queue.options.history_age_s is not None:
+            queue.drop_aged(now_s)
+        if queue.deferred.waiting:
+            queue.seal_deferred()
         if not queue.is_acknowledged:
             queue.bytes_s = self.governing_paths.bytes_s
             self._heartbeats.is_reminder_wanted |= queue.drop_expired(now_s)
         heartbeats: list[bytes] = []
-        if self._heartbeats.is_due(now_s):
+        schedule = self._heartbeats
+        if (schedule.wanted or schedule.is_reminder_wanted) and schedule.is_due(now_s):
             wire = self.acknowledgements.poll_heartbeat(now_s, self.governing_paths.patience_s(now_s))
-            heartbeats = self._keys.status.seal(self._heartbeats.number, queue.flags, wire, mtu)[:]
+            heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
         return frames

@@ -81,12 +81,15 @@ class ReaderPath:
         if next_s > now_s + BURST_S:
             controller.pace.is_paced = True
             return 0
-        free = max(free, mtu)  # an empty path carries a frame, whatever its window
+        free = free if free > mtu else mtu  # an empty path carries a frame, whatever its window
         pace = controller.pace.bytes_s
         if pace >= _UNLIMITED:
             return free
-        since_s = max(next_s, now_s - max(controller.pace.credit_s, BURST_S))
-        return min(free, int((now_s + BURST_S - since_s) * pace) + mtu)
+        if next_s < now_s - BURST_S:
+            burst_s = max(controller.pace.credit_s, BURST_S) if controller.pace.is_paced else BURST_S
+            next_s = next_s if next_s > now_s - burst_s else now_s - burst_s
+        paced = int((now_s + BURST_S - next_s) * pace) + mtu
+        return free if free < paced else paced
 
     def next_send_s(self) -> float:
         """Return when the next frame may leave; infinity: not before something is confirmed."""
@@ -232,12 +235,20 @@ class ReaderPath:
 
 
 class ReaderPaths:
-    """Paths of one participant, by the name of the reader node."""
+    """Paths of one participant, by the name of the reader node.
+
+    Attributes:
+        due_s: monotonic second of the next ``handle_timer``; infinity: none.
+        leaving: flights that are counted, and perhaps not sealed yet.
+        changes: count of paths that came and went.
+    """
 
     def __init__(self) -> None:
         self._paths: dict[bytes, ReaderPath] = {}
         self._started: dict[bytes, int] = {}  # when the newest incarnation of a reader node started
-        self._scan_s: float | None = None
+        self.due_s = NEVER_S
+        self.leaving: list[Flight] = []
+        self.changes = 0
         self._mtu = MTU_MIN_BYTES  # of new paths
 
     def __len__(self) -> int:
@@ -248,8 +259,9 @@ class ReaderPaths:
         path = self._paths.get(reader)
         if path is None:
             path = self._paths[reader] = ReaderPath(self._mtu, now_s)
-        if self._scan_s is None:
-            self._scan_s = now_s + PACE_S
+            self.changes += 1
+        if self.due_s == NEVER_S:
+            self.due_s = now_s + PACE_S
         return path
 
     def get(self, reader: bytes) -> ReaderPath | None:
@@ -311,12 +323,13 @@ class ReaderPaths:
 
     def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""
-        for path in self._paths.values():
-            path.controller.rate.frames_sent(now_s)
+        for flight in self.leaving:
+            flight.sent_s = now_s
+        self.leaving = []
 
     def handle_timer(self, now_s: float) -> bool:
         """Let silent paths start again, and forget unused ones; return whether any may carry more now."""
-        if self._scan_s is None or now_s < self._scan_s:
+        if now_s < self.due_s:
             return False
         before = sum(path.is_silent for path in self._paths.values())
         timed_out = False
@@ -327,9 +340,7 @@ class ReaderPaths:
             if path.is_unused(now_s):
                 del self._paths[reader]
                 self._started.pop(reader, None)
-        self._scan_s = now_s + PACE_S if any(path.controller.rate.inflight for path in self._paths.values()) else None
+                self.changes += 1
+        is_awaiting = any(path.controller.rate.inflight for path in self._paths.values())
+        self.due_s = now_s + PACE_S if is_awaiting else NEVER_S
         return timed_out or before != sum(path.is_silent for path in self._paths.values())
-
-    def get_timer(self) -> float | None:
-        """Return the monotonic second of the next ``handle_timer``, or None."""
-        return self._scan_s

@@ -114,6 +114,7 @@ class ReaderProxies:
     Attributes:
         active: those that are not suspended.
         is_reachable: a tree to them is installed.
+        changes: how often one became active, or stopped being so.
         confirmed: ``sequence`` of the last incarnation of a reader that is over, by name; oldest first.
     """
 
@@ -127,6 +128,7 @@ class ReaderProxies:
         self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
         self.confirmed: dict[bytes, int] = {}
         self.is_reachable = False
+        self.changes = 0
 
     def is_read_by(self, name: bytes) -> bool:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
@@ -148,20 +150,23 @@ class ReaderProxies:
         """Return those that have not been heard for ``READER.lease_s``."""
         return [name for name, reading in self.active.items() if now_s - reading.heard_s > READER.lease_s]
 
-    def next_silent(self) -> float | None:
-        """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
+    def next_silent(self) -> float:
+        """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty; infinity: never."""
         due_s = NEVER_S
-        for readers, lease_s in ((self.active, READER.lease_s), (self._suspended, NEVER_S)):
-            for each in readers.values():
-                behind_s = NEVER_S if each.behind_s is None else each.behind_s + FORGET_S
-                heard_s = each.heard_s + lease_s
-                earlier_s = behind_s if behind_s < heard_s else heard_s
-                due_s = earlier_s if earlier_s < due_s else due_s
-        return None if due_s == NEVER_S else due_s + 0.001
+        for each in self.active.values():
+            silent_s = each.heard_s + READER.lease_s
+            due_s = silent_s if silent_s < due_s else due_s
+            if each.behind_s is not None and each.behind_s + FORGET_S < due_s:
+                due_s = each.behind_s + FORGET_S
+        for each in self._suspended.values() if self._suspended else ():
+            if each.behind_s is not None and each.behind_s + FORGET_S < due_s:
+                due_s = each.behind_s + FORGET_S
+        return due_s + 0.001
 
     def suspend(self, name: bytes, now_s: float) -> None:
         """Suspend a silent reader, until it reports again or is forgotten."""
         reading = self._suspended[name] = self.active.pop(name)
+        self.changes += 1
         reading.behind_s = now_s if reading.behind_s is None else reading.behind_s
 
     def is_suspended(self, name: bytes) -> bool:
@@ -175,6 +180,7 @@ class ReaderProxies:
             return False
         reading.heard_s = now_s
         self.active[name] = reading
+        self.changes += 1
         return True
 
     def overdue(self, now_s: float) -> list[tuple[bytes, ReaderProxy]]:
@@ -217,11 +223,13 @@ class ReaderProxies:
         self._end(name, self.active.get(name) or self._suspended.pop(name, None))
         incarnation_id = self._incarnation_ids[name, incarnation]
         reading = self.active[name] = ReaderProxy(incarnation=incarnation, incarnation_id=incarnation_id, heard_s=now_s)
+        self.changes += 1
         return reading
 
     def forget(self, name: bytes) -> bool:
         """Forget a reader, suspended or not; return whether it was one."""
         self.confirmed.pop(name, None)
+        self.changes += 1
         return (self.active.pop(name, None) or self._suspended.pop(name, None)) is not None
 
     def give_up(self, name: bytes) -> None:
@@ -280,14 +288,15 @@ class ReaderProxies:
         if incarnation_id is None:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a note of a life that did not introduce itself")
         acknack = AckNack.from_wire(incarnation_id.open(header, frame, secret, now_s))
-        is_new = AckNackFlag.NEW in acknack.flags
+        is_new = acknack.flags is AckNackFlag.NEW
         if not may_begin and (is_new or not is_current):
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
         if name not in self.active and len(self.active) >= READERS_MAX:
             raise EnvelopeError(DropReason.QUOTA, "readers")
         if reading is not None and is_current:
             reading.heard_s = now_s
-            self.resume(name, now_s)
+            if self._suspended:
+                self.resume(name, now_s)
             return acknack, False
         if reading is not None and (not is_new or incarnation_id.started <= reading.incarnation_id.started):
             raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")

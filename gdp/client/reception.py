@@ -58,12 +58,13 @@ class Reception:
             self.messages += subscription.poll_messages(writer_proxy.publisher)
             if writer_proxy.is_report_due(now_s):
                 self.reporting[writer_proxy] = None  # it states for how long it held back what it reports
-            self.timers.reschedule(writer_proxy)
-        self.fed.clear()
+            self.timers.touched[writer_proxy] = None
+        self.fed = {}
 
     def handle_timer(self, now_s: float) -> None:
         """Process the timers that are due."""
-        for writer_proxy in self.timers.poll_due(now_s):
+        timers = self.timers
+        for writer_proxy in timers.poll_due(now_s) if timers.touched or now_s >= timers.due_s else ():
             writer_proxy.handle_timer(now_s)
             self.reporting[writer_proxy] = None
             subscription = self._subscriptions.get(writer_proxy.topic)
@@ -76,7 +77,7 @@ class Reception:
             notes = writer_proxy.control_to_send(now_s)
             if notes:
                 self._send(notes)
-            self.timers.reschedule(writer_proxy)
+            self.timers.touched[writer_proxy] = None
         self.reporting.clear()
 
     def close(self, writer_proxies: Iterable[WriterProxy], *, goodbye: bool) -> None:

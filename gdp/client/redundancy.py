@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import PARTS_AT
+from gdp.intervals import NEVER_S
 from gdp.limits import SENDS_MAX
 from gdp.message.second_copies import REPEATED_PARTS_MAX
 from gdp.token_bucket import TokenBucket
@@ -77,6 +78,7 @@ class Redundancy:
     Attributes:
         is_enabled: as set.
         copies: frames that were sent again against loss.
+        due_s: monotonic second at which a copy is due; infinity: none waits.
     """
 
     def __init__(self, *, budget: CopyBudget, is_enabled: bool) -> None:
@@ -84,6 +86,7 @@ class Redundancy:
         self.is_enabled = is_enabled
         self._waiting = tuple(deque[tuple[float, bytes]]() for _ in _OFFSETS_S)
         self.copies = 0
+        self.due_s = NEVER_S
 
     def handle_sent(
         self,
@@ -110,6 +113,7 @@ class Redundancy:
                 if not self._budget.spend(now_s, len(frame), path_bytes_s):
                     return
                 waiting.append((now_s + offset_s, frame))
+                self.due_s = min(self.due_s, waiting[0][0])
 
     def poll_copies(self, now_s: float) -> list[bytes]:
         """Remove and return the copies that are due."""
@@ -118,13 +122,11 @@ class Redundancy:
             while waiting and waiting[0][0] <= now_s:
                 due.append(waiting.popleft()[1])
         self.copies += len(due)
+        self.due_s = min((waiting[0][0] for waiting in self._waiting if waiting), default=NEVER_S)
         return due
-
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which a copy is due, or None."""
-        return min(waiting[0][0] for waiting in self._waiting if waiting) if any(self._waiting) else None
 
     def clear(self) -> None:
         """Drop the copies that wait: there is no reader any more."""
         for waiting in self._waiting:
             waiting.clear()
+        self.due_s = NEVER_S

@@ -19,6 +19,7 @@ from typing import Final
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.errors import LocalError
+from gdp.intervals import NEVER_S
 from gdp.names import Name
 
 __all__ = ["RequestStreams"]
@@ -42,12 +43,20 @@ class RequestStreams:
     Args:
         public: the stream to all servers.
         stream: returns the unicast stream to a server; raises ``LocalError`` if it is not connected.
+        holding: of the participant, those with copies that have not begun.
     """
 
-    def __init__(self, public: Publisher, stream: Callable[[Name, float], Publisher], paths: ReaderPaths) -> None:
+    def __init__(
+        self,
+        public: Publisher,
+        stream: Callable[[Name, float], Publisher],
+        paths: ReaderPaths,
+        holding: dict[RequestStreams, None],
+    ) -> None:
         self._public = public
         self._stream = stream
         self._paths = paths
+        self._holding = holding
         self._requests: dict[Hashable, _Request] = {}
         self._apart: dict[Hashable, _Request] = {}  # of them those that no tree carries
         self._held: dict[Hashable, _Request] = {}  # ... and those with copies that have not begun
@@ -64,6 +73,7 @@ class RequestStreams:
             self._requests.setdefault(call, _Request(message)).copies.append(self._newest(self._public))
             return
         request = self._requests[call] = self._apart[call] = self._held[call] = _Request(message)
+        self._holding[self] = None
         request.waiting.extend(map(Name, servers))
         self.release(now_s)
 
@@ -80,7 +90,7 @@ class RequestStreams:
     def cancel(self, call: Hashable) -> None:
         """Cancel what is still under way of a call that has ended."""
         self._apart.pop(call, None)
-        self._held.pop(call, None)
+        self._end_hold(call)
         request = self._requests.pop(call, None)
         for publisher, sequence in () if request is None else request.copies:
             publisher.cancel(sequence)
@@ -91,11 +101,20 @@ class RequestStreams:
             while request.waiting and self._may_follow(request, now_s):
                 self._begin_next(request, now_s)
             if not request.waiting:
-                del self._held[call]
+                self._end_hold(call)
 
-    def get_timer(self) -> float | None:
-        """Return the monotonic second at which the next copy begins at the latest, or None."""
-        return min((request.check_s for request in self._held.values()), default=None)
+    def close(self) -> None:
+        """Begin no further copy."""
+        self._holding.pop(self, None)
+
+    def _end_hold(self, call: Hashable) -> None:
+        self._held.pop(call, None)
+        if not self._held:
+            self._holding.pop(self, None)
+
+    def get_timer(self) -> float:
+        """Return the monotonic second at which the next copy begins at the latest; infinity: none waits."""
+        return min((request.check_s for request in self._held.values()), default=NEVER_S)
 
     def _begin_next(self, request: _Request, now_s: float) -> None:
         server = request.waiting.popleft()
@@ -112,7 +131,7 @@ class RequestStreams:
     def _may_follow(self, request: _Request, now_s: float) -> bool:
         """Return whether the next copy may begin: those before have left, or the newest is late."""
         if request.server is None or all(
-            publisher.queue.sequences[0] > sequence for publisher, sequence in request.copies
+            publisher.queue.sent_sequence > sequence for publisher, sequence in request.copies
         ):
             return True
         if now_s < request.check_s:

@@ -39,6 +39,7 @@ _PARITY: Final = int(Flag.PARITY)
 _RELIABLE: Final = int(Flag.RELIABLE)
 _LATCHED: Final = int(Flag.LATCHED)
 _URGENT: Final = int(Flag.URGENT)
+_FORGET_EVERY: Final = 64  # messages, after which the ledger forgets those that are no longer cached
 
 
 class SendQueue:
@@ -75,6 +76,7 @@ class SendQueue:
         self.awaited = 0
         self._note_depth(settings.depth)
         self.mtu: int | None = None
+        self._frame_capacity = (-1, 0)  # an MTU, and the bytes of the messages that one frame carries
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
@@ -89,7 +91,7 @@ class SendQueue:
     @property
     def is_empty(self) -> bool:
         """Return whether nothing waits outside the window."""
-        return not (self.deferred.waiting or self._gathered.messages or self._best_effort)
+        return not (self.deferred.waiting or self._gathered.messages or self._best_effort.waiting)
 
     def has_space(self) -> bool:
         """Return whether a message may be added without evicting an unacknowledged one."""
@@ -117,14 +119,12 @@ class SendQueue:
         return (self.next_number if waiting is None else waiting.number), 0
 
     @property
-    def sequences(self) -> tuple[int, int]:
-        """Return the sequence numbers of what is sent next, and of what is cached first."""
-        waiting, oldest = self._best_effort.oldest, self._window.cache.oldest
-        if not self.is_acknowledged:
-            sent = self.first_waiting if waiting is None else waiting.sequence
-        else:
-            sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
-        return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
+    def sent_sequence(self) -> int:
+        """Return the sequence number of what is sent next."""
+        if self.is_acknowledged:
+            return self.ledger.begin_of(self._window.sent[0], self.first_waiting)
+        waiting = self._best_effort.oldest
+        return self.first_waiting if waiting is None else waiting.sequence
 
     @property
     def kept(self) -> int:
@@ -160,14 +160,16 @@ class SendQueue:
         Raises:
             LocalError: above the limits.
         """
-        self.seal_deferred()
-        if self.depth or not self._gathered.is_small(message, self._bundle_capacity()):
+        gathered = self._gathered
+        if self.deferred.waiting:
+            self.seal_deferred()
+        if self.depth or not gathered.is_small(message, self._bundle_capacity()):
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s)
             self.ledger.next(added_s)
             return
-        self._gathered.add(self.ledger.next(added_s), message, added_s)
-        if self._gathered.held_bytes > gather_bytes:
+        gathered.add(self.ledger.next(added_s), message, added_s)
+        if gathered.held_bytes > gather_bytes:
             self._seal_next()
 
     def skip(self, reason: LossReason, now_s: float | None = None) -> None:
@@ -211,12 +213,15 @@ class SendQueue:
         """Drop best-effort messages that would come too late; return whether there were any. None is sealed for it."""
         if self.is_acknowledged:
             return False
-        gathered, options, dropped = self._gathered, self.options, 0
-        for each in self._best_effort.drop_expired(now_s, self.bytes_s, is_followed=bool(gathered)):
+        gathered, best_effort, options, dropped = self._gathered, self._best_effort, self.options, 0
+        expired = best_effort.waiting and best_effort.drop_expired(
+            now_s, self.bytes_s, is_followed=bool(gathered.messages)
+        )
+        for each in expired or ():
             self._lose(each.sequence, each.messages, DropReason.LIFESPAN, LossReason.LIFESPAN)
             dropped += each.messages
-        while gathered:
-            waited_s, has_newer = now_s - gathered.oldest_added_s(now_s), len(gathered) > 1
+        while gathered.messages:
+            waited_s, has_newer = now_s - gathered.oldest_added_s(now_s), len(gathered.messages) > 1
             if not is_expired(waited_s, gathered.oldest_bytes, options.deadline_s, self.bytes_s, has_newer=has_newer):
                 break
             self._lose(gathered.drop_oldest(), 1, DropReason.LIFESPAN, LossReason.LIFESPAN)
@@ -227,21 +232,22 @@ class SendQueue:
         """Drop best-effort messages that wait: their readers are gone."""
         for each in self._best_effort.drop_all():
             self._lose(each.sequence, each.messages, DropReason.NO_READER, LossReason.NO_READER)
-        while self._gathered and not self.is_acknowledged:
+        while self._gathered.messages and not self.is_acknowledged:
             self._lose(self._gathered.drop_oldest(), 1, DropReason.NO_READER, LossReason.NO_READER)
 
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
-        frames = self._best_effort.poll_frames(max(limit, 1))
-        if not self._gathered.messages or self._window.has_frames:
-            frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
-        sends_window = self.is_acknowledged
-        while self._gathered.messages and len(frames) < limit:
-            if self._window.sent[0] < self.next_number if sends_window else self._best_effort:
+        window, best_effort, messages = self._window, self._best_effort, self._gathered.messages
+        left = limit if limit > 0 else 1
+        frames = best_effort.poll_frames(left) if best_effort.waiting else []
+        if not messages or window.has_frames:
+            frames += window.frames_to_send(now_s, max(left - len(frames), 1) if frames else left)
+        while messages:
+            left = limit - len(frames) if frames else limit
+            if left <= 0 or (window.unsent if self.is_acknowledged else best_effort.waiting):
                 break
             self._seal_next()
-            left = limit - len(frames)
-            frames += self._window.frames_to_send(now_s, left) if sends_window else self._best_effort.poll_frames(left)
+            frames += window.frames_to_send(now_s, left) if self.is_acknowledged else best_effort.poll_frames(left)
         return frames
 
     def refragment_best_effort(self, mtu: int) -> bool:
@@ -284,7 +290,7 @@ class SendQueue:
     def close(self) -> None:
         """Drop what waits; nothing is sent any more."""
         deferred = self.deferred.drop_beyond(0, self.options, None, is_latched=self.depth > 0)
-        self.drops[DropReason.NO_READER] += len(self._gathered) + deferred
+        self.drops[DropReason.NO_READER] += len(self._gathered.messages) + deferred
         self._gathered, self._best_effort = Gathered(), BestEffortQueue(self.options.deadline_s)
 
     def _bundle_capacity(self) -> int:
@@ -294,12 +300,15 @@ class SendQueue:
         """
         if self.is_acknowledged or self.mtu is None:
             return self.bundle_bytes
-        return min(self.bundle_bytes, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
+        if self._frame_capacity[0] != self.mtu:
+            self._frame_capacity = self.mtu, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES
+        return min(self.bundle_bytes, self._frame_capacity[1])
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
         first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(self._bundle_capacity())
-        self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together), added_s)
+        count = len(together)
+        self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
 
     def _seal_message(self, body: bytes, sequence: int, messages: int = 1, added_s: float | None = None) -> None:
         """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
@@ -314,14 +323,17 @@ class SendQueue:
             return
         ledger.put(number, sequence, messages)
         evicted = self._window.add(number, frames, frames.size_bytes, added_s)
-        self.drops[DropReason.MEMORY_FULL] += ledger.record_evicted(evicted, LossReason.WINDOW_OVERFLOW)
-        ledger.forget(self.oldest)
+        if evicted:
+            self.drops[DropReason.MEMORY_FULL] += ledger.record_evicted(evicted, LossReason.WINDOW_OVERFLOW)
+        if not number % _FORGET_EVERY:
+            ledger.forget(self.oldest)
 
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool, prefix: bytes = b"") -> Sealed:
         flags = self.flags | _BUNDLE * is_bundle
-        size = len(prefix) + (len(body) if isinstance(body, bytes) else body.message_bytes)
-        if self.has_parity and is_protected(size, mtu):
-            return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES, prefix)
+        if self.has_parity:
+            size = len(prefix) + (len(body) if isinstance(body, bytes) else body.message_bytes)
+            if is_protected(size, mtu):
+                return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES, prefix)
         return self._keys.data.seal(number, flags, body, mtu, prefix)
 
     def _lose(self, sequence: int, messages: int, drop_reason: DropReason, reason: LossReason) -> None:

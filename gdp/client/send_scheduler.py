@@ -31,6 +31,11 @@ class SendScheduler:
 
     Args:
         asked: called with each publisher whose frames were polled.
+
+    Attributes:
+        is_ready: some publisher waits, and the paths hold it back no longer.
+        due_s: monotonic second at which a path permits more; infinity: nothing waits, or for a reader's report.
+        uncounted: the only publisher, whose frames leave before they are counted; else None.
     """
 
     def __init__(self, asked: Callable[[Publisher], None]) -> None:
@@ -39,18 +44,17 @@ class SendScheduler:
         self._new: dict[Publisher, None] = {}  # had nothing to send before
         self._ordinary: dict[Publisher, int] = {}  # with the bytes left of its round; the one whose turn it is first
         self._at_once = BYTES_AT_ONCE
-        self._held_until_s: float | None = None  # the paths hold back all that wait
-        self._uncounted: Publisher | None = None  # whose frames leave before they are counted
+        self._is_held = False  # the paths hold back all that wait
+        self.is_ready = False
+        self.due_s = NEVER_S
+        self.uncounted: Publisher | None = None
         self._is_idle = False  # it had nothing more
         self._reserved_until_s = float("-inf")  # for the publisher whose turn it is
         self._reserving: Publisher | None = None
 
-    def __bool__(self) -> bool:
-        return bool(self._urgent or self._new or self._ordinary) and self._held_until_s is None
-
     def add(self, publisher: Publisher) -> None:
         """Note that a publisher may have frames; one that already waits for its turn keeps its position."""
-        self._held_until_s = None
+        self._is_held, self.is_ready, self.due_s = False, True, NEVER_S
         if publisher.is_urgent:
             self._at_once = BYTES_WITH_URGENT
             self._urgent[publisher] = None
@@ -59,34 +63,32 @@ class SendScheduler:
 
     def resume(self) -> None:
         """Note that paths may permit more than before."""
-        self._held_until_s = None
-
-    def next_due(self) -> float | None:
-        """Return the monotonic second at which a path permits more; None: nothing waits, or for a reader's report."""
-        return None if self._held_until_s == NEVER_S else self._held_until_s
+        self._hold(None)
 
     def poll_turn(self, now_s: float) -> list[list[bytes]]:
         """Return the frames that leave now, urgent and ordinary ones apart; an empty publisher leaves the queue."""
-        if self._held_until_s is not None and now_s < self._held_until_s:
+        if self._is_held and now_s < self.due_s:
             return []
-        self._held_until_s = None
-        self.count_sent()
-        if not self._urgent and len(self._new) + len(self._ordinary) == 1:
+        if self.uncounted is not None:
+            self.count_sent()
+        if not (self._urgent or self._new or self._ordinary):
+            return []
+        if not (self._urgent or (self._new and self._ordinary)) and len(self._new or self._ordinary) == 1:
             frames = self._poll_only(now_s)
             return [frames] if frames else []
         urgent, due_s = self._poll_urgent(now_s)
         if 0 < sum(map(len, urgent)) < self._at_once // 2:
+            self._hold(None)
             return [urgent]  # it leaves now; the others' next chunk is sealed after that
         self._ordinary = {**dict.fromkeys(self._new, 0), **self._ordinary}
         self._new.clear()
         ordinary, ordinary_due_s = self._poll_ordinary(now_s)
-        if not urgent and not ordinary and (self._urgent or self._ordinary):
-            self._held_until_s = min(due_s, ordinary_due_s)
+        self._hold(None if urgent or ordinary else min(due_s, ordinary_due_s))
         return [frames for frames in (urgent, ordinary) if frames]
 
     def count_sent(self) -> None:
         """Count what the only publisher sent: after its frames have left, so that they need not wait for that."""
-        publisher, self._uncounted = self._uncounted, None
+        publisher, self.uncounted = self.uncounted, None
         if publisher is not None:
             publisher.sent_frames.count()
             if self._is_idle:
@@ -97,14 +99,24 @@ class SendScheduler:
         (publisher,) = self._ordinary or self._new
         publisher.governing_paths.share = 1.0
         allowance = publisher.governing_paths.allowance(now_s)
-        frames = publisher.poll_frames(now_s, min(allowance, self._at_once))
+        frames = publisher.poll_frames(now_s, allowance if allowance < self._at_once else self._at_once)
         self._asked(publisher)
-        self._uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
-        self._new.clear()
-        self._ordinary = {publisher: 0} if allowance <= 0 or publisher.has_more else {}
-        if self._ordinary and not frames:
-            self._held_until_s = _or_never(publisher.governing_paths.next_send_s(now_s)) if allowance <= 0 else NEVER_S
+        self.uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
+        self._new = {}
+        if self._is_idle:
+            self._ordinary, self._is_held, self.is_ready, self.due_s = {}, False, False, NEVER_S
+            return frames
+        self._ordinary = {publisher: 0}
+        next_s = _or_never(publisher.governing_paths.next_send_s(now_s)) if allowance <= 0 else NEVER_S
+        self._hold(None if frames else next_s)
         return frames
+
+    def _hold(self, until_s: float | None) -> None:
+        """Hold back what waits until a monotonic second; None: no longer."""
+        is_waiting = bool(self._urgent or self._new or self._ordinary)
+        self._is_held = is_waiting and until_s is not None
+        self.is_ready = is_waiting and until_s is None
+        self.due_s = NEVER_S if until_s is None or not is_waiting else until_s
 
     def _poll_urgent(self, now_s: float) -> tuple[list[bytes], float]:
         """Return urgent frames, and when a path permits more."""

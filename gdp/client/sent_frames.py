@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 from gdp import burst
 from gdp.client.reader_path import ReaderPath, ReaderPaths
@@ -34,16 +34,9 @@ _MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
 
 
-class _Run(NamedTuple):
-    first: int  # fragment of a message
-    last: int  # ... and the one up to which the others left right after it
-    place: int  # count of frames sent up to the first one
-    is_repair: bool
-
-    @property
-    def end(self) -> int:
-        """Count of frames sent up to the last one."""
-        return self.place + self.last - self.first
+# Fragment of a message; the one up to which the others left right after it; count of frames sent up to the first one;
+# whether they were sent again.
+_Run = tuple[int, int, int, bool]
 
 
 @dataclass(slots=True)
@@ -71,12 +64,13 @@ class SentFrames:
     Attributes:
         loss: share of urgent frames lost, copies included.
         last_s: when frames other than copies last left.
+        leaving: what ``count`` is to enter by ``sent``, so that the frames need not wait for that; None: nothing.
     """
 
     def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
         self._paths = paths
         self._counts_losses = counts_losses
-        self._leaving: tuple[Sequence[bytes], Sequence[bytes], float, int] | None = None
+        self.leaving: tuple[Sequence[bytes], Sequence[bytes], float, int] | None = None
         self.loss = FrameLoss()
         self.last_s = float("-inf")
         self._readers: dict[bytes, _Reader] = {}
@@ -89,13 +83,9 @@ class SentFrames:
         """Return whether frames have left of which some reader's reports do not show yet what became of them."""
         return any(reader.flights for reader in self._readers.values())
 
-    def leave(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int) -> None:
-        """Note frames as in ``sent``; they are entered by ``count``, so that they need not wait for that."""
-        self._leaving = frames, names, now_s, again
-
     def count(self) -> None:
         """Enter the frames that left last."""
-        leaving, self._leaving = self._leaving, None
+        leaving, self.leaving = self.leaving, None
         if leaving is not None:
             self.sent(*leaving)
 
@@ -104,11 +94,12 @@ class SentFrames:
 
         Of several readers, those that have a frame already do not confirm it again. It then counts for the pace alone.
         """
-        if len(self._readers) > len(names):
+        readers = len(names)
+        if len(self._readers) > readers:
             self.keep(names)
-        if again and len(names) > 1:
+        if again and readers > 1:
             size = sum(map(len, frames[:again]))
-            samples = self._samples(frames[:again])
+            samples = burst.samples(frames, 0, again) if self._counts_losses else ()
             for name in names:
                 self._paths.path(name, now_s).controller.pace.charge(size, now_s)
                 if name in self._readers:
@@ -121,54 +112,62 @@ class SentFrames:
             frames, again = frames[again:], 0
         if again:
             self._add(frames[:again], names, now_s, is_repair=True)
-        self._add(frames[again:] if again else frames, names, now_s, is_repair=False)
-        if not names or len(self._runs) > _MESSAGES_MAX:
+            frames = frames[again:]
+        if frames:
+            self._add(frames, names, now_s, is_repair=False)
+        if not readers or (frames and len(self._runs) > _MESSAGES_MAX):
             self._forget_places()
 
     def _add(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, *, is_repair: bool) -> None:
         """Count frames that all leave for the first time, or all again."""
-        if not frames:
-            return
-        before, samples = self._count, self._samples(frames)
-        flights = [frames[first : first + _FLIGHT_FRAMES] for first in range(0, len(frames), _FLIGHT_FRAMES)]
-        sizes = [(sum(map(len, flight)), len(flight)) for flight in flights]
-        self._count += len(frames)
+        before, paths, count = self._count, self._paths, len(frames)
+        samples = burst.samples(frames, 0, count) if self._counts_losses else ()  # striped ones would prove no order
+        sizes: list[tuple[int, int]] = []
+        for at in range(0, count, _FLIGHT_FRAMES):
+            flight = frames[at : at + _FLIGHT_FRAMES]
+            sizes.append((sum(map(len, flight)), min(count - at, _FLIGHT_FRAMES)))
+        self._count += count
         self._note_places(frames, before + 1, is_repair=is_repair)
         for name in names:
-            path, reader = self._paths.path(name, now_s), self._readers.get(name)
+            path, reader, place = paths.path(name, now_s), self._readers.get(name), before
             if reader is None:
                 reader = self._readers[name] = _Reader(resolved=before)
-            reader.receipts.sent(samples, before + 1, is_repair=is_repair)
-            place = before
+            if samples:
+                reader.receipts.sent(samples, before + 1, is_repair=is_repair)
             for size, count in sizes:
                 record = path.sent(size, count, now_s)
                 place += count
                 record.place, record.is_repair = place, is_repair
                 reader.flights.append(record)
-
-    def _samples(self, frames: Sequence[bytes]) -> Sequence[tuple[int, int]]:
-        """Return the samples among frames; those of striped ones would prove no order."""
-        return burst.samples(frames, 0, len(frames)) if self._counts_losses else ()
+                paths.leaving.append(record)
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
-        number, part = NUMBER_AND_PART.unpack_from(frames[0], NUMBER_AT)
-        last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
-        if not is_repair and number == last_number and last_part - part == len(frames) - 1:  # of one message, in order
-            self._runs.setdefault(number, []).append(_Run(part, last_part, place, False))
+        number, part = last_number, last_part = NUMBER_AND_PART.unpack_from(frames[0], NUMBER_AT)
+        count = len(frames)
+        if count > 1:
+            last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
+        if not is_repair and number == last_number and last_part - part == count - 1:  # of one message, in order
+            self._note_run(number, (part, last_part, place, False))
             return
         for each, frame in enumerate(frames, place):
             number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
-            self._runs.setdefault(number, []).append(_Run(part, part, each, is_repair))
+            self._note_run(number, (part, part, each, is_repair))
+
+    def _note_run(self, number: int, run: _Run) -> None:
+        if number in self._runs:
+            self._runs[number].append(run)
+        else:
+            self._runs[number] = [run]
 
     def _find(self, number: int, part: int) -> tuple[int, bool]:
         """Return the count of frames sent up to a frame, 0 if not known any more, and whether it was sent again.
 
         A reader requests a frame when it would have come already. So of one that was sent again, the last one came.
         """
-        for run in reversed(self._runs.get(number, ())):
-            if run.first <= part <= run.last:
-                return run.place + part - run.first, run.is_repair or part in self._uncounted.get(number, ())
+        for first, last, place, is_repair in reversed(self._runs.get(number, ())):
+            if first <= part <= last:
+                return place + part - first, is_repair or part in self._uncounted.get(number, ())
         return 0, False
 
     def handle_report(
@@ -272,11 +271,14 @@ class SentFrames:
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""
-        below = min((reader.resolved for reader in self._readers.values()), default=self._count)
-        runs = self._runs
-        while runs:
-            number = next(iter(runs))
-            if runs[number][-1].end > below and len(runs) <= _MESSAGES_MAX:
+        below = min([reader.resolved for reader in self._readers.values()] or [self._count])
+        gone, spare = list[int](), len(self._runs) - _MESSAGES_MAX
+        for number, runs in self._runs.items():
+            first, last, place, _ = runs[-1]
+            if place + last - first > below and len(gone) >= spare:
                 break
-            del runs[number]
-            self._uncounted.pop(number, None)
+            gone.append(number)
+        for number in gone:
+            del self._runs[number]
+            if self._uncounted:
+                self._uncounted.pop(number, None)

@@ -36,6 +36,7 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
 
+_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 ENDED_MAX: Final = 4_096  # closed writer proxies whose end is remembered
 ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may return
 
@@ -130,13 +131,17 @@ class Subscription:
 
     def poll_messages(self, source: Name) -> list[Message]:
         """Return, once, the messages of one source; unicast ones only once the source has sent their description."""
-        writer_proxy, topic = self.writer_proxies.get(source), self.topic.name
+        writer_proxy, messages = self.writer_proxies.get(source), list[Message]()
         if writer_proxy is None:
-            return []
-        messages = [Message(topic, each, writer_proxy.description) for each in writer_proxy.delivery.poll()]
-        private = self.private.get(source)
-        if private is not None and writer_proxy.state is WriterProxyState.LIVE:
-            messages += [Message(topic, each, writer_proxy.description, True) for each in private.delivery.poll()]
+            return messages
+        topic, description = writer_proxy.topic, writer_proxy.description
+        if writer_proxy.delivery.ready:
+            for each in writer_proxy.delivery.poll():
+                messages.append(_tuple(Message, (topic, each, description, False)))
+        private = self.private.get(source) if self.private else None
+        if private is not None and private.delivery.ready and writer_proxy.state is WriterProxyState.LIVE:
+            for each in private.delivery.poll():
+                messages.append(_tuple(Message, (topic, each, description, True)))
         return messages
 
 

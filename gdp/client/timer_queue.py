@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Generic, Protocol, TypeVar
 
 from gdp.due_queue import DueQueue
+from gdp.intervals import NEVER_S
 
 __all__ = ["HasTimer", "TimerQueue"]
 
@@ -23,29 +24,36 @@ T = TypeVar("T", bound=HasTimer)
 
 
 class TimerQueue(Generic[T]):
-    """Timers of many objects."""
+    """Timers of many objects.
+
+    Attributes:
+        touched: those whose timers are read again, in order, so that a run is reproducible.
+        due_s: as ``next_due``, while none is touched.
+    """
 
     def __init__(self) -> None:
-        self._touched: dict[T, None] = {}  # in order, so that a run is reproducible
+        self.touched: dict[T, None] = {}
+        self.due_s = NEVER_S
         self._queue = DueQueue[T]()
-        self._due_s: float | None = None  # while nothing is touched
 
     def reschedule(self, each: T) -> None:
         """Note that an object may be due at another time than before."""
-        self._touched[each] = None
+        self.touched[each] = None
 
-    def next_due(self) -> float | None:
-        """Return the monotonic second at which the first is due, or None."""
-        if self._touched:
-            for each in self._touched:
+    def next_due(self) -> float:
+        """Return the monotonic second at which the first is due; infinity: none is."""
+        if self.touched:
+            for each in self.touched:
                 self._queue.put(each, each.get_timer())
-            self._touched.clear()
-            self._due_s = self._queue.next_due()
-        return self._due_s
+            self.touched = {}
+            due_s = self._queue.next_due()
+            self.due_s = NEVER_S if due_s is None else due_s
+        return self.due_s
 
     def poll_due(self, now_s: float) -> list[T]:
         """Return the objects that are due; the next check reads their timers again."""
-        due_s = self.next_due()
-        taken = self._queue.poll_due(now_s) if due_s is not None and due_s <= now_s else []
-        self._touched.update(dict.fromkeys(taken))
+        if self.next_due() > now_s:
+            return []
+        taken = self._queue.poll_due(now_s)
+        self.touched.update(dict.fromkeys(taken))
         return taken

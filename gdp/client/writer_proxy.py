@@ -214,26 +214,35 @@ class WriterProxy:
         """Drop what waited too long for its fragments, and go on without what neither path brought (best effort)."""
         is_final = self.state is WriterProxyState.LIVE and not self.delivery.is_reliable
         self.delivery.handle_timer(now_s)
-        self._data.drop_expired(now_s, for_good=is_final)
-        self._status.drop_expired(now_s, for_good=False)
-        self.recovery.drop_expired(now_s)
+        if self._data.unfinished_bytes:
+            self._data.drop_expired(now_s, for_good=is_final)
+        if self._status.unfinished_bytes:
+            self._status.drop_expired(now_s, for_good=False)
+        if self.recovery.messages:
+            self.recovery.drop_expired(now_s)
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
-        due_s = min(self.schedule.due_s, self.delivery.get_timer(), self._late.get_timer(), self.recovery.next_expiry())
-        for expiry in (self._status.next_expiry(), self._data.next_expiry()):
-            if expiry is not None and expiry < due_s:
-                due_s = expiry
+        delivery, late, data, status = self.delivery, self._late, self._data, self._status
+        due_s = min(self.schedule.due_s, delivery.gap_until_s, late.due_s, late.hold_s)
+        if delivery.held:
+            due_s = min(due_s, delivery.held[0][0])
+        if self.recovery.messages:
+            due_s = min(due_s, self.recovery.next_expiry())
+        if status.unfinished_bytes or data.unfinished_bytes:
+            for expiry in (status.next_expiry(), data.next_expiry()):
+                if expiry is not None and expiry < due_s:
+                    due_s = expiry
         return due_s
 
     def is_report_due(self, now_s: float) -> bool:
         """Return whether ``control_to_send`` has a report now."""
-        return now_s >= self.schedule.due_s or self._late.is_due(now_s)
+        return now_s >= self.schedule.due_s or (self._late.due_s < NEVER_S and self._late.is_due(now_s))
 
     def control_to_send(self, now_s: float) -> list[bytes]:
         """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""
         schedule = self.schedule
-        late = self._late.poll_missing(now_s) if self._late.is_due(now_s) else ()
+        late = self._late.poll_missing(now_s) if self._late.due_s < NEVER_S and self._late.is_due(now_s) else ()
         if now_s < schedule.due_s and not late:
             return []
         schedule.start_report()
@@ -250,7 +259,9 @@ class WriterProxy:
         schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
         expected = self.delivery.expected
         part, sequence = self._data.progress(expected), self.delivery.sequence
-        share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
+        share = 0
+        if self._copies is not None and isinstance(self._copies, StripedPaths):
+            share = self._copies.poll_share()
         newest, newest_part, came_s = schedule.newest
         acknack = AckNack(
             AckNackFlag.NONE, expected, part, missing or late, sequence, self.losses.total, share,
@@ -306,9 +317,12 @@ class WriterProxy:
             else:
                 reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
-        striped = self._copies if isinstance(self._copies, StripedPaths) else None
-        is_done = reassembler.window.is_finished(header.number)
-        seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
+        striped, is_done = None, False
+        if self._copies is not None and isinstance(self._copies, StripedPaths):
+            striped, is_done = self._copies, reassembler.window.is_finished(header.number)
+        is_whole = header.parts == 1
+        seen, highest = reassembler.new_parts, reassembler.highest
+        refused = 0 if is_whole else reassembler.drops[DropReason.MEMORY_FULL]
         reassembled = reassembler.add(header, frame, now_s)
         is_first = reassembler.new_parts > seen
         if striped is not None and header.parts >= STRIPES_FROM_PARTS and not is_done and (is_first or not header.part):
@@ -319,7 +333,8 @@ class WriterProxy:
                 self._set_reliable(header.flags)
             self.recovery.recovered += is_restored
             came = 1 - is_restored
-            receipts = sum(seal for _, seal in burst.samples((frame,), 0, came))
+            samples = burst.samples((frame,), 0, came)
+            receipts = sum([seal for _, seal in samples]) if samples else 0
             self.schedule.count(header.length, came, receipts, header.number, header.part, came_s)
             if reassembled is None:
                 self.recovery.keep(header, frame, now_s)
@@ -328,7 +343,8 @@ class WriterProxy:
                 if reassembled is None and not self.delivery.is_reliable:
                     self._late.handle_part(header, now_s)
         if reassembled is not None:
-            self.recovery.forget(header.number)
+            if self.recovery.messages:
+                self.recovery.forget(header.number)
             if self.state is WriterProxyState.LIVE and not self.delivery.is_reliable:
                 self._late.handle_complete(reassembled.number, header.part, now_s)
             if striped is not None:
@@ -337,7 +353,7 @@ class WriterProxy:
                     self.schedule.due_s = min(self.schedule.due_s, now_s + REPORT_DELAY_S)
             self._sealer.handle_message(reassembled.number, header.epoch, now_s)
             self.delivery.add(reassembled, now_s)
-        elif reassembler.drops[DropReason.MEMORY_FULL] > refused:
+        elif not is_whole and reassembler.drops[DropReason.MEMORY_FULL] > refused:
             self.delivery.skip_gap(now_s)
 
     def _missing(self, now_s: float) -> tuple[tuple[MissingRange, ...], float]:
@@ -349,7 +365,8 @@ class WriterProxy:
         due_s = NEVER_S
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
-        for number in self._data.window.unfinished(self.delivery.expected, end):
+        expected = self.delivery.expected
+        for number in self._data.window.unfinished(expected, end) if expected < end else ():
             capacity = NACKS_PER_REPORT - len(missing)
             if capacity <= 0:
                 break

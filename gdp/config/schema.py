@@ -5,6 +5,7 @@ I/O; loading reads files and changes nothing. ``gdp/config/config.py`` and ``pro
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, TypeVar, get_args
@@ -40,6 +41,9 @@ __all__ = [
     "relative",
 ]
 
+# The search for plugins of pydantic reads the metadata of each installed package, and we use none.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
 _VALUE_ERROR: Final = "Value error, "  # prefix of pydantic for what our validators say
 _SHOULD_BE: Final = "Input should be "  # prefix of pydantic for a value of the wrong kind or out of bounds
 _PATH_SHOWN: Final = 200  # characters
@@ -67,7 +71,7 @@ class Section(BaseModel):
 
     renamed: ClassVar[Mapping[str, str]] = {}
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
 
 def relative(path: Path, info: ValidationInfo) -> Path:

@@ -143,7 +143,8 @@ class PathController:
 
     def app_limited(self) -> None:
         """Report that nothing waits, though a frame might leave."""
-        self.rate.app_limited()
+        rate = self.rate
+        rate.limited_until = rate.delivered + (rate.inflight or 1)  # what is under way, and what follows it
         self.pace.is_paced = False
 
     def acknowledged(

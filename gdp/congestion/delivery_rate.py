@@ -40,35 +40,28 @@ class DeliveryRate:
     Attributes:
         delivered: bytes confirmed so far.
         inflight: bytes under way.
+        limited_until: bytes confirmed up to which what leaves was all that the program had to send.
     """
 
     def __init__(self) -> None:
         self.delivered = 0
         self.inflight = 0
         self._flights: dict[Flight, None] = {}  # in the order in which they left
-        self._leaving: list[Flight] = []  # counted, and perhaps not sealed yet
         self._delivered_s = 0.0
         self._first_sent_s = 0.0
-        self._limited_until = 0
+        self.limited_until = 0
 
     def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
         """Return the flight of frames that leave."""
         if not self.inflight:
             self._first_sent_s = self._delivered_s = now_s
         self.inflight += size
-        is_limited = self._limited_until > self.delivered
+        is_limited = self.limited_until > self.delivered
         flight = Flight(
             size, frames, now_s, self._first_sent_s, self.delivered, self._delivered_s, is_limited, self.inflight
         )
         self._flights[flight] = None
-        self._leaving.append(flight)
         return flight
-
-    def frames_sent(self, now_s: float) -> None:
-        """Note when the flights counted since the last call really leave: their frames are sealed after ``sent``."""
-        for flight in self._leaving:
-            flight.sent_s = now_s
-        self._leaving.clear()
 
     def remove(self, flight: Flight) -> bool:
         """Take a flight off the account; return whether it was on it."""
@@ -90,10 +83,6 @@ class DeliveryRate:
     def forget_all(self) -> None:
         """Take everything under way off the account."""
         self.forget(list(self._flights))
-
-    def app_limited(self) -> None:
-        """Mark what is under way, and what follows it: the program had nothing to send."""
-        self._limited_until = self.delivered + max(self.inflight, 1)
 
     def acknowledged(self, newest: Flight, size: int, now_s: float, least_s: float) -> float | None:
         """Return the bytes a second of one acknowledgement; None if its interval is shorter than ``least_s``.

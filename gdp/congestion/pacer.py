@@ -44,5 +44,8 @@ class Pacer:
 
         The delay has a bound, because what leaves while another path governs may exceed this one's pace for long.
         """
-        latest_s = now_s + max(_DELAY_MOST_S, self.mtu / self.bytes_s)
-        self.due_s = min(max(self.due_s, now_s - self.credit_s) + size / self.bytes_s, latest_s)
+        from_s = now_s - self._credit_s if self.is_paced else now_s
+        due_s = (self.due_s if self.due_s > from_s else from_s) + size / self.bytes_s
+        if due_s > now_s + _DELAY_MOST_S:
+            due_s = min(due_s, now_s + max(_DELAY_MOST_S, self.mtu / self.bytes_s))
+        self.due_s = due_s

@@ -36,6 +36,7 @@ class LivenessMonitor:
 
     Attributes:
         is_probing: some neighbour may be lost before its detection time.
+        longest_s: interval between keepalives to a neighbour, the longest one.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class LivenessMonitor:
         self._slowness = Slowness()
         self._frames_from: Callable[[int], int] = lambda _: 0
         self.is_probing = False
+        self.longest_s = 0.0
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port; frames without keepalives show a full queue."""
@@ -143,12 +145,13 @@ class LivenessMonitor:
 
     def find_next(self) -> float:
         """Return the monotonic second of the next keepalive or loss of a neighbour; infinity: never."""
-        due_s, self.is_probing = NEVER_S, False
+        due_s, self.is_probing, self.longest_s = NEVER_S, False, 0.0
         for port in self._ports.values():
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self.gone_at_s(neighbour)
                 self.is_probing = self.is_probing or (session is not None and session.probe is not None)
                 if session is not None and port.is_up:
+                    self.longest_s = max(self.longest_s, session.out_interval_s)
                     at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
                 due_s = min(due_s, at_s)
         return due_s

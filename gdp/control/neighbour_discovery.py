@@ -69,6 +69,7 @@ class HelloProtocol:
         neighbours: those of all ports.
         preshared_keys: of tunnels to neighbours.
         reception: of hellos, whose frames it joins.
+        together_s: keepalives leave so long before they are due, if this node is called for something else.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class HelloProtocol:
         self._incarnation = settings.incarnation
         self._due_s = NEVER_S  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
+        self.together_s = 0.0
         self._digest_for = digest_for
         self._incarnation_id = settings.incarnation_id
         self._incarnation_elsewhere = incarnation_elsewhere
@@ -459,6 +461,7 @@ class HelloProtocol:
 
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
+        self.together_s = self.liveness.longest_s * _TOGETHER
         for port in self.ports.values():
             if port.is_up:
                 due_s = min(due_s, port.hello_at_s, port.answer_at_s)

@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gdp.control.hello_port import HelloPort
 from gdp.control.neighbour import NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
-from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason
 from gdp.intervals import REPORT_S
 from gdp.names import Name
+
+if TYPE_CHECKING:
+    from gdp.diagnosis.facts import WaitFact
 
 __all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits", "wait_fact"]
 
@@ -101,6 +103,8 @@ def stranger_waits(hello_protocol: HelloProtocol, now_s: float) -> Iterator[Wait
 
 def wait_fact(wait: Wait, device: str) -> WaitFact:
     """Return a wait as a fact of a diagnosis; ``device``: of its port, empty without one."""
+    from gdp.diagnosis.facts import WaitFact  # a node gathers facts for who asks
+
     refused = "" if wait.refused is None else wait.refused.label
     neighbour = "" if wait.port is None or wait.name is None else wait.name.to_text()
     return WaitFact(reason=wait.reason.value, device=device, domain=wait.domain, neighbour=neighbour, refused=refused)

@@ -23,7 +23,17 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.envelope import TAG_BYTES
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
+from gdp.frame.codec import (
+    HEADER_BYTES,
+    HOPS_AT,
+    LENGTH_AT,
+    NUMBER_AT,
+    PART_AT,
+    PARTS_AT,
+    Header,
+    authenticated,
+    encode,
+)
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
@@ -40,6 +50,7 @@ __all__ = [
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
+_LENGTH_AND_NUMBER: Final = struct.Struct("!HQ")
 # numbers between two messages that arrive together; the writer proxies of a reader share its numbers
 JUMP_MAX: Final = 4_096
 _NUMBERS_PER_S: Final = 100_000  # more than one process sends
@@ -96,7 +107,7 @@ class ControlSealer:
     def __init__(self, *, key: bytes, epoch: int, context: ControlContext, numbers: Iterator[int]) -> None:
         kind, source, incarnation, destination, destination_incarnation, topic = context
         self._aead = AESGCMSIV(key)
-        self._header = Header(kind, Flag.LAST, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source)
+        self._header = encode(Header(kind, Flag.LAST, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source))
         self._topic = topic
         self._context = topic + _INCARNATION.pack(destination_incarnation)
         self._numbers = numbers
@@ -105,9 +116,9 @@ class ControlSealer:
         """Return the frame of the next control message."""
         number = next(self._numbers)
         length = NAME_BYTES + len(body) + TAG_BYTES
-        header = encode(self._header._replace(number=number, length=length))
-        sealed = self._aead.encrypt(_NONCE.pack(number, 0), body, authenticated(header) + self._context)
-        return header + self._topic + sealed
+        header = self._header[:LENGTH_AT] + _LENGTH_AND_NUMBER.pack(length, number) + self._header[PART_AT:]
+        additional = header[:HOPS_AT] + header[HOPS_AT + 1 :] + self._context
+        return header + self._topic + self._aead.encrypt(header[NUMBER_AT:PARTS_AT], body, additional)
 
 
 class ControlOpener:

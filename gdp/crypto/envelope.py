@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, Header, encode
+from gdp.frame.codec import HEADER_BYTES, INCARNATION_AT, NUMBER_AT, Header, encode
 from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
@@ -61,6 +61,7 @@ _LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a 
 _SHARED: Final = struct.Struct("!2sBxH2xQ4x84s")  # of a frame: without hops left, payload length and part
 _HASHED: Final = struct.Struct("!13s2sBHQ84s")
 SHARED_FLAGS: Final = 0xFF & ~_LAST  # of all parts of a message
+_NUMBERS: Final = struct.Struct("!QII")  # of message, part and parts
 _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
 
 
@@ -160,6 +161,8 @@ class Sealer:
         kind, source, incarnation, destination = context
         self._fixed = (epoch, kind, incarnation, destination if address is None else address, source)
         self._last_number = -1
+        self._template = (-1, b"")  # flags of the message before, and the header of its first part
+        self._capacity = (-1, 0)  # its MTU, and the plaintext bytes of a part
 
     def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int, prefix: bytes = b"") -> Sealed:
         """Return a message as its frames, each from the header on and at most ``mtu`` bytes long.
@@ -179,18 +182,25 @@ class Sealer:
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
         size = len(prefix) + (len(message) if isinstance(message, bytes) else message.message_bytes)
-        capacity = fragment_capacity(mtu)
-        parts = max(-(-(size + self._signature_bytes) // capacity), 1)
+        if self._capacity[0] != mtu:
+            self._capacity = mtu, fragment_capacity(mtu)
+        capacity = self._capacity[1]
+        parts = -(-(size + self._signature_bytes) // capacity) or 1
         if size > MESSAGE_MAX_BYTES + SEQUENCE_BYTES or parts > PARTS_MAX:
             raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
         self._last_number = number
-        epoch, kind, incarnation, destination, source = self._fixed
-        header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
+        if self._template[0] != flags:
+            epoch, kind, incarnation, destination, source = self._fixed
+            header = Header(kind, flags, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, destination, source)
+            self._template = flags, encode(header)
+        template = self._template[1]
         salt = self._random_bytes(SALT_BYTES)
-        cipher, head, signer = burst.CIPHER(self._keys.of(salt)), encode(header) + salt, self._signer
+        head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
+        cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
         return Sealed(
-            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, capacity=capacity
-        )
+            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, size=size,
+            capacity=capacity,
+        )  # fmt: skip
 
 
 class Sealed(Sequence[bytes]):
@@ -205,6 +215,7 @@ class Sealed(Sequence[bytes]):
         parts: int,
         prefix: bytes,
         message: bytes | Sealed,
+        size: int,
         capacity: int,
     ) -> None:
         self._cipher = cipher
@@ -214,14 +225,15 @@ class Sealed(Sequence[bytes]):
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
-            self._message, self.message_bytes = message, len(prefix) + len(message)
+            self._message = message
         else:
-            self._message, self.message_bytes = b"", message.message_bytes
+            self._message = b""
             self._origin = message._origin or message
         self._capacity = capacity
         self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []
-        self.size_bytes = self.message_bytes + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
+        self.message_bytes = size
+        self.size_bytes = size + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
         return self._parts

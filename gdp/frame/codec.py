@@ -25,6 +25,7 @@ __all__ = [
     "HEADER_BYTES",
     "HOPS_AT",
     "HOPS_MASK",
+    "INCARNATION_AT",
     "KIND_AT",
     "LENGTH_AT",
     "NUMBER_AND_PART",
@@ -54,12 +55,14 @@ LENGTH_AT: Final = 6
 NUMBER_AT: Final = 8
 PART_AT: Final = 16
 PARTS_AT: Final = 20
+INCARNATION_AT: Final = 24
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64
 HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
 SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 
 NUMBER_AND_PART: Final = struct.Struct("!QI")  # at ``NUMBER_AT``
+_tuple: Final = tuple.__new__  # one call, where ``Header._make`` is three
 _HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
 _BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
@@ -102,13 +105,14 @@ def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
     Raises:
         FrameError: truncated, another version, or an impossible part; never anything else, whatever the bytes.
     """
-    if len(frame) - at < HEADER_BYTES:
+    size = len(frame) - at
+    if size < HEADER_BYTES:
         raise FrameError(DropReason.TRUNCATED, "header")
     if frame[at] != VERSION:
         raise FrameError(DropReason.BAD_VERSION, str(frame[at]))
-    header = Header._make(_BEHIND_VERSION.unpack_from(frame, at))
+    header = _tuple(Header, _BEHIND_VERSION.unpack_from(frame, at))
     _, _, _, _, length, _, part, parts, _, _, _ = header
-    if len(frame) - at - HEADER_BYTES < length:
+    if size - HEADER_BYTES < length:
         raise FrameError(DropReason.TRUNCATED, "payload")
     if not part < parts <= PARTS_MAX:
         raise FrameError(DropReason.BAD_PARTS, f"{part} of {parts}")

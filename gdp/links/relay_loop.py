@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from gdp.intervals import UPKEEP_S
+from gdp.intervals import NEVER_S, UPKEEP_S
 from gdp.ports.plane import HasFileno
 from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.runtime import now
@@ -32,13 +32,16 @@ class Timed(Protocol):
 class _Periodic:
     """Function that is called once in a period, however often the timers are."""
 
-    def __init__(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
+    def __init__(self, period_s: float, function: Callable[[Timestamps], None], has_work: Callable[[], object]) -> None:
         self._period_s = period_s
         self._function = function
+        self._has_work = has_work
         self._due_s = float("-inf")
 
     def handle_timer(self, now_s: float) -> float:
         """Call the function if it is due; return the second of the next call."""
+        if not self._has_work():
+            return NEVER_S
         if now_s >= self._due_s:
             self._due_s = now_s + self._period_s
             self._function(now())
@@ -86,9 +89,11 @@ class RelayLoop:
         """Undo ``watch``, before the source is closed."""
         self.unregister(source.fileno())
 
-    def every(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
-        """Call a function each ``period_s``, the first time at once."""
-        self.add_timed(_Periodic(period_s, function))
+    def every(
+        self, period_s: float, function: Callable[[Timestamps], None], has_work: Callable[[], object] = lambda: True
+    ) -> None:
+        """Call a function each ``period_s``, the first time at once; not while it has no work."""
+        self.add_timed(_Periodic(period_s, function, has_work))
 
     def remove_timed(self, part: Timed) -> None:
         """Call a part's timers no more."""

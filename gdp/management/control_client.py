@@ -28,7 +28,6 @@ from gdp.state.control_protocol import (
     decode_response,
     encode_request,
 )
-from gdp.stores.keyring import CARD, load_card
 
 __all__ = [
     "NodeConnection",
@@ -68,6 +67,8 @@ def find_control_socket(directory: Path) -> Path:
     Raises:
         LocalError: the directory belongs to no node.
     """
+    from gdp.stores.keyring import CARD, load_card  # it loads what reads keys; a path of a socket needs none of it
+
     own = directory / CONTROL_SOCKET
     if own.exists():
         return own

@@ -19,6 +19,7 @@ from gdp.limits import NACKS_PER_REPORT
 __all__ = ["FRAMES_MASK", "AckNack", "AckNackFlag", "MissingRange"]
 
 _HEAD: Final = struct.Struct("!BBQIQQIQIIIQH")
+_HEAD_BYTES: Final = _HEAD.size
 _U32_MAX: Final = (1 << 32) - 1
 _U64_MAX: Final = (1 << 64) - 1
 FRAMES_MASK: Final = (1 << 32) - 1
@@ -31,6 +32,10 @@ class AckNackFlag(IntFlag):
     NONE = 0
     NEW = 1  # it has not seen a Heartbeat: it requests its start
     BYE = 2  # it leaves
+
+
+_BYE: Final = int(AckNackFlag.BYE)
+_FLAGS: Final = tuple(map(AckNackFlag, range(_BYE + 1)))  # by value: to construct one takes longer
 
 
 class MissingRange(NamedTuple):
@@ -72,26 +77,24 @@ class AckNack(NamedTuple):
 
     def to_wire(self) -> bytes:
         """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
-        ranges = self.missing[:NACKS_PER_REPORT]
-        counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
-        path = (
-            self.received & _U32_MAX,
-            self.newest,
-            self.newest_part,
-            min(self.held_us, _U32_MAX),
-            self.frames,
-            self.receipts,
-        )
-        head = _HEAD.pack(self.flags, self.share, self.next_number, self.next_part, *counts, *path, len(ranges))
-        return head + b"".join(_RANGE.pack(*each) for each in ranges)
+        flags, number, part, missing, sequence, lost, share, received, *newest, held_us, frames, receipts = self
+        ranges = [_RANGE.pack(*each) for each in missing[:NACKS_PER_REPORT]] if missing else []
+        sequence = sequence if sequence < _U64_MAX else _U64_MAX
+        lost = lost if lost < _U64_MAX else _U64_MAX
+        held_us = held_us if held_us < _U32_MAX else _U32_MAX
+        counts = sequence, lost, received & _U32_MAX, *newest, held_us, frames, receipts
+        return b"".join([_HEAD.pack(flags, share, number, part, *counts, len(ranges)), *ranges])
 
     @classmethod
     def from_wire(cls, wire: bytes) -> AckNack:
         """Read the wire form. Raises ``FrameError``: the bytes are not exactly one AckNack."""
-        if len(wire) < _HEAD.size:
+        size = len(wire)
+        if size < _HEAD_BYTES:
             raise FrameError(DropReason.TRUNCATED, "report")
         flags, share, number, part, sequence, lost, *path, count = _HEAD.unpack_from(wire)
-        if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > AckNackFlag.BYE:
+        if count > NACKS_PER_REPORT or size != _HEAD_BYTES + count * _RANGE.size or flags > _BYE:
             raise FrameError(DropReason.MALFORMED, "report")
-        ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
-        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost, share, *path)
+        ranges: tuple[MissingRange, ...] = ()
+        if count:
+            ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD_BYTES:]))
+        return cls(_FLAGS[flags], number, part, ranges, sequence, lost, share, *path)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.intervals import READER
+from gdp.intervals import NEVER_S, READER
 from gdp.message.retransmission import repair_allowance
 from gdp.token_bucket import TokenBucket
 
@@ -49,12 +49,27 @@ class ReaderPositions:
     Attributes:
         active: readers that block the window, by name.
         suspended: readers that do not, by name.
+        least_at: position that every active reader has acknowledged; None without one.
+        most_at: position of the most advanced active reader; 0 without one.
+        least_number: lowest message number that an active reader lacks; above all numbers without one.
+        most_number: highest message number before which an active reader lacks nothing; above all without one.
     """
 
     def __init__(self, lag_s: float) -> None:
         self._lag_s = lag_s
         self.active: dict[bytes, ReaderPosition] = {}
         self.suspended: dict[bytes, ReaderPosition] = {}
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute the extremes of the active readers; it follows each change of a position."""
+        least_at, most_at, least, most = _BEYOND_ALL, 0, _BEYOND_ALL, -1
+        for each in self.active.values():
+            at, number = each.acked_at, each.next_number
+            least_at, most_at = at if at < least_at else least_at, at if at > most_at else most_at
+            least, most = number if number < least else least, number if number > most else most
+        self.least_at: int | None = least_at if self.active else None
+        self.most_at, self.least_number, self.most_number = most_at, least, most if self.active else _BEYOND_ALL
 
     def add(self, reader: bytes, acked_at: int, next_number: int, now_s: float) -> None:
         """Add an active reader, or restart one."""
@@ -62,22 +77,27 @@ class ReaderPositions:
         self.active[reader] = ReaderPosition(
             acked_at=acked_at, next_number=next_number, last_progress_s=now_s, mark_at=acked_at, mark_s=now_s
         )
+        self.refresh()
 
     def remove(self, reader: bytes) -> bool:
         """Remove a reader; return whether there was one."""
-        return bool(self.active.pop(reader, None) or self.suspended.pop(reader, None))
+        position = self.active.pop(reader, None) or self.suspended.pop(reader, None)
+        self.refresh()
+        return position is not None
 
     def suspend(self, reader: bytes) -> None:
         """Suspend an active reader; others are left as they are."""
         position = self.active.pop(reader, None)
         if position is not None:
             self.suspended[reader] = position
+            self.refresh()
 
     def resume(self, reader: bytes, now_s: float) -> None:
         """Reactivate a suspended reader at its position. Raises ``KeyError``: it is not suspended."""
         position = self.active[reader] = self.suspended.pop(reader)
         position.last_progress_s = position.mark_s = now_s
         position.mark_at = position.acked_at
+        self.refresh()
 
     def all(self) -> list[ReaderPosition]:
         """Return every position, active ones first."""
@@ -90,26 +110,11 @@ class ReaderPositions:
 
     def acked_at(self, otherwise: int) -> int:
         """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
-        least: int | None = None
-        for each in self.active.values():
-            if least is None or each.acked_at < least:
-                least = each.acked_at
-        return otherwise if least is None else least
-
-    def least_active(self) -> int:
-        """Return the lowest message number that an active reader lacks."""
-        least = _BEYOND_ALL
-        for each in self.active.values():
-            least = min(least, each.next_number)
-        return least
-
-    def most_active(self) -> int:
-        """Return the highest message number before which an active reader lacks nothing."""
-        return max([each.next_number for each in self.active.values()], default=_BEYOND_ALL)
+        return otherwise if self.least_at is None else self.least_at
 
     def least(self) -> int:
         """Return the lowest message number that any reader lacks, suspended or not."""
-        least = self.least_active()
+        least = self.least_number
         return min([least, *(each.next_number for each in self.suspended.values())]) if self.suspended else least
 
     def acknowledge(self, position: ReaderPosition, acked_at: int, now_s: float) -> None:
@@ -117,10 +122,10 @@ class ReaderPositions:
         if acked_at > position.acked_at:
             position.acked_at = acked_at
             position.last_progress_s = now_s
-        first_at = self.first_at()
-        for each in self.active.values():
-            if each.mark_at <= each.acked_at < first_at:
-                each.mark_at, each.mark_s = first_at, now_s
+        self.refresh()
+        for each in self.active.values() if self.least_at != self.most_at else ():
+            if each.mark_at <= each.acked_at < self.most_at:
+                each.mark_at, each.mark_s = self.most_at, now_s
 
     def reset_stall_timers(self, sent_at: int, now_s: float) -> None:
         """Restart the timers of readers that have everything sent before ``sent_at``: they owe nothing."""
@@ -130,26 +135,19 @@ class ReaderPositions:
 
     def slow(self, sent_at: int, now_s: float) -> list[bytes]:
         """Return the active readers that have stalled, or lag behind another for longer than tolerated."""
-        first_at = self.first_at()
         return [
             name
             for name, each in self.active.items()
             if each.acked_at < sent_at
             and (
                 now_s - each.last_progress_s > READER.lease_s
-                or (now_s - each.mark_s > self._lag_s and each.acked_at < each.mark_at <= first_at)
+                or (now_s - each.mark_s > self._lag_s and each.acked_at < each.mark_at <= self.most_at)
             )
         ]
 
-    def next_slow(self) -> float | None:
-        """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
-        if len(self.active) < 2:
-            return None
-        first_at = self.first_at()
-        behind = [each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at]
-        mark_s = min(behind, default=None)
-        return None if mark_s is None else mark_s + self._lag_s + 0.001
-
-    def first_at(self) -> int:
-        """Return the position of the most advanced active reader."""
-        return max([each.acked_at for each in self.active.values()], default=0)
+    def next_slow(self) -> float:
+        """Return the monotonic second at which a reader that lags behind another becomes slow; infinity: never."""
+        if self.least_at == self.most_at:
+            return NEVER_S
+        behind = [each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= self.most_at]
+        return min(behind, default=NEVER_S) + self._lag_s + 0.001

@@ -48,16 +48,16 @@ def unpack(wire: bytes) -> list[bytes]:
 
 
 class Gathered:
-    """Small messages that wait for their seal, ``messages``, oldest first; their sequence numbers are consecutive."""
+    """Small messages that wait for their seal, oldest first; their sequence numbers are consecutive.
+
+    Attributes:
+        messages: each with when it was published; None: unknown.
+    """
 
     def __init__(self) -> None:
-        self.messages = deque[bytes]()
-        self._added_s = deque[float | None]()  # when each was published; None: unknown
+        self.messages = deque[tuple[bytes, float | None]]()
         self.first = 0  # sequence number of the oldest
         self.held_bytes = 0
-
-    def __len__(self) -> int:
-        return len(self.messages)
 
     @staticmethod
     def is_small(message: bytes, capacity: int) -> bool:
@@ -67,20 +67,21 @@ class Gathered:
     @property
     def oldest_bytes(self) -> int:
         """Return about how many bytes of frames the oldest message takes with a seal of its own."""
-        return len(self.messages[0]) + _ALONE_BYTES
+        return len(self.messages[0][0]) + _ALONE_BYTES
 
     def oldest_added_s(self, now_s: float) -> float:
         """Return when the oldest message was published; messages without a time wait from now on."""
-        added_s = self._added_s
-        at = len(added_s)
-        while at and added_s[at - 1] is None:  # the newest ones
+        messages = self.messages
+        at = len(messages)
+        while at and messages[at - 1][1] is None:  # the newest ones
             at -= 1
-            added_s[at] = now_s
-        return now_s if added_s[0] is None else added_s[0]
+            messages[at] = messages[at][0], now_s
+        added_s = messages[0][1]
+        return now_s if added_s is None else added_s
 
     def drop_oldest(self) -> int:
         """Remove the oldest message; return its sequence number."""
-        self._remove_oldest()
+        self.held_bytes -= len(self.messages.popleft()[0]) + _ALONE_BYTES
         self.first += 1
         return self.first - 1
 
@@ -88,8 +89,7 @@ class Gathered:
         """Add a message that was published at ``added_s`` (monotonic seconds; None: unknown)."""
         if not self.messages:
             self.first = sequence
-        self.messages.append(message)
-        self._added_s.append(added_s)
+        self.messages.append((message, added_s))
         self.held_bytes += len(message) + _ALONE_BYTES
 
     def poll_batch(self, capacity: int) -> tuple[list[bytes], float | None]:
@@ -98,18 +98,16 @@ class Gathered:
         Returns:
             the messages, and when the newest of them was published.
         """
-        together: list[bytes] = []
-        added_s: float | None = None
-        while self.messages:
-            capacity -= len(self.messages[0]) + _LENGTH.size
+        messages, together, newest_s = self.messages, list[bytes](), None
+        while messages:
+            message, added_s = messages[0]
+            size = len(message)
+            capacity -= size + _LENGTH.size
             if together and capacity < 0:
                 break
-            message, added_s = self._remove_oldest()
+            messages.popleft()
+            self.held_bytes -= size + _ALONE_BYTES
+            self.first += 1
+            newest_s = added_s
             together.append(message)
-        self.first += len(together)
-        return together, added_s
-
-    def _remove_oldest(self) -> tuple[bytes, float | None]:
-        message = self.messages.popleft()
-        self.held_bytes -= len(message) + _ALONE_BYTES
-        return message, self._added_s.popleft()
+        return together, newest_s

@@ -22,27 +22,29 @@ class RoundTripEstimator:
     Attributes:
         rtt_s: smoothed estimate; None before the first sample.
         deviation_s: smoothed mean deviation.
+        is_sampling: a sample is running.
     """
 
     def __init__(self) -> None:
         self.rtt_s: float | None = None
         self.deviation_s = 0.0
         self._sample: tuple[int, float] | None = None  # (position, when it was sent)
+        self.is_sampling = False
 
     def handle_sent(self, sent_at: int, now_s: float) -> None:
         """Start a sample at a position that was just sent, unless one is running."""
         if self._sample is None:
-            self._sample = (sent_at, now_s)
+            self._sample, self.is_sampling = (sent_at, now_s), True
 
     def handle_acknowledged(self, acked_at: int, now_s: float) -> None:
         """Finish the sample if its position is acknowledged."""
         if self._sample is not None and acked_at >= self._sample[0]:
             self.add(now_s - self._sample[1])
-            self._sample = None
+            self.discard_sample()
 
     def discard_sample(self) -> None:
         """Discard the running sample: the acknowledgement of a retransmitted frame is ambiguous (Karn's rule)."""
-        self._sample = None
+        self._sample, self.is_sampling = None, False
 
     def add(self, sample_s: float) -> None:
         """Add a sample, in seconds."""
@@ -61,36 +63,32 @@ class FlowControl:
     Attributes:
         window_bytes: what a reader must be able to hold.
         round_trip: estimate of the round-trip time.
+        probe_at_s: monotonic second at which readers are probed, if something is under way.
     """
 
     window_bytes: Final = FLIGHT_MAX_BYTES
 
     def __init__(self) -> None:
         self.round_trip = RoundTripEstimator()
-        self._quiet_s = 0.0  # since when nothing was acknowledged
-        self._probe_s = PROBES.first_s
+        self._probe_s = self.probe_at_s = PROBES.first_s  # after a time without an acknowledgement
 
     def handle_acknowledged(self, new_bytes: int, acked_at: int, now_s: float) -> None:
         """Process an acknowledgement of ``new_bytes`` up to ``acked_at``, and restart the probe timer."""
         if new_bytes <= 0:
             return
-        self._quiet_s = now_s
         trip = self.round_trip
         trip.handle_acknowledged(acked_at, now_s)
         self._probe_s = PROBES.pause_s(1, 3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s)
+        self.probe_at_s = now_s + self._probe_s
 
     def restart_probe(self, now_s: float) -> None:
         """Restart the probe timer: nothing is under way."""
-        self._quiet_s = now_s
-
-    def next_probe(self) -> float:
-        """Return the monotonic second at which readers are probed, if something is under way."""
-        return self._quiet_s + self._probe_s
+        self.probe_at_s = now_s + self._probe_s
 
     def probe_due(self, now_s: float) -> bool:
         """Return whether readers have been silent for too long; if so, the next interval doubles."""
-        if now_s < self.next_probe():
+        if now_s < self.probe_at_s:
             return False
-        self._quiet_s = now_s
         self._probe_s = PROBES.after_s(self._probe_s)
+        self.probe_at_s = now_s + self._probe_s
         return True

@@ -67,21 +67,22 @@ class FrameRecovery:
     Attributes:
         recovered: frames that were rebuilt, and fit.
         unfinished_bytes: memory that the kept frames hold.
+        messages: unfinished ones, by number.
     """
 
     def __init__(self, source: bytes, budget: ReassemblyQuota) -> None:
         self._source = source
         self._budget = budget
         self._is_enabled = erasure.is_available()
-        self._messages: dict[int, _Protected] = {}
+        self.messages: dict[int, _Protected] = {}
         self.unfinished_bytes = 0
         self.recovered = 0
         budget.register(self, source)
 
     def give_way(self) -> None:
         """Forget the message that is needed last, because reassembly needs the memory."""
-        if self._messages:
-            self.forget(max(self._messages))
+        if self.messages:
+            self.forget(max(self.messages))
 
     def keep(self, header: Header, frame: bytes, now_s: float) -> None:
         """Keep a new frame of an unfinished message, if its flags announce parity, as far as memory allows."""
@@ -103,7 +104,7 @@ class FrameRecovery:
         Raises:
             EnvelopeError: UNUSED_PARITY, nothing lacks it; MALFORMED, it does not fit its message; MEMORY_FULL.
         """
-        parity, message = Parity.from_wire(body), self._messages.get(header.number)
+        parity, message = Parity.from_wire(body), self.messages.get(header.number)
         if message is None:
             raise EnvelopeError(DropReason.UNUSED_PARITY, "no frame of its message is kept")
         parts = message.header.parts
@@ -127,7 +128,7 @@ class FrameRecovery:
 
     def awaited_s(self, number: int, now_s: float) -> float:
         """Return the monotonic second until which parity may fill what lacks of a message; 0: none is awaited."""
-        message = self._messages.get(number)
+        message = self.messages.get(number)
         if message is None:
             return 0.0
         if message.deferred_s is None:
@@ -139,40 +140,40 @@ class FrameRecovery:
 
     def forget(self, number: int) -> None:
         """Release what is kept of a message."""
-        message = self._messages.pop(number, None)
+        message = self.messages.pop(number, None)
         if message is not None:
             self._release(message, message.held_bytes)
 
     def forget_below(self, number: int) -> None:
         """Release what is kept of messages under a number."""
-        for each in [each for each in self._messages if each < number]:
+        for each in [each for each in self.messages if each < number]:
             self.forget(each)
 
     def drop_expired(self, now_s: float) -> None:
         """Release messages of which nothing came for a second: they are repaired, or given up."""
-        for number in [n for n, message in self._messages.items() if now_s - message.last_s >= _FORGET_S]:
+        for number in [n for n, message in self.messages.items() if now_s - message.last_s >= _FORGET_S]:
             self.forget(number)
 
     def next_expiry(self) -> float:
         """Return the monotonic second at which ``drop_expired`` has something to do; infinity: none."""
-        if not self._messages:
+        if not self.messages:
             return NEVER_S
-        return min(message.last_s for message in self._messages.values()) + _FORGET_S
+        return min(message.last_s for message in self.messages.values()) + _FORGET_S
 
     def close(self) -> None:
         """Release everything."""
-        for number in list(self._messages):
+        for number in list(self.messages):
             self.forget(number)
 
     def _message(self, header: Header, now_s: float) -> _Protected:
-        number, message = header.number, self._messages.get(header.number)
+        number, message = header.number, self.messages.get(header.number)
         if message is not None and not _is_same(message.header, header):
             self.forget(number)  # of two forms of one message, the later one holds
             message = None
         if message is None:
-            while len(self._messages) >= _MESSAGES_MAX:
-                self.forget(min(self._messages))
-            message = self._messages[number] = _Protected(header=header, begun_s=now_s, last_s=now_s)
+            while len(self.messages) >= _MESSAGES_MAX:
+                self.forget(min(self.messages))
+            message = self.messages[number] = _Protected(header=header, begun_s=now_s, last_s=now_s)
         return message
 
     def _keep(self, message: _Protected, part: int, frame: bytes, now_s: float) -> None:

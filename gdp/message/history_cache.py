@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 
 __all__ = ["CachedMessage", "HistoryCache"]
 
@@ -95,7 +94,8 @@ class HistoryCache:
         """Remove and return a message. Raises ``KeyError``: it is not cached."""
         message = self.messages.pop(number)
         self.held_bytes -= message.size
-        self.repaired -= bool(message.again_s)
+        if message.again_s:
+            self.repaired -= 1
         return message
 
     def note_repair(self, number: int, part: int, now_s: float) -> bytes:
@@ -105,14 +105,19 @@ class HistoryCache:
         message.again_s[part] = now_s
         return message.frames[part]
 
-    def beyond_depth(self, now_s: float = 0.0) -> list[int]:
-        """Return the numbers that no late joiner needs, oldest first."""
-        beyond = max(len(self.messages) - self.depth, 0)
+    def beyond_depth(self, now_s: float, below: int) -> list[int]:
+        """Return the numbers under ``below`` that no late joiner needs, oldest first."""
+        beyond, numbers = len(self.messages) - self.depth, list[int]()
         if self.depth_bytes is None and self.age_s is None:
-            return list(islice(self.messages, beyond))
-        numbers: list[int] = []
+            for _, number in zip(range(beyond), self.messages, strict=False):
+                if number >= below:
+                    break
+                numbers.append(number)
+            return numbers
         held_bytes = self.held_bytes
         for number, message in self.messages.items():
+            if number >= below:
+                break
             is_aged = self.age_s is not None and now_s - message.added_s >= self.age_s
             is_above = self.depth_bytes is not None and held_bytes > self.depth_bytes
             if len(numbers) >= beyond and not is_aged and not is_above:

@@ -97,6 +97,11 @@ class LateRepairs:
         data: reassembles the writer's messages.
         lag_s: returns how long the slower of two paths may take to bring what the faster one has lost.
         awaited_s: returns until when parity may fill the gaps of a message, in monotonic seconds; 0: none is awaited.
+
+    Attributes:
+        due_s: monotonic second at which something may be requested; infinity: nothing is.
+        hold_s: until when complete messages wait; infinity: none does.
+        incomplete: messages that may be repaired, by number.
     """
 
     def __init__(
@@ -108,25 +113,20 @@ class LateRepairs:
         self._data = data
         self._lag_s = lag_s
         self._awaited_s = awaited_s
-        self._incomplete: dict[int, _Incomplete] = {}
-        self._due_s = NEVER_S  # when something may be requested
-        self._hold_s = NEVER_S  # until when complete messages wait
+        self.incomplete: dict[int, _Incomplete] = {}
+        self.due_s = self.hold_s = NEVER_S
         self._highest = -1  # number of the latest message that has begun
         self._unanswered = 0  # messages in a row
         self._repair = RoundTripEstimator()  # from a request to its repair
 
-    def get_timer(self) -> float:
-        """Return the monotonic second at which a request may be due, or a wait ends."""
-        return self._due_s if self._due_s < self._hold_s else self._hold_s
-
     def is_due(self, now_s: float) -> bool:
         """Return whether ``poll_missing`` may return something."""
-        return self._due_s <= now_s + _EPSILON_S
+        return self.due_s <= now_s + _EPSILON_S
 
     def handle_part(self, header: Header, now_s: float) -> None:
         """Process a new fragment, which did not complete its message."""
         number, part = header.number, header.part
-        entry = self._incomplete.get(number)
+        entry = self.incomplete.get(number)
         if entry is None:
             self._handle_begun(number, now_s)
             if header.parts <= REPAIRS_ABOVE_PARTS:
@@ -137,38 +137,38 @@ class LateRepairs:
         known_end = max(entry.next_part, self._data.progress(number))
         if part > known_end and entry.gap_s == NEVER_S:
             entry.gap_s, entry.gap_end = now_s, part
-            self._due_s = min(self._due_s, now_s + self._delay_s())
+            self.due_s = min(self.due_s, now_s + self._delay_s())
         if part >= known_end:
             entry.next_part = part + 1
             entry.until_s = now_s + REPAIR_S
 
     def handle_complete(self, number: int, part: int, now_s: float) -> None:
         """Process a message that a fragment completed; those before it delay it for at most ``HOLD_S``."""
-        entry = self._incomplete.pop(number, None)
+        entry = self.incomplete.pop(number, None)
         if entry is not None and part < entry.requested_end:
             self._handle_answer(entry, part, now_s)
         self._handle_begun(number, now_s)
-        for before, each in self._incomplete.items():
+        for before, each in self.incomplete.items():
             if before < number:
                 each.hold_until_s = min(each.hold_until_s, now_s + HOLD_S)
-        if not self._incomplete:
-            self._due_s = NEVER_S
+        if not self.incomplete:
+            self.due_s = NEVER_S
 
     def forget(self, below: int) -> None:
         """Give up the messages numbered under ``below``."""
-        for number in [number for number in self._incomplete if number < below]:
+        for number in [number for number in self.incomplete if number < below]:
             self._remove(number)
-        if not self._incomplete:
-            self._due_s = NEVER_S
+        if not self.incomplete:
+            self.due_s = NEVER_S
 
     def close(self) -> None:
         """Forget everything."""
-        self._incomplete.clear()
-        self._due_s = self._hold_s = NEVER_S
+        self.incomplete.clear()
+        self.due_s = self.hold_s = NEVER_S
 
     def wait_s(self, below: int, now_s: float) -> float:
         """Return for how long messages numbered under ``below`` may still be repaired; 0: none is."""
-        times = [self._incomplete[number].wait_until_s for number in self._awaited(now_s) if number < below]
+        times = [self.incomplete[number].wait_until_s for number in self._awaited(now_s) if number < below]
         return max(times, default=now_s) - now_s
 
     def hold(self, numbers: Sequence[int], now_s: float) -> int:
@@ -177,9 +177,9 @@ class LateRepairs:
         Args:
             numbers: of all complete messages that were not delivered, lowest first.
         """
-        first = min(self._awaited(now_s), default=_NONE) if self._incomplete else _NONE
+        first = min(self._awaited(now_s), default=_NONE) if self.incomplete else _NONE
         is_waiting = bool(numbers) and numbers[-1] > first
-        self._hold_s = self._incomplete[first].wait_until_s if is_waiting else NEVER_S
+        self.hold_s = self.incomplete[first].wait_until_s if is_waiting else NEVER_S
         return first
 
     def give_up(self, now_s: float) -> bool:
@@ -187,38 +187,38 @@ class LateRepairs:
 
         Their memory is released, unless they may be under way still.
         """
-        has_ended = self._hold_s <= now_s
-        for number, entry in list(self._incomplete.items()):
+        has_ended = self.hold_s <= now_s
+        for number, entry in list(self.incomplete.items()):
             if now_s < entry.until_s and self._is_exhausted(number, entry, now_s):
                 entry.until_s, has_ended = now_s, True
             if entry.until_s <= now_s and number < self._highest:
                 self._remove(number)
                 self._data.give_up(number)
         if has_ended:
-            self._hold_s = NEVER_S  # until ``hold`` is called
+            self.hold_s = NEVER_S  # until ``hold`` is called
         return has_ended
 
     def poll_missing(self, now_s: float) -> tuple[MissingRange, ...]:
         """Return the fragments that are to be requested now, once."""
         missing: list[MissingRange] = []
-        self._due_s = NEVER_S
-        for number, entry in self._incomplete.items():
+        self.due_s = NEVER_S
+        for number, entry in self.incomplete.items():
             if len(missing) >= NACKS_PER_REPORT:
-                self._due_s = now_s
+                self.due_s = now_s
                 break
             extent = self._data.extent(number) if now_s < entry.until_s else None
             if extent is not None and (awaited_s := self._awaited_s(number, now_s)) > now_s:
-                self._due_s = min(self._due_s, max(awaited_s, self._next_s(entry)))
+                self.due_s = min(self.due_s, max(awaited_s, self._next_s(entry)))
                 continue
             if extent is not None:
                 ranges = self._poll_ranges(number, entry, extent, NACKS_PER_REPORT - len(missing), now_s)
                 missing += [MissingRange(number, *each) for each in ranges]
-                self._due_s = min(self._due_s, self._next_s(entry))
-        self._due_s = max(self._due_s, now_s + REPORT_GAP_S)
+                self.due_s = min(self.due_s, self._next_s(entry))
+        self.due_s = max(self.due_s, now_s + REPORT_GAP_S)
         return tuple(missing)
 
     def _remove(self, number: int) -> None:
-        entry = self._incomplete.pop(number)
+        entry = self.incomplete.pop(number)
         if entry.requests and not entry.is_answered:
             self._unanswered += 1
 
@@ -230,17 +230,17 @@ class LateRepairs:
         """Return the numbers of the messages that may still be repaired."""
         if not self._is_hopeful:
             return []
-        entries = self._incomplete.items()
+        entries = self.incomplete.items()
         return [n for n, each in entries if now_s < each.wait_until_s and self._data.extent(n) is not None]
 
     def _begin(self, number: int, now_s: float) -> _Incomplete:
-        if len(self._incomplete) >= _MESSAGES_MAX:
-            over = [each for each, entry in self._incomplete.items() if entry.until_s <= now_s]
-            self._remove(over[0] if over else max(self._incomplete))
-        entry = self._incomplete[number] = _Incomplete(until_s=now_s + REPAIR_S, quiet_s=now_s + REPORT_DELAY_S)
+        if len(self.incomplete) >= _MESSAGES_MAX:
+            over = [each for each, entry in self.incomplete.items() if entry.until_s <= now_s]
+            self._remove(over[0] if over else max(self.incomplete))
+        entry = self.incomplete[number] = _Incomplete(until_s=now_s + REPAIR_S, quiet_s=now_s + REPORT_DELAY_S)
         if number < self._highest:
             entry.gap_s, entry.gap_end = now_s, _ALL
-        self._due_s = min(self._due_s, self._next_s(entry))
+        self.due_s = min(self.due_s, self._next_s(entry))
         return entry
 
     def _handle_begun(self, number: int, now_s: float) -> None:
@@ -248,11 +248,11 @@ class LateRepairs:
         if number <= self._highest:
             return
         self._highest = number
-        for before, each in self._incomplete.items():
+        for before, each in self.incomplete.items():
             if before < number:
                 if each.requested_end < _ALL:
                     each.gap_s, each.gap_end = min(each.gap_s, now_s), _ALL
-                self._due_s = min(self._due_s, now_s + self._delay_s())
+                self.due_s = min(self.due_s, now_s + self._delay_s())
 
     def _handle_answer(self, entry: _Incomplete, part: int, now_s: float) -> None:
         """Learn from a fragment that was requested how long a repair takes.

@@ -83,8 +83,16 @@ class Ledger:
 
     def forget(self, below: int) -> None:
         """Forget message numbers under ``below``."""
-        while self._of and (first := next(iter(self._of))) < below:
-            self._numbers.pop(self._of.pop(first)[0], None)
+        gone: list[int] = []
+        for number in self._of:
+            if number >= below:
+                break
+            gone.append(number)
+        for number in gone:
+            sequence, _ = self._of[number]
+            if sequence in self._numbers:
+                del self._numbers[sequence]
+            del self._of[number]
 
     def move(self, move: Renumbering) -> None:
         """Apply a renumbering."""

@@ -67,7 +67,7 @@ class Losses:
     @property
     def total(self) -> int:
         """Return how many messages were lost."""
-        return sum(self.counts.values())
+        return sum(self.counts.values()) if self.counts else 0
 
     def add(self, lost: LostRange) -> None:
         """Count a range; one that continues the latest is joined to it."""

@@ -55,16 +55,21 @@ class ReceiptCheck:
         due, gain, self._total = self._take(place), total - self._total & RECEIPTS_MASK, total
         if len(due) > _DUE_MAX:
             return lost
-        seals = [*due, *self._spare]
-        came = _set_of_sum(seals, gain)
-        self._spare = deque((each for at, each in enumerate(seals) if not came >> at & 1), maxlen=_SPARE_MAX)
-        kept = min(_MEMORY / (self._sent + len(due) or 1.0), 1.0)
-        self._sent = (self._sent + len(due)) * kept
-        self._stated = (self._stated + len(due) * max(1 - lost / frames, 0.0)) * kept
-        self._came = (self._came + (came & (1 << len(due)) - 1).bit_count()) * kept
+        if due or self._spare:
+            self._count(due, gain, max(1 - lost / frames, 0.0))
         if self._stated - self._came <= _DOUBT * sqrt(self._sent):
             return lost
         return max(lost, round(frames * (1 - self._came / self._sent)))
+
+    def _count(self, due: list[int], gain: int, stated: float) -> None:
+        """Count the samples that were due: those that came by the counts, and those that the sum proves."""
+        seals, count = [*due, *self._spare], len(due)
+        came = _set_of_sum(seals, gain)
+        self._spare = deque((each for at, each in enumerate(seals) if not came >> at & 1), maxlen=_SPARE_MAX)
+        kept = min(_MEMORY / (self._sent + count or 1.0), 1.0)
+        self._sent = (self._sent + count) * kept
+        self._stated = (self._stated + count * stated) * kept
+        self._came = (self._came + (came & (1 << count) - 1).bit_count()) * kept
 
     def _take(self, place: int) -> list[int]:
         """Remove and return the samples up to a place."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from gdp.intervals import READER
+from gdp.intervals import NEVER_S, READER
 from gdp.limits import FLIGHT_MESSAGES_MAX, REPAIRS_MAX_BYTES, WINDOW_BYTES
 from gdp.message.acknack import AckNack
 from gdp.message.acknowledgement import ReaderPositions
@@ -46,6 +46,7 @@ class SendWindow:
         readers: what each has acknowledged, and which block nothing.
         governing: the reader that alone governs what leaves; None: all do, and the slowest decides.
         cache: what can be sent again.
+        unsent: numbers of messages with a fragment that was never sent, and the first such one, oldest first.
         retransmissions: fragments that were sent again.
         evicted: messages removed from a full window before every reader had them.
     """
@@ -65,7 +66,7 @@ class SendWindow:
         self._repairs = RetransmissionQueue()
         self._late_repairs = RetransmissionQueue()  # of readers that do not govern: they leave after what is new
         self._cancelled: set[int] = set()  # messages that were sent, and are not repaired
-        self._unsent = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
+        self.unsent = deque[tuple[int, int]]()
         self._newest = first_number - 1
         self._sent_at = 0
         self._now_s = 0.0  # of the latest event
@@ -87,7 +88,7 @@ class SendWindow:
     @property
     def sent(self) -> tuple[int, int]:
         """Return the message number and the fragment before which everything has been sent."""
-        return self._unsent[0] if self._unsent else (self._newest + 1, 0)
+        return self.unsent[0] if self.unsent else (self._newest + 1, 0)
 
     def set_history_depth(self, depth: int, next_number: int) -> None:
         """Change how many messages stay for late joiners; ``next_number`` is the lowest that ``add`` will get."""
@@ -116,7 +117,7 @@ class SendWindow:
             the numbers of messages that were evicted for it before every reader had them.
         """
         evicted = []
-        while self.cache and self.cache.held_bytes + size > self._budget_bytes:
+        while self.cache.held_bytes + size > self._budget_bytes and self.cache.messages:
             if self.cache.held_bytes + size <= self._budget_now():
                 break
             oldest = next(iter(self.cache.messages))
@@ -126,7 +127,7 @@ class SendWindow:
         self.evicted += len(evicted)
         self._newest = number
         self.cache.add(number, frames, size, self._now_s if added_s is None else added_s)
-        self._unsent.append((number, 0))
+        self.unsent.append((number, 0))
         return evicted
 
     def cancel(self, number: int) -> bool:
@@ -134,7 +135,7 @@ class SendWindow:
 
         One that was sent whole is on its way: readers lack it only if they request something of it.
         """
-        message, waiting = self.cache.messages.get(number), self._unsent
+        message, waiting = self.cache.messages.get(number), self.unsent
         if message is None:
             return False
         if number < self.sent[0]:
@@ -173,9 +174,11 @@ class SendWindow:
         positions = self.readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
+        self.readers.refresh()
         self._skip_unwanted()
         for position in positions:
             position.acked_at = position.mark_at = self._sent_at
+        self.readers.refresh()
         self._release_acknowledged()
 
     def add_reader(self, reader: bytes, first_number: int, now_s: float) -> None:
@@ -201,7 +204,12 @@ class SendWindow:
         """
         self._now_s = now_s
         message = self.cache.messages.get(acknack.next_number)
-        position = message.position(acknack.next_part) if message else self.cache.begin_of(acknack.next_number)
+        if message is not None:
+            position = message.position(acknack.next_part) if acknack.next_part else message.begin_at
+        elif acknack.next_number > self._newest:
+            position = self.cache.end_at
+        else:
+            position = self.cache.begin_of(acknack.next_number)
         next_number = min(acknack.next_number, max(self._sent_before, self.sent[0]))  # no reader has more
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
@@ -214,19 +222,23 @@ class SendWindow:
             suspended.acked_at = min(position, self._sent_at)
             self.readers.resume(reader, now_s)
         state = self.readers.active[reader]
-        state.next_number = max(state.next_number, next_number)
-        self._skip_unwanted()
+        if next_number > state.next_number:
+            state.next_number = next_number
+            self.readers.refresh()
+        if self.unsent:
+            self._skip_unwanted()
         before = self.readers.acked_at(self._sent_at)
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self.readers.acked_at(self._sent_at)
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
-        self._request_repairs(reader, acknack, now_s, trip_s)
+        if acknack.missing:
+            self._request_repairs(reader, acknack, now_s, trip_s)
         self._release_acknowledged()
 
     @property
     def has_frames(self) -> bool:
         """Return whether something waits to be sent, or sent again; or no reader waits for it."""
-        return bool(self._unsent or self._repairs.queue) or not self.readers.active
+        return bool(self.unsent or self._repairs.queue) or not self.readers.active
 
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
@@ -234,38 +246,44 @@ class SendWindow:
         frames: list[bytes] = []
         if self._repairs.queue and (frames := self._repaired_frames(limit, now_s, self._repairs)):
             self._flow.round_trip.discard_sample()
-        least = self.readers.least_active() if self.governing is None else self.readers.most_active()
-        if self._unsent and self._unsent[0][0] < least:
+        readers = self.readers
+        least = readers.least_number if self.governing is None else readers.most_number
+        if self.unsent and self.unsent[0][0] < least:
             self._skip_unwanted()
-        acked_at = self.readers.acked_at(self._sent_at)
+        acked_at = self._sent_at if readers.least_at is None else readers.least_at
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
-        if self._unsent:
-            self.readers.reset_stall_timers(self._sent_at, now_s)
-            first_at = self.readers.first_at() if self.governing is not None else acked_at
+        if self.unsent:
+            if readers.most_at >= self._sent_at:
+                readers.reset_stall_timers(self._sent_at, now_s)
+            first_at = readers.most_at if self.governing is not None else acked_at
             may_reach, below = first_at + self._flow.window_bytes, least + FLIGHT_MESSAGES_MAX
-            frames += self._new_frames(may_reach, below, limit - len(frames))
-        if frames and not self.cache.repaired:
+            frames += self._new_frames(may_reach, below, limit - len(frames) if frames else limit)
+        if frames and not self.cache.repaired and not self._flow.round_trip.is_sampling:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
-        if not self.readers.active and not self._unsent:
+        if not readers.active and not self.unsent:
             self._release_acknowledged()
         return frames
 
     def late_repairs_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again for readers that do not govern, once nothing new waits."""
-        if self._unsent or not self._late_repairs.queue or limit <= 0:
+        if self.unsent or not self._late_repairs.queue or limit <= 0:
             return []
         self._flow.round_trip.discard_sample()
         return self._repaired_frames(limit, now_s, self._late_repairs)
 
     def probe_due(self, now_s: float) -> bool:
         """Return whether readers have been silent for too long while something is under way; backs off."""
-        return self.next_probe() is not None and self._flow.probe_due(now_s)
+        least_at = self.readers.least_at
+        return least_at is not None and least_at != self._sent_at and self._flow.probe_due(now_s)
 
-    def next_probe(self) -> float | None:
-        """Return the monotonic second at which ``probe_due`` may be true next, or None."""
-        is_under_way = self.readers.active and self._sent_at != self.readers.acked_at(self._sent_at)
-        return self._flow.next_probe() if is_under_way else None
+    def get_timer(self) -> float:
+        """Return the monotonic second of the next probe, or at which a reader becomes slow; infinity: never."""
+        readers, flow = self.readers, self._flow
+        if readers.least_at is None:
+            return NEVER_S
+        due_s = NEVER_S if readers.least_at == readers.most_at else readers.next_slow()
+        return flow.probe_at_s if readers.least_at != self._sent_at and flow.probe_at_s < due_s else due_s
 
     def _repaired_frames(self, limit: int, now_s: float, repairs: RetransmissionQueue) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
@@ -282,35 +300,43 @@ class SendWindow:
     def _new_frames(self, may_reach: int, below: int, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames that were never sent, up to a position, of messages below a number."""
         frames: list[bytes] = []
-        while self._unsent and self._sent_at < may_reach and len(frames) < limit and self._unsent[0][0] < below:
-            number, part = self._unsent[0]
-            message, begin_at = self.cache.messages[number].frames, self.cache.messages[number].begin_at
-            self._sent_at = max(self._sent_at, begin_at)  # what lies before it was cancelled
-            count = min(max(1, (may_reach - self._sent_at) // len(message[0])), limit - len(frames))
-            batch = message[part : part + count]
+        unsent = self.unsent
+        while unsent and self._sent_at < may_reach and limit > 0 and unsent[0][0] < below:
+            number, part = unsent[0]
+            message = self.cache.messages[number]
+            begin_at, count = message.begin_at, limit
+            self._sent_at = begin_at if begin_at > self._sent_at else self._sent_at  # what lies before it was cancelled
+            if begin_at + message.size > may_reach:
+                count = min(max(1, (may_reach - self._sent_at) // len(message.frames[0])), limit)
+            batch = message.frames[part : part + count]
             frames += batch
+            sent = len(batch)
+            limit -= sent
             self._sent_at += sum(map(len, batch))
-            if part + len(batch) < len(message):
-                self._unsent[0] = (number, part + len(batch))
+            if sent == count and part + sent < len(message.frames):
+                unsent[0] = (number, part + sent)
             else:
-                self._unsent.popleft()
-        if not self._unsent:
+                unsent.popleft()
+        if not unsent:
             self._sent_at = self.cache.end_at
         return frames
 
     def _skip_unwanted(self) -> None:
         """Do not send what no active reader lacks; a suspended one gets it as a repair once it reports again."""
-        least = self.readers.least_active() if self.readers.active else 0
-        while self._unsent and self._unsent[0][0] < least:
-            self._sent_at = self.cache.messages[self._unsent.popleft()[0]].end_at
+        least = self.readers.least_number if self.readers.active else 0
+        if not self.unsent or self.unsent[0][0] >= least:
+            return
+        while self.unsent and self.unsent[0][0] < least:
+            self._sent_at = self.cache.messages[self.unsent.popleft()[0]].end_at
             for reader in self.readers.active.values():
                 reader.acked_at = max(reader.acked_at, self._sent_at)
+        self.readers.refresh()
 
     def _budget_now(self) -> int:
         """Return how many bytes may be cached: fewer if the oldest message is cached for suspended readers alone."""
         oldest, readers = self.cache.oldest, self.readers
         is_spare = len(self.cache.messages) > self.cache.depth
-        is_spare = is_spare and oldest is not None and oldest < readers.least_active()
+        is_spare = is_spare and oldest is not None and oldest < readers.least_number
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
     def _request_repairs(self, reader: bytes, acknack: AckNack, now_s: float, trip_s: float) -> None:
@@ -328,19 +354,20 @@ class SendWindow:
         )
 
     def _release_acknowledged(self) -> None:
-        least = self.readers.least()
-        for number in self.cache.beyond_depth(self._now_s):
-            is_unsent = self.readers.active and self.cache.messages[number].end_at > self._sent_at
-            if number >= least or is_unsent:
+        for number in self.cache.beyond_depth(self._now_s, self.readers.least()):
+            message = self.cache.messages[number]
+            if self.readers.active and message.begin_at + message.size > self._sent_at:
                 break
             self._release(number)
 
     def _release(self, number: int) -> None:
         message = self._forget(number)
-        self._sent_at = max(self._sent_at, message.end_at)
-        while self._unsent and self._unsent[0][0] <= number:
-            self._unsent.popleft()
+        end_at = message.begin_at + message.size
+        self._sent_at = end_at if end_at > self._sent_at else self._sent_at
+        while self.unsent and self.unsent[0][0] <= number:
+            self.unsent.popleft()
 
     def _forget(self, number: int) -> CachedMessage:
-        self._cancelled.discard(number)
+        if self._cancelled:
+            self._cancelled.discard(number)
         return self.cache.remove(number)

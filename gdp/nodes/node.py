@@ -28,7 +28,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
-from gdp.intervals import TICK_S
+from gdp.intervals import PACE_S, TICK_S
 from gdp.links.relay_loop import RelayLoop
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
@@ -190,7 +190,8 @@ class Node:
             audit = NodeAudit(self._audit_log, self.policy.audit, self.node_log.state.core.drops)
             loop.every(TICK_S, audit.write_pending)
             self._stack.callback(lambda: audit.write_pending(now()))
-        self._revocations.start(loop.every)
+        self._revocations.start()
+        loop.every(PACE_S, self._revocations.work, self._revocations.has_work)
         if metrics is not None and sources is not None:
             from gdp.telemetry import metrics as server  # its library takes a tenth of a node's start
 

@@ -6,16 +6,17 @@ I/O.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.intervals import PACE_S
 from gdp.sansio import Timestamps
-from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations
+
+if TYPE_CHECKING:
+    from gdp.stores.revocation_file import RevocationFile
 
 __all__ = ["RevocationUpkeep"]
 
@@ -33,7 +34,11 @@ class RevocationUpkeep:
     """
 
     def __init__(self, folder: Path | None, revoked: Revocations) -> None:
-        self._file = None if folder is None else RevocationFile(folder)
+        self._file: RevocationFile | None = None
+        if folder is not None:
+            from gdp.stores.revocation_file import RevocationFile  # it loads a database
+
+            self._file = RevocationFile(folder)
         self._revoked = revoked
 
     def restore(self, at: Timestamps) -> None:
@@ -49,22 +54,22 @@ class RevocationUpkeep:
         self._revoked.changes = set()
         log.info("revocations read kept=%d refused=%d", len(self._revoked), refused)
 
-    def start(self, every: Callable[[float, Callable[[Timestamps], None]], None] | None = None) -> None:
-        """Begin to write; call it after the confinement of rights, which applies only to threads started later.
-
-        Args:
-            every: of a loop, which calls ``work`` from now on; None: the caller does.
-        """
+    def start(self) -> None:
+        """Begin to write; call it after the confinement of rights, which applies only to threads started later."""
         if self._file is not None:
             self._file.start()
-            if every is not None:
-                every(PACE_S, self.work)
+
+    def has_work(self) -> bool:
+        """Return whether there are changes to write."""
+        return self._file is not None and bool(self._revoked.changes)
 
     def work(self, at: Timestamps) -> None:
         """Pass one slice of changes to the file, if it is ready."""
         del at
         changes = self._revoked.changes
         if changes and self._file is not None and self._file.is_ready:
+            from gdp.stores.revocation_file import SLICE
+
             keys = list(islice(changes, SLICE))
             changes.difference_update(keys)
             self._file.write([(key, self._revoked.kept(key)) for key in keys])

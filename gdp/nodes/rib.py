@@ -81,7 +81,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         upkeep.start(host.rib, now())
         plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
-        runtime.every(upkeep.every_s, upkeep.work)
+        runtime.every(upkeep.every_s, upkeep.work, upkeep.has_work)
         state = RibState(identity, policy, plane, host, now().mono_s)
         node.drive(state, runtime, on_wait)
         sources = common_sources(node.node_log, rib_sources(state))

@@ -43,6 +43,10 @@ class Upkeep:
     def work(self, now: Timestamps) -> None:
         """Do what is due."""
 
+    def has_work(self) -> bool:
+        """Return whether ``work`` has to be called."""
+        return True
+
     def close(self) -> None:
         """End the upkeep."""
 
@@ -81,6 +85,10 @@ class MemoryUpkeep(Upkeep):
         keys = list(islice(changes, SLICE))
         changes.difference_update(keys)
         snapshot.write([(key, rib.state.entry_of(key, now.mono_s)) for key in keys], now.unix_s)
+
+    def has_work(self) -> bool:
+        """Return whether there are changes for the snapshot."""
+        return self._snapshot is not None and bool(self._memory.changes)
 
     def close(self) -> None:
         """Write the changes that wait in the snapshot's queue."""

@@ -18,15 +18,17 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gdp.config.config import RibConfig, SwitchConfig
-from gdp.config.relay_config import RelayConfig, RelayServer
-from gdp.config.schema import Metrics
 from gdp.host.single_instance import lock_directory
 from gdp.nodes.audit import audit_folder
 from gdp.nodes.credentials import NodeConfig, watched_folders
 from gdp.ports.sandbox import Capability, Needs, confine
+
+if TYPE_CHECKING:  # a node loads its own configuration alone
+    from gdp.config.config import RibConfig, SwitchConfig
+    from gdp.config.relay_config import RelayConfig, RelayServer
+    from gdp.config.schema import Metrics
 
 __all__ = ["confine_proxy", "confine_relay", "confine_rib", "confine_switch"]
 

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gdp.config.config import SwitchConfig
 from gdp.control.settings import NodeSettings
@@ -18,9 +19,6 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.single_instance import own_devices
 from gdp.intervals import PACE_S, TICK_S
-from gdp.links.links import TunnelLinks
-from gdp.links.relay_ports import RelayPorts
-from gdp.links.tunnels import open_underlays
 from gdp.links.uplink import refuse_loopback
 from gdp.links.veth import attach_pairs, switch_end
 from gdp.management.control_socket import ControlHandlers
@@ -44,6 +42,11 @@ from gdp.state.topic_rows import rows_to_fields
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.telemetry.sources import Sources
+
+if TYPE_CHECKING:  # a switch without tunnels loads nothing of them
+    from gdp.links.links import TunnelLinks
+    from gdp.links.relay_ports import RelayPorts
+    from gdp.ports.tunnel.wireguard import WireGuardDevice
 
 __all__ = ["run_switch", "switch_handlers", "switch_sources"]
 
@@ -71,8 +74,7 @@ def run_switch(
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
     with contextlib.ExitStack() as stack:
-        audit = audit_folder(config.audit)
-        node = Node("switch", member, config, stack, state_folder=config.state, audit=audit)
+        node = Node("switch", member, config, stack, state_folder=config.state, audit=audit_folder(config.audit))
         switch = node.build_core(
             lambda identity, policy, settings: SwitchCore(identity, policy, table, settings),
             _settings(config),
@@ -83,7 +85,11 @@ def run_switch(
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
         devices = [*wanted, *map(switch_end, config.attach)]
-        underlays = () if config.links is None else stack.enter_context(open_underlays(config.links, identity))
+        underlays: tuple[WireGuardDevice, ...] = ()
+        if config.links is not None:
+            from gdp.links.tunnels import open_underlays
+
+            underlays = stack.enter_context(open_underlays(config.links, identity))
         chosen = choose_plane(config.data_plane, devices, table, config.table_max)
         plane = chosen.plane
         stack.callback(plane.close)
@@ -93,6 +99,8 @@ def run_switch(
         attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
         links = None
         if config.links is not None:
+            from gdp.links.links import TunnelLinks
+
             links = TunnelLinks(
                 config=config.links, identity=identity, policy=policy, switch=switch, runtime=runtime,
                 underlays=underlays,
@@ -161,6 +169,8 @@ def _follow_relay(
     """Return the ports on devices of the switch's relay; None: the configuration has no relay."""
     if not config.relay:
         return None
+    from gdp.links.relay_ports import RelayPorts
+
     named = frozenset(port.iface for port in config.ports)
     relay = RelayPorts(name=identity.name, switch=switch, runtime=runtime, excluded=named)
     stack.callback(relay.close)

@@ -24,7 +24,7 @@ from typing import Final
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES
-from gdp.intervals import PACE_S
+from gdp.intervals import PACE_S, TICK_S
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
 from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, LinkCallback, Port, ReceivedFrame
 from gdp.ports.rtnetlink import Link, LinkMonitor
@@ -35,7 +35,8 @@ __all__ = ["NetdevPlane", "NoDeviceError"]
 log = logging.getLogger(__name__)
 
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
-_AUDIT_POLLS: Final = 256  # a busy plane reads the kernel's drops every so many polls, an idle one at each poll
+_AUDIT_POLLS: Final = 256  # a busy plane reads the kernel's drops every so many polls
+_AUDIT_FRAMES: Final = 16  # ... an idle one after so many frames, and each ``TICK_S``: a question for each socket
 
 
 class NoDeviceError(LocalError):
@@ -64,7 +65,8 @@ class NetdevPlane(ABC):
         self._counters = Counters()
         self._came: Counter[int] = Counter()  # frames, by port
         self._polls = 0
-        self._audited_at = -1  # frames that had come by the last audit
+        self._audited_at = 0  # frames that had come by the last audit
+        self._audit_s = 0.0
         self._next_index = 0
         self._epoll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}
@@ -124,9 +126,9 @@ class NetdevPlane(ABC):
             timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
         self._polls += 1
-        # A poll that does not wait, between two chunks of a message or while spinning, has nothing new to read.
-        is_idle = not events and (timeout_s != 0 or self._counters.frames_in != self._audited_at)
-        if is_idle or not self._polls % _AUDIT_POLLS:
+        has_come = self._counters.frames_in >= self._audited_at + _AUDIT_FRAMES
+        is_due = not events and (has_come or (timeout_s != 0 and time.monotonic() >= self._audit_s))
+        if is_due or not self._polls % _AUDIT_POLLS:
             self._audit()
         if len(events) > 1:
             events.sort(key=lambda event: self._ranks[event[0]])
@@ -228,7 +230,7 @@ class NetdevPlane(ABC):
 
     def _audit(self) -> None:
         """Add the kernel's own drops to the counters."""
-        self._audited_at = self._counters.frames_in
+        self._audited_at, self._audit_s = self._counters.frames_in, time.monotonic() + TICK_S
         self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
 
     def _know(self, port: Port) -> None:

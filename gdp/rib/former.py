@@ -5,13 +5,15 @@ Sans-I/O; bounded: of too many, those that were noted or asked for longest ago a
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from gdp.diagnosis.facts import GoneFact
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.trust.lru import Lru
+
+if TYPE_CHECKING:
+    from gdp.diagnosis.facts import GoneFact
 
 __all__ = ["FormerAdvertisers"]
 
@@ -19,25 +21,21 @@ _NAMES_MAX: Final = 4_096
 _ADVERTISERS_MAX: Final = 16  # of one name
 _LAPSED: Final = "lapsed"
 _WITHDREW: Final = "withdrew"
+_Gone: TypeAlias = tuple[str, Name, Name]  # how, and its last switch and that one's domain
 
 
 class FormerAdvertisers:
     """How advertisers of names left, and why an advertisement was refused last."""
 
     def __init__(self) -> None:
-        self._gone: Lru[dict[Name, GoneFact]] = Lru(_NAMES_MAX)
+        self._gone: Lru[dict[Name, _Gone]] = Lru(_NAMES_MAX)
         self._refused: Lru[str] = Lru(_NAMES_MAX)
 
     def note_gone(self, route: Route, *, is_lapsed: bool) -> None:
         """Note that an advertiser withdrew a name, or that its lease ended."""
         known = self._gone.get(route.name) or {}
         known.pop(route.advertiser, None)
-        known[route.advertiser] = GoneFact(
-            advertiser=route.advertiser.to_text(),
-            how=_LAPSED if is_lapsed else _WITHDREW,
-            switch=route.switch.to_text(),
-            domain=route.domain.to_text(),
-        )
+        known[route.advertiser] = (_LAPSED if is_lapsed else _WITHDREW, route.switch, route.domain)
         if len(known) > _ADVERTISERS_MAX:
             del known[next(iter(known))]
         self._gone.put(route.name, known)
@@ -48,7 +46,12 @@ class FormerAdvertisers:
 
     def gone(self, name: Name) -> tuple[GoneFact, ...]:
         """Return the advertisers of a name that left, those that are back included."""
-        return tuple((self._gone.get(name) or {}).values())
+        from gdp.diagnosis.facts import GoneFact  # a node gathers facts for who asks
+
+        return tuple(
+            GoneFact(advertiser=each.to_text(), how=how, switch=switch.to_text(), domain=domain.to_text())
+            for each, (how, switch, domain) in (self._gone.get(name) or {}).items()
+        )
 
     def refused(self, name: Name) -> str:
         """Return the label of the newest refusal of a name, or an empty text."""

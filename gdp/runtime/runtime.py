@@ -39,7 +39,13 @@ def now() -> Timestamps:
 class _Periodic:
     period_s: float
     call: Callable[[Timestamps], None]
+    has_work: Callable[[], object]
     due_s: float = float("-inf")
+
+    @property
+    def next_s(self) -> float | None:
+        """Return when it is due; None: it waits for work, which a step of the loop brings."""
+        return self.due_s if self.has_work() else None
 
 
 class Runtime:
@@ -149,9 +155,15 @@ class Runtime:
         """Return whether ``drain`` was called."""
         return self._drain_until_s is not None
 
-    def every(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
-        """Call ``function`` from within the loop each ``period_s``, the first time at once."""
-        self._periodic.append(_Periodic(period_s, function))
+    def every(
+        self, period_s: float, function: Callable[[Timestamps], None], has_work: Callable[[], object] = lambda: True
+    ) -> None:
+        """Call ``function`` from within the loop each ``period_s``, the first time at once; not while it has no work.
+
+        Args:
+            has_work: its answer changes within a step of the loop alone, or the loop is woken otherwise.
+        """
+        self._periodic.append(_Periodic(period_s, function, has_work))
 
     def after_receive(self, function: Callable[[], None]) -> None:
         """Call ``function`` each time that the core has handled frames; it must be cheap."""
@@ -174,9 +186,8 @@ class Runtime:
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.get_timer()
-            times = [each for each in (self._deadline_s, latest_s) if each is not None]
-            times += [each.due_s for each in self._periodic]
-            arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
+            first_s = earliest(self._deadline_s, latest_s, *(each.next_s for each in self._periodic))
+            arrivals = self._wait(None if first_s is None else max(first_s - time.monotonic(), 0.0))
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
         if arrivals:
@@ -187,7 +198,7 @@ class Runtime:
             self._machine.handle_timer(moment)
             self._deadline_s = self._machine.get_timer()
         for each in self._periodic:
-            if moment.mono_s >= each.due_s:
+            if moment.mono_s >= each.due_s and each.has_work():
                 each.due_s = moment.mono_s + each.period_s
                 each.call(moment)
 
@@ -200,7 +211,7 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        return earliest(self._machine.get_timer(), *(each.due_s for each in self._periodic))
+        return earliest(self._machine.get_timer(), *(each.next_s for each in self._periodic))
 
     def _wait(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""

@@ -6,14 +6,17 @@ Sans-I/O.
 from __future__ import annotations
 
 from itertools import chain
+from typing import TYPE_CHECKING
 
 from gdp.names import Name
-from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
 from gdp.state.diagnostic_control import Row, TableSource
 from gdp.state.node_state import MemberState, RibState
 from gdp.state.tables import common_tables, seconds_left
 from gdp.trust.right import Right
+
+if TYPE_CHECKING:  # a node loads its own core alone
+    from gdp.rib.store import Store
 
 __all__ = ["participant_tables", "rib_tables"]
 
@@ -51,6 +54,8 @@ def participant_tables(state: MemberState) -> dict[str, TableSource]:
 
 def rib_tables(state: RibState, store: Store) -> dict[str, TableSource]:
     """Return the sources of the tables of a RIB; one that stores its names in a cluster has no table of names."""
+    from gdp.rib.store import MemoryStore
+
     if not isinstance(store, MemoryStore):
         return common_tables(state)
 

@@ -16,15 +16,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError, StatementError
 from gdp.intervals import IDLE_S
 from gdp.names import Name
-from gdp.rib.core import RibCore
 from gdp.sansio import Timestamps
-from gdp.switch.core import SwitchCore
 from gdp.trust.advertisement import Advertisement
+
+if TYPE_CHECKING:  # a node loads its own core alone
+    from gdp.rib.core import RibCore
+    from gdp.switch.core import SwitchCore
 
 __all__ = ["ADVERTISERS_MAX", "SwitchLookups", "rib_lookup"]
 

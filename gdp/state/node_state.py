@@ -11,15 +11,12 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from gdp.client.attachment import Attachment, attachment_waits
-from gdp.client.participant import Participant
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.diagnostics import Diagnostics
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.waiting import Wait, wait_fact
 from gdp.crypto.identity import Identity
-from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import Plane
@@ -28,7 +25,10 @@ from gdp.telemetry.sources import DeviceCounts, NeighbourRow, PortRow
 from gdp.trust.domain import Policy
 
 if TYPE_CHECKING:  # a node loads its own core alone, which makes the start of a library short
+    from gdp.client.attachment import Attachment
+    from gdp.client.participant import Participant
     from gdp.client.rib_host import RibHost
+    from gdp.diagnosis.facts import WaitFact
     from gdp.switch.core import SwitchCore
 
 __all__ = ["MemberState", "NodeState", "RibState", "SwitchState"]
@@ -193,6 +193,8 @@ class AttachedState(NodeState):
 
     def waits(self, now_s: float) -> list[Wait]:
         """Return what keeps it from being attached with all that it advertises, at a monotonic second."""
+        from gdp.client.attachment import attachment_waits
+
         return attachment_waits(self.attachment, now_s)
 
     @property

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from gdp.client.participant import Participant
 from gdp.control.link_state import Scope
 from gdp.names import Name
 from gdp.state.node_state import NodeState, SwitchState
@@ -24,6 +23,7 @@ from gdp.state.tables import rounded_ms
 from gdp.telemetry.sources import DeviceCounts, NeighbourRow, Sources
 
 if TYPE_CHECKING:  # a node loads its own core alone
+    from gdp.client.participant import Participant
     from gdp.rib.core import RibCore
     from gdp.switch.core import SwitchCore
 

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gdp.control.diagnostics import Diagnostics, Question
 from gdp.crypto.statements import parse
-from gdp.diagnosis.facts import RibFacts, RouteFact, SwitchFacts, TunnelFact
 from gdp.diagnosis.fields import to_fields
 from gdp.errors import StoreError
 from gdp.names import Name
-from gdp.rib.state import RibCoreState
 from gdp.sansio import Timestamps
 from gdp.state.node_state import RibState, SwitchState
-from gdp.state.switch_facts import switch_facts
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.domain import Policy
+
+if TYPE_CHECKING:  # a node loads its own core alone, and facts when somebody asks
+    from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact
+    from gdp.rib.state import RibCoreState
 
 __all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state", "rib_facts"]
 
@@ -67,6 +68,8 @@ def answer_for_switch(
     switch = state.switch
 
     def gather(question: Question, now: Timestamps) -> SwitchFacts:
+        from gdp.state.switch_facts import switch_facts
+
         rows = () if tunnels is None else tunnels(now)
         return replace(switch_facts(state, question.name, now), tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
 
@@ -94,6 +97,8 @@ def answer_for_rib(state: RibState) -> None:
 
 def rib_facts(rib: RibCoreState, name: Name, now: Timestamps) -> RibFacts:
     """Return what a RIB stores about a name, for a diagnosis. Raises ``StoreError``: the store is away."""
+    from gdp.diagnosis.facts import RibFacts, RouteFact
+
     routes = [route for route in rib.store.routes(name) if route.expires_s > now.mono_s]
     here = {route.advertiser.to_text() for route in routes}
     return RibFacts(
@@ -116,6 +121,8 @@ def rib_facts(rib: RibCoreState, name: Name, now: Timestamps) -> RibFacts:
 
 
 def _tunnel(row: Mapping[str, object]) -> TunnelFact:
+    from gdp.diagnosis.facts import TunnelFact
+
     age_s = row.get("handshake_age_s")
     return TunnelFact(
         peer=str(row.get("label") or row.get("peer")),

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import Enum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gdp.client.participant import Topic
 from gdp.diagnosis.fields import from_fields
 from gdp.errors import DropReason, RemoteError
+
+if TYPE_CHECKING:  # a client reads rows, and needs no core
+    from gdp.client.participant import Topic
 
 __all__ = ["ROWS_MAX", "Direction", "TopicRow", "held_row", "rows_from_fields", "rows_to_fields"]
 

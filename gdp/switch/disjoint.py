@@ -9,16 +9,13 @@ what uses it.
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple, TypeAlias
 
 from gdp.names import Name
-
-if TYPE_CHECKING:
-    import networkx as nx
+from gdp.shortest_paths import add_edge, shortest_paths
 
 __all__ = ["DirectedLink", "DirectedPath", "disjoint_paths"]
-
-_WEIGHT: Final = "weight"
 
 
 class DirectedLink(NamedTuple):
@@ -37,35 +34,28 @@ class _Shared(NamedTuple):
 
 _Node = Name | DirectedLink | _Shared
 DirectedPath = tuple[DirectedLink, ...]
+_Graph: TypeAlias = "dict[_Node, dict[_Node, int]]"
 
 
-def disjoint_paths(graph: nx.MultiDiGraph[Name], source: Name, target: Name) -> tuple[DirectedPath, ...]:
+def disjoint_paths(links: Mapping[DirectedLink, int], source: Name, target: Name) -> tuple[DirectedPath, ...]:
     """Return two paths, the cheaper one first; one path if there is no other, and none if there is no path.
 
     Of all pairs, those with the fewest shared links count, and of these the one of least total cost. A pair shares a
     link only where every path needs it. It takes two runs of Dijkstra's algorithm.
 
     Args:
-        graph: each edge has a ``weight`` above 0.
+        links: the cost of each, above 0.
     """
-    from networkx import dijkstra_path, dijkstra_predecessor_and_distance
-
+    costs = {link: links[link] for link in _by_start(links)}
+    graph = _with_links(costs)
     if source not in graph or target not in graph or source == target:
         return ()
-    edges = graph.edges(keys=True)
-    costs = {DirectedLink(*edge): int(graph.edges[edge][_WEIGHT]) for edge in edges}
-    before, distances = dijkstra_predecessor_and_distance(_with_links(costs), source)
+    before, distances = shortest_paths(graph, source)
     if target not in distances:
         return ()
-    first: list[DirectedLink] = []
-    node: _Node = target
-    while node != source:
-        node = before[node][0]
-        if isinstance(node, DirectedLink):
-            first.append(node)
-    second = dijkstra_path(
-        _residual(costs, {each: int(distance) for each, distance in distances.items()}, first), source, target
-    )
+    first = [each for each in _passed(before, source, target) if isinstance(each, DirectedLink)]
+    residual = _residual(costs, distances, first)
+    second = _passed(shortest_paths(residual, source)[0], source, target)
     used = _used_links(first, second)
     paths = [_take_path(used, source, target) for _ in range(2)]
     if paths[0] == paths[1]:
@@ -73,36 +63,49 @@ def disjoint_paths(graph: nx.MultiDiGraph[Name], source: Name, target: Name) -> 
     return tuple(sorted(paths, key=lambda path: (sum(costs[link] for link in path), path)))
 
 
-def _with_links(costs: dict[DirectedLink, int]) -> nx.DiGraph[_Node]:
-    """Return a graph in which each link is a node between its ends."""
-    from networkx import DiGraph
+def _by_start(links: Iterable[DirectedLink]) -> list[DirectedLink]:
+    """Return the links out of each switch together, in the order in which a link first names the switch."""
+    out: dict[Name, list[DirectedLink]] = {}
+    for link in links:
+        out.setdefault(link.start, []).append(link)
+        out.setdefault(link.end, [])
+    return [link for each in out.values() for link in each]
 
-    graph: nx.DiGraph[_Node] = DiGraph()
+
+def _passed(before: Mapping[_Node, _Node], source: Name, target: Name) -> list[_Node]:
+    """Return the nodes of a path before its target, the last one first."""
+    passed: list[_Node] = []
+    node: _Node = target
+    while node != source:
+        node = before[node]
+        passed.append(node)
+    return passed
+
+
+def _with_links(costs: Mapping[DirectedLink, int]) -> _Graph:
+    """Return a graph in which each link is a node between its ends."""
+    graph: _Graph = {}
     for link, cost in costs.items():
-        graph.add_edge(link.start, link, weight=cost)
-        graph.add_edge(link, link.end, weight=0)
+        add_edge(graph, link.start, link, cost)
+        add_edge(graph, link, link.end, 0)
     return graph
 
 
-def _residual(
-    costs: dict[DirectedLink, int], distances: dict[_Node, int], first: list[DirectedLink]
-) -> nx.DiGraph[_Node]:
+def _residual(costs: Mapping[DirectedLink, int], distances: Mapping[_Node, int], first: list[DirectedLink]) -> _Graph:
     """Return the graph of the second run: reduced costs, and the links of the first path reversed or shared."""
-    from networkx import DiGraph
-
     on_first, shared_cost = set(first), 1 + sum(costs.values())
-    graph: nx.DiGraph[_Node] = DiGraph()
+    graph: _Graph = {}
     for link, cost in costs.items():
         if link.start not in distances:
             continue
         if link in on_first:
-            graph.add_edge(link.end, link, weight=0)
-            graph.add_edge(link, link.start, weight=0)
-            graph.add_edge(link.start, _Shared(link), weight=shared_cost)
-            graph.add_edge(_Shared(link), link.end, weight=0)
+            add_edge(graph, link.end, link, 0)
+            add_edge(graph, link, link.start, 0)
+            add_edge(graph, link.start, _Shared(link), shared_cost)
+            add_edge(graph, _Shared(link), link.end, 0)
         else:
-            graph.add_edge(link.start, link, weight=cost + distances[link.start] - distances[link.end])
-            graph.add_edge(link, link.end, weight=0)
+            add_edge(graph, link.start, link, cost + distances[link.start] - distances[link.end])
+            add_edge(graph, link, link.end, 0)
     return graph
 
 

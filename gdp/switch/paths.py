@@ -1,6 +1,6 @@
 """Shortest paths over the link states, restricted to the domains that are allowed.
 
-Sans-I/O. Source: Dijkstra, by networkx. Edges are directed; a link counts when both ends list it. Of another domain a
+Sans-I/O. Edges are directed; a link counts when both ends list it. Of another domain a
 switch sees only the borders. So the path to a switch behind them is the path to the nearest border that lists it. A
 part of the own domain that a failure has cut off is reached in the same way: through its borders, over other domains.
 
@@ -12,15 +12,13 @@ to this one are ``severed``.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.names import ZERO, Name
+from gdp.shortest_paths import add_edge, shortest_paths
 from gdp.switch.disjoint import DirectedLink, DirectedPath, disjoint_paths
 from gdp.switch.lsdb import LinkStateDatabase
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 __all__ = ["Path", "Paths"]
 
@@ -52,7 +50,7 @@ class Paths:
         self._domain = domain
         self.link_states = link_states
         self._version = -1
-        self._graph: nx.DiGraph[Name] | None = None
+        self._graph: dict[Name, dict[Name, int]] = {}
         self._members: frozenset[Name] = frozenset()  # switches of our domain that are reachable within it
         self._leaves: frozenset[Name] = frozenset()  # of our domain
         self._severed: frozenset[Name] = frozenset()  # of our domain
@@ -97,10 +95,10 @@ class Paths:
         Only a neighbour of our domain qualifies, because the path choice of other domains is unknown. A leaf is none.
         For a leaf each neighbour that has a path is one, since no frame returns through a leaf.
         """
-        if self._graph is None or len(self._graph) > _ALTERNATES_SWITCHES_MAX:
+        if len(self._graph) > _ALTERNATES_SWITCHES_MAX:
             return None
         found: list[tuple[int, Name]] = []
-        for neighbour, edge in self._graph.adj[self._me].items():
+        for neighbour, cost in self._graph[self._me].items():
             if neighbour == path.first or self._domains.get(neighbour) != self._domain:
                 continue
             if neighbour in self._leaves and neighbour != switch:
@@ -110,17 +108,17 @@ class Paths:
             if onwards is None or back is None:
                 continue
             if self._me in self._leaves or onwards < back + path.distance:
-                found.append((edge["weight"] + onwards, neighbour))
+                found.append((cost + onwards, neighbour))
         return min(found, default=(0, None))[1]
 
     def is_only_way(self, neighbour: Name) -> bool:
         """Return whether the link between them alone joins this switch and a neighbour, as far as is known."""
         self._refresh()
-        if self._graph is None or self._me not in self._graph or neighbour not in self._graph:
+        if self._me not in self._graph or neighbour not in self._graph:
             return True  # a switch that has just started knows others before its own first link is in the graph
-        from networkx import has_path, restricted_view
-
-        return not has_path(restricted_view(self._graph, (), ((self._me, neighbour),)), self._me, neighbour)
+        link = self._me, neighbour
+        _, others = shortest_paths(self._graph, self._me, lambda start, end: (start, end) != link)
+        return neighbour not in others
 
     def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
         """Return the distance of a switch from another one than this; None where there is no path."""
@@ -245,20 +243,18 @@ class Paths:
         return self._pairs[key]
 
     def _disjoint(self, switch: Name, domain: Name) -> tuple[DirectedPath, ...]:
-        from networkx import MultiDiGraph
-
         ends = self._leaves - {self._me}
         within = switch in self._members
         borders = () if within else self._borders_to(switch, domain)
-        graph: nx.MultiDiGraph[Name] = MultiDiGraph()
+        costs: dict[DirectedLink, int] = {}
         for link, cost in self._links.items():
             if link.start in ends or link.start not in self._members:
                 continue
             if link.end in self._members or link.end in borders:
-                graph.add_edge(link.start, link.end, link.key, weight=cost)
+                costs[link] = cost
         for border in borders:
-            graph.add_edge(border, ZERO, 0, weight=1)
-        found = disjoint_paths(graph, self._me, switch if within else ZERO)
+            costs[DirectedLink(border, ZERO, 0)] = 1
+        found = disjoint_paths(costs, self._me, switch if within else ZERO)
         return found if within else tuple(dict.fromkeys(path[:-1] for path in found))
 
     def _borders_to(self, switch: Name, domain: Name) -> frozenset[Name]:
@@ -282,22 +278,17 @@ class Paths:
         return ways
 
     def _compute(self, start: Name, allowed: frozenset[Name]) -> dict[Name, Path]:
-        if self._graph is None or start not in self._graph:
+        if start not in self._graph:
             return {}
-        from networkx import dijkstra_predecessor_and_distance
-
         open_ = {name for name, domain in self._domains.items() if domain in allowed or domain == self._domain}
         ends = self._leaves - {start}
 
-        def cost(from_: Name, to: Name, edge: dict[str, int]) -> int | None:
-            return edge["weight"] if to in open_ and from_ not in ends else None  # None hides an edge
-
-        before, distances = dijkstra_predecessor_and_distance(self._graph, start, weight=cost)
+        before, distances = shortest_paths(self._graph, start, lambda from_, to: to in open_ and from_ not in ends)
         ways: dict[Name, Path] = {}
         for to, distance in distances.items():  # nearest first: the hop before ``to`` is already there
             if to != start:
-                last = before[to][0]
-                ways[to] = Path(to if last == start else ways[last].first, int(distance))
+                last = before[to]
+                ways[to] = Path(to if last == start else ways[last].first, distance)
         return ways
 
     def _refresh(self) -> None:
@@ -361,16 +352,15 @@ def _links(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> dict[Directed
     return {each: costs[each] for each in sorted(costs) if DirectedLink(each.end, each.start, each.key) in costs}
 
 
-def _graph(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> nx.DiGraph[Name]:
+def _graph(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> dict[Name, dict[Name, int]]:
     """Return the graph of all links that both ends list."""
     cost: dict[tuple[Name, Name], int] = {}
     for origin, links in edges:
         for link in links:
             edge = (origin, link.name)
             cost[edge] = min(cost.get(edge, link.cost), link.cost)
-    from networkx import DiGraph  # large; no path is requested before there is a neighbour
-
-    graph: nx.DiGraph[Name] = DiGraph()
-    # sorted: among ways of one length every switch picks in the same order
-    graph.add_weighted_edges_from((a, b, cost[a, b]) for a, b in sorted(cost) if (b, a) in cost)
+    graph: dict[Name, dict[Name, int]] = {}
+    for a, b in sorted(cost):  # among ways of one length every switch picks in the same order
+        if (b, a) in cost:
+            add_edge(graph, a, b, cost[a, b])
     return graph

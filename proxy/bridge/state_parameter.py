@@ -11,7 +11,6 @@ import struct
 from functools import cache
 from typing import Final
 
-import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -61,6 +60,8 @@ def state_in(raw: bytes) -> bytes | None:
 
 def write_request(state: bytes) -> bytes:
     """Return the request that writes the state, as CDR."""
+    import numpy as np  # most servers export no state
+
     store = _store()
     none = {"integer_array_value": np.zeros(0, np.int64), "double_array_value": np.zeros(0, np.float64)}
     value = store.types["rcl_interfaces/msg/ParameterValue"](

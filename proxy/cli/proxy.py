@@ -14,8 +14,6 @@ from gdp.cli.console import Columns
 from gdp.cli.node import AwaitIface, Check, Config, Json, Logs, MemberPlane, running, with_plane
 from gdp.cli.program import Program
 from gdp.intervals import ATTACH_S
-from gdp.links.uplink import wait_for_device
-from proxy.config.config import ProxyConfig
 
 __all__ = ["Schema", "main", "schema_text"]
 
@@ -25,6 +23,8 @@ main = app.run
 
 def schema_text() -> str:
     """Return the content of ``docs/proxy.schema.json``."""
+    from proxy.config.config import ProxyConfig
+
     return json.dumps(ProxyConfig.json_schema(), indent=2) + "\n"
 
 
@@ -63,6 +63,9 @@ def proxy(
     could be written.
     """
     del columns, schema  # their callbacks have done all
+    from gdp.links.uplink import wait_for_device
+    from proxy.config.config import ProxyConfig
+
     with running(logs):
         settings = with_plane(ProxyConfig.load(config), data_plane)
         if check:

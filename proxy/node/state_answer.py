@@ -5,17 +5,18 @@ I/O through the bridge, which it only reads. ``gdp/state/state_answers.py`` says
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gdp.control.diagnostics import Question
 from gdp.crypto.schema import Keyed, text
-from gdp.diagnosis.facts import ProxyFacts
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.state.state_answers import answer_state
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.name_facts import proxy_facts
 from proxy.node.proxy_state import ProxyState
+
+if TYPE_CHECKING:
+    from gdp.diagnosis.facts import ProxyFacts
 
 __all__ = ["answer_for_proxy"]
 
@@ -30,6 +31,8 @@ def answer_for_proxy(state: ProxyState, bridge: Bridge) -> None:
     member, identity, policy = state.member, state.identity, state.policy
 
     def gather(question: Question, now: Timestamps) -> ProxyFacts:
+        from proxy.bridge.name_facts import proxy_facts  # a node gathers facts for who asks
+
         asked = _ASKED.read(question.body)
         if not asked or question.asker.domain not in policy.diagnostics:
             asked = question.name.to_text() if question.name != ZERO else ""

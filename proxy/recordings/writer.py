@@ -75,6 +75,7 @@ class BagWriter:
         self._definitions_bytes = 0
         self._syncs = ThreadPoolExecutor(1, "sync")
         self._synced: Future[None] | None = None
+        self._synced_bytes = 0  # of the file, when it was last put on the disk
         self.is_closed = False
 
     @property
@@ -135,7 +136,9 @@ class BagWriter:
             if self._synced is None or self._synced.done():
                 if self._synced is not None:
                     self._synced.result()
-                self._synced = self._syncs.submit(os.fdatasync, self._format.file.fileno())
+                if (size_bytes := self._format.file.tell()) > self._synced_bytes:
+                    self._synced = self._syncs.submit(os.fdatasync, self._format.file.fileno())
+                    self._synced_bytes = size_bytes
         except OSError as error:
             self.failure = f"{self.path} cannot be written: {error.strerror}"
 

@@ -9,11 +9,10 @@ by one thread only.
 
 from __future__ import annotations
 
+import array
 import struct
 from collections.abc import Callable
 from typing import Final, TypeAlias
-
-import numpy as np
 
 from proxy.serial.cost import fixed_bytes, items_of
 from proxy.serial.dialect import Dialect, MisfitError, Wide
@@ -29,6 +28,7 @@ _Values: TypeAlias = "tuple[object, ...] | list[object]"
 _Shape: TypeAlias = "Callable[[_Values, Tree], None]"
 
 ITEMS_MAX: Final = 1 << 19  # records, lists and texts of one message: some 150 MB
+_UNSIGNED: Final = {2: "H", 4: "I", 8: "Q"}  # by bytes
 _ITEMS_FREE: Final = 256  # ... of which any message may have this many
 _ITEMS_PER_BYTE: Final = 4  # ... and this many for each of its bytes
 
@@ -279,4 +279,7 @@ def _named(name: str, read: Reader) -> _Step:
 
 
 def _swapped(raw: memoryview, width: int) -> bytes:
-    return np.frombuffer(raw, dtype=f">u{width}").astype(f"<u{width}").tobytes()
+    values = array.array(_UNSIGNED[width])
+    values.frombytes(raw)
+    values.byteswap()
+    return values.tobytes()

@@ -21,7 +21,6 @@ from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.cbor_dialect import CborDialect
 from proxy.serial.channel import Channel
 from proxy.serial.dialect import Dialect, MisfitError, Wide
-from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.layout import Wire
 from proxy.serial.native_dialect import NativeDialect
 from proxy.serial.reader import ITEMS_MAX, Reader, read_with
@@ -225,12 +224,19 @@ def _native(type_name: str, definition: str, definition_format: str, ros: int) -
     return _codecs.get(digest_of("native", type_name, definition, definition_format, ros), build)
 
 
+def _dialect(encoding: Encoding) -> Dialect:
+    if encoding != "json":
+        return CborDialect()
+    from proxy.serial.json_dialect import JsonDialect  # it loads NumPy
+
+    return JsonDialect()
+
+
 def _codec(channel: Channel, encoding: Encoding) -> Codec:
     named = (channel.type_name, channel.definition, channel.definition_format, channel.ros)
 
     def build() -> Codec:
-        dialect: Dialect = JsonDialect() if encoding == "json" else CborDialect()
-        return Codec(parse(*named), channel.ros, dialect, _native(*named))
+        return Codec(parse(*named), channel.ros, _dialect(encoding), _native(*named))
 
     return _codecs.get(digest_of(encoding, *named), build)
 

@@ -50,8 +50,7 @@ class Tutorial:
         self.machines: dict[str, FreshMachine] = {}
         self._tokens: list[str] = []
         for label, access in _SITES.items():
-            site = laboratory.add_site(f"at-{label}", access, has_line=True)
-            site.set_delay(_DELAY_MS)
+            site = laboratory.add_site(f"at-{label}", access, delay_ms=_DELAY_MS)
             machine = FreshMachine(laboratory.add_host(label, site), laboratory.run.directory)
             self.machines[label] = stack.enter_context(machine)
         self._border = self.machines["border"].host.lease().address.partition("/")[0]

@@ -67,10 +67,10 @@ class Row(Lab):
     def __init__(self, run: Run) -> None:
         super().__init__(run, chain(5))
         nodes = self.topology.nodes
-        self._macs = {node: self.inside(node, partial(mac_addresses, self._devices(node))) for node in nodes}
+        self._macs = {node: self.inside(node, partial(mac_addresses, self.topology.neighbours(node))) for node in nodes}
         with ExitStack() as undo:
             self._source, self._sink = (
-                undo.enter_context(self._worker(node, "end", cpu=cpu, ifname=self._devices(node)[0]))
+                undo.enter_context(self._worker(node, "end", cpu=cpu, ifname=self.topology.neighbours(node)[0]))
                 for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
             )
             self._source.read(_READY_S)
@@ -89,7 +89,7 @@ class Row(Lab):
         with ExitStack() as undo:
             workers = []
             for node in self.topology.nodes[1:-1]:
-                left, right = self._devices(node)
+                left, right = self.topology.neighbours(node)
                 ways = {side: f"{at} {self._macs[at][node].hex()}" for side, at in (("left", left), ("right", right))}
                 workers.append(undo.enter_context(self._worker(node, "switch", ways=ways)))
             for worker in workers:
@@ -101,7 +101,7 @@ class Row(Lab):
         """Make a bridge in every middle, which has learnt both addresses; yield as ``kernel``."""
         with ExitStack() as undo:
             for node in self.topology.nodes[1:-1]:
-                self.inside(node, partial(add_bridge, _BRIDGE, self._devices(node)))
+                self.inside(node, partial(add_bridge, _BRIDGE, self.topology.neighbours(node)))
                 undo.callback(self.inside, node, partial(remove_link, _BRIDGE))
             frames = self._frames(4)
             self.round_trips(frames, _WARM_UP_PINGS)
@@ -127,12 +127,6 @@ class Row(Lab):
         times: list[float] = self._source.ask(do="ping", frame=frames["there"], pings=pings)["rtt_us"]
         self._sink.read(_READY_S)
         return times
-
-    def _devices(self, node: str) -> list[str]:
-        """Return a node's devices, from left to right; each has the name of the neighbour that it leads to."""
-        nodes = self.topology.nodes
-        at = nodes.index(node)
-        return [*nodes[max(0, at - 1) : at], *nodes[at + 1 : at + 2]]
 
     def _frames(self, hops: int) -> Mapping[str, str]:
         """Return frames to the machine so many links away: the next one for a switch, the far end for a bridge."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import matplotlib as mpl
 
@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from samples import Sample, p99
 
-__all__ = ["Span", "plt", "save", "save_distributions", "save_timeline", "tidy"]
+__all__ = ["Span", "plt", "save", "save_distributions", "save_timeline"]
 
 _COLOURS: Final = ("#99a8b2", "#1f6f8b", "#c96f3b", "#5b8c5a", "#7a5195")
 _DOTS_PER_INCH: Final = 110
@@ -51,7 +51,7 @@ def save_distributions(path: Path, title: str, panels: Mapping[str, Mapping[str,
         right.set_title(f"{name}: share that took at most so long; dashed: p99", fontsize=10, loc="left")
         for axis in (left, right):
             axis.set_xlabel(unit, fontsize=8)
-            tidy(axis)
+            _tidy(axis)
     save(figure, path, title)
 
 
@@ -73,15 +73,15 @@ def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequ
     axis.set_xlabel("seconds; shaded: the machine of that colour was killed and is not serving yet", fontsize=8)
     axis.set_ylabel("latency, ms", fontsize=8)
     axis.set_ylim(bottom=0)
-    tidy(axis)
+    _tidy(axis)
     save(figure, path, title)
 
 
-def tidy(axis: Axes, *, ncols: int = 1, loc: Literal["best", "upper left"] = "best") -> None:
+def _tidy(axis: Axes) -> None:
     """Give an axis small labels, a legend without a frame, and no lines above and to the right."""
     axis.tick_params(labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(fontsize=8, frameon=False, ncols=ncols, loc=loc)
+    axis.legend(fontsize=8, frameon=False)
 
 
 def save(figure: Figure, path: Path, title: str = "") -> None:

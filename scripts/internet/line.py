@@ -1,18 +1,15 @@
 """Delay line of a site's uplink: a process that passes frames between two devices after a delay with jitter.
 
-I/O; two AF_PACKET sockets. Run as ``python -m internet.line DEVICE DEVICE``. Each line on its standard input is a
-JSON object with delay and jitter in milliseconds; it ends with its input. It replaces netem, which not every kernel
-has. Frames pass with their offload header, so that a large segment of TCP costs no more than a small one, and no
-checksum is lost.
+I/O; two AF_PACKET sockets. Run as ``python -m internet.line DEVICE DEVICE MS JITTER_MS``; it prints a line when it is
+ready, and ends with its standard input. It replaces netem, which not every kernel has. Frames pass with their offload
+header, so that a large segment of TCP costs no more than a small one, and no checksum is lost.
 Source: packet(7), PACKET_VNET_HDR; Linux, include/uapi/linux/if_packet.h, for the numbers.
 """
 
 from __future__ import annotations
 
 import ctypes
-import json
 import logging
-import os
 import random
 import select
 import socket
@@ -36,13 +33,13 @@ _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
 class _Delay:
     """Due times of frames: each direction keeps its order."""
 
-    def __init__(self) -> None:
-        self.delay_ns = self.jitter_ns = 0
+    def __init__(self, delay_ms: float, jitter_ms: float) -> None:
+        self._delay_ns, self._jitter_ns = round(delay_ms * _MS_NS), round(jitter_ms * _MS_NS)
         self._last_ns = [0, 0]
 
     def due_ns(self, side: int, now_ns: int) -> int:
         """Return when a frame that arrived now on a side is due."""
-        due_ns = now_ns + self.delay_ns + (random.randrange(self.jitter_ns) if self.jitter_ns else 0)
+        due_ns = now_ns + self._delay_ns + (random.randrange(self._jitter_ns) if self._jitter_ns else 0)
         self._last_ns[side] = max(self._last_ns[side], due_ns)
         return self._last_ns[side]
 
@@ -61,9 +58,8 @@ def _open(device: str) -> socket.socket:
     return opened
 
 
-def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
+def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine, delay: _Delay) -> None:
     """Relay until the input ends."""
-    delay = _Delay()
     control = sys.stdin.fileno()
     while True:
         ready, _, _ = select.select((*sides, control), (), (), line.pause_s(time.monotonic_ns()))
@@ -71,11 +67,7 @@ def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
             if source in ready:
                 _receive(source, side, line, delay)
         if control in ready:
-            order = os.read(control, 1 << 10)
-            if not order:
-                return
-            delay.delay_ns, delay.jitter_ns = (round(ms * _MS_NS) for ms in json.loads(order).values())
-            os.write(sys.stdout.fileno(), b"{}\n")
+            return
         for side, frame in line.poll_frames(time.monotonic_ns()):
             try:
                 sides[side].send(frame)
@@ -99,9 +91,10 @@ def main() -> None:
     """Run the relay of the command line."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s internet.line %(message)s")
     ctypes.CDLL(None).prctl(_TIMER_SLACK, 1, 0, 0, 0)  # the default adds 50 us to each pause
-    line = DelayLine(0)
+    line, delay = DelayLine(0), _Delay(*map(float, sys.argv[3:]))
     with _open(sys.argv[1]) as one, _open(sys.argv[2]) as other:
-        _relay((one, other), line)
+        print("ready", flush=True)
+        _relay((one, other), line, delay)
     if line.dropped:  # expected where an uplink was cut with frames under way
         log.warning("delay line %s-%s lost frames, device down or queue full count=%d", *sys.argv[1:3], line.dropped)
 

@@ -20,7 +20,6 @@ from functools import cached_property
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final
 
-from gdp.errors import LocalError
 from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
 from lab.namespaces import IpNamespace
 from lab.process import LabProcess
@@ -57,7 +56,7 @@ class Site:
     ``access``: its kind. ``routers``: from its hosts outwards.
     """
 
-    def __init__(self, laboratory: Laboratory, label: str, access: Access, *, has_line: bool) -> None:
+    def __init__(self, laboratory: Laboratory, label: str, access: Access, delay_ms: float, jitter_ms: float) -> None:
         self.label, self.access = label, access
         self._laboratory = laboratory
         self._core = laboratory.core
@@ -81,7 +80,7 @@ class Site:
                 [f"link add {port} index {laboratory.next_index()} type veth peer {WAN} netns {home.path}"]
             )
             carrier.configure([f"link set {port} master {LAN} up"])
-        self._join_core(has_line=has_line)
+        self._join_core(delay_ms, jitter_ms)
         self._configure()
 
     @property
@@ -169,15 +168,6 @@ class Site:
         self._configure()
         self._laboratory.set_ports(self, is_up=True)
 
-    def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
-        """Delay packets by ``ms``, and up to ``jitter_ms`` more, in each direction; their order stays.
-
-        Raises ``LocalError``: the site was made without a delay line. Raises ``FailedError``: its process has ended.
-        """
-        if self._line is None:
-            raise LocalError(f"site {self.label} has no delay line")
-        self._line.ask(ms=ms, jitter_ms=jitter_ms)
-
     def close(self) -> None:
         """End the process of the delay line."""
         if self._line is not None:
@@ -186,10 +176,10 @@ class Site:
     def _next_mac(self) -> str:
         return (_MAC + self._laboratory.next_index().to_bytes(2, "big")).hex(":")
 
-    def _join_core(self, *, has_line: bool) -> None:
+    def _join_core(self, delay_ms: float, jitter_ms: float) -> None:
         number, outer = self._laboratory.next_index(), self._outer
         core_end, router_end = f"index {number} address {self._core_mac}", f"address {self._wan_mac} netns {outer.path}"
-        if not has_line:
+        if not delay_ms:
             self._core.configure([f"link add {self.uplink} {core_end} type veth peer name {WAN} {router_end}"])
             return
         line = IpNamespace(self._laboratory.run, f"{self.label}-line")
@@ -200,9 +190,9 @@ class Site:
         for device in ("core", "site"):
             line.set(f"ipv6/conf/{device}/disable_ipv6", 1)
         line.configure(["link set core up", "link set site up"])
-        argv = line.command([sys.executable, "-m", "internet.line", "core", "site"])
+        argv = line.command([sys.executable, "-m", "internet.line", "core", "site", str(delay_ms), str(jitter_ms)])
         self._line = LabProcess(self._laboratory.run, f"line {self.label}", argv, has_orders=True)
-        self.set_delay(0.0)
+        self._line.read_until("ready")
 
     def _configure(self) -> None:
         """Set all links up, and addresses, routes and rules; harmless where they are so."""

@@ -94,10 +94,7 @@ class Stage:
 
     def add_site(self, label: str, access: Access) -> Site:
         """Attach one more network."""
-        site = self._laboratory.add_site(label, access, has_line=bool(self._delay_ms))
-        if self._delay_ms:
-            site.set_delay(self._delay_ms, self._delay_ms / 10)
-        return site
+        return self._laboratory.add_site(label, access, delay_ms=self._delay_ms, jitter_ms=self._delay_ms / 10)
 
     def create_domain(self) -> str:
         """Create the domain on the public machine; return the token for the first machine."""

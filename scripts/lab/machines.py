@@ -212,4 +212,4 @@ class BenchNodes(OverlayNodes):
         if node in self._switch_nodes:
             (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
             return iface
-        return next(self._topology.links_of(node)).other(node)
+        return self._topology.neighbours(node)[0]

@@ -242,7 +242,7 @@ class Namespaces:
             namespace.inside(netns_files.disable_ipv6)
         self._join()
         for node, namespace in self._namespaces.items():
-            for device in ("lo", *(link.other(node) for link in topology.links_of(node))):
+            for device in ("lo", *topology.neighbours(node)):
                 namespace.inside(partial(set_link, device, state="up"))
 
     def __getitem__(self, node: str) -> Namespace:

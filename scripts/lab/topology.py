@@ -103,6 +103,10 @@ class Topology:
         """Yield the links that end at this switch, in the topology's order."""
         return (link for link in self.links if node in link.ends())
 
+    def neighbours(self, node: str) -> list[str]:
+        """Return the switches that a switch has a link to, which name its devices, in the topology's order."""
+        return [link.other(node) for link in self.links_of(node)]
+
     def link(self, a: str, b: str) -> Link:
         """Return the link between two switches, named in either order."""
         for link in self.links:

@@ -43,10 +43,14 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 _LATE: Final = ("domain", "join", "share", "delegate", "topic", "explain", "trace")  # commands with many imports
 _PRELOADED: Final = (
     "gdp.cli.switch",
+    "gdp.nodes.switch",
     "gdp.cli.rib",
+    "gdp.nodes.rib",
     "gdp.cli.gdp",
     "gdp.cli.relay",
+    "gdp.nodes.relay",
     "proxy.cli.proxy",
+    "proxy.node.bridge_node",
     "proxy.cli.replay",
     "proxy.recordings.child",
     "fog.cli.app",

@@ -66,7 +66,7 @@ class Overlay:
     def stand_up(self) -> None:
         """Start switches and RIBs; return when all are ready."""
         if self.options.pcap is not None:
-            ifaces = [f"--iface={link.other(_MIDDLE)}" for link in self.topology.links_of(_MIDDLE)]
+            ifaces = [f"--iface={each}" for each in self.topology.neighbours(_MIDDLE)]
             argv = ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)]
             self.supervisor.ready(self.start(_MIDDLE, "capture", argv))
         self.reporter.step("starting a switch in each")

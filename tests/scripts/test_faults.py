@@ -14,7 +14,7 @@ from faults.schedule import STRUCTURAL, make_schedule
 from faults.store import critical_lines, snapshot_faults
 
 from gdp.message.loss import LossReason
-from lab.faults import Broken, Fault, FaultKind, broken_by
+from lab.faults import Broken, Fault, FaultKind, broken_by, moments
 from lab.topology import make_topology
 
 SEEDS = range(1, 9)
@@ -71,6 +71,11 @@ def test_no_fault_outlasts_the_schedule_and_none_meets_another_at_the_same_targe
         of_kind = [fault for fault in faults if fault.kind is kind]
         for one, other in pairwise(of_kind):
             assert one.targets != other.targets or one.end_s <= other.start_s
+
+
+def test_a_fault_that_lasts_has_a_beginning_only_and_what_begins_comes_before_what_ends() -> None:
+    lasting, first = Fault(FaultKind.CUT, ("a", "b"), 2.0), Fault(FaultKind.CUT, ("b", "c"), 1.0, 2.0)
+    assert moments([lasting, first]) == [(1.0, first, True), (2.0, lasting, True), (2.0, first, False)]
 
 
 def test_a_schedule_can_be_limited_to_some_kinds() -> None:

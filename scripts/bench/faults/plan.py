@@ -74,7 +74,7 @@ class Plan:
     def home(self, mover: str) -> str:
         """Return the switch into which a member, or a switch that moves, is plugged at the start."""
         homes = self.homes.get(mover)
-        return homes[0] if homes else next(self.topology.links_of(mover)).other(mover)
+        return homes[0] if homes else self.topology.neighbours(mover)[0]
 
     def channels(self, member: str) -> Iterable[tuple[int, Flow | Service]]:
         """Yield what a member takes part in, with its channel."""

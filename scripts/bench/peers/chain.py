@@ -8,6 +8,7 @@ right end .2; the three in the middle forward IPv4::
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -47,16 +48,11 @@ class Chain(Lab):
     def __init__(self, mtu: int, run: Run) -> None:
         super().__init__(run, row(mtu))
         for node in NODES:
-            self.inside(node, partial(_number, node))
+            self.inside(node, partial(_number, node, self.topology.neighbours(node)))
 
 
-def _neighbours(node: str) -> tuple[str, ...]:
-    own = NODES.index(node)
-    return NODES[max(own - 1, 0) : own] + NODES[own + 1 : own + 2]
-
-
-def _number(node: str) -> None:
-    for other in _neighbours(node):
+def _number(node: str, neighbours: Iterable[str]) -> None:
+    for other in neighbours:
         add_address(other, address(node, other))
         clear_offloads(other)
     with IPRoute() as here:

@@ -100,8 +100,7 @@ class ZenohNet:
         """Return the path of a machine's certificate; the first call makes all of them."""
         directory = chain.directory / "tls"
         if not directory.exists():
-            links = chain.topology.links
-            hosts = {host: [address(host, link.other(host)) for link in links if host in link.ends()] for host in NODES}
+            hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
             make_certificates(directory, hosts)
         return {"certificate": str(directory / node)}
 

@@ -206,7 +206,7 @@ def leaves(command: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
 def test_every_command_has_help_with_an_example_and_json(gdp: Run, path: tuple[str, ...]) -> None:
     done = gdp("", *path, "--help")
     assert done.code == 0
-    assert re.search(rf"Examples?:\s+gdp {' '.join(path)} ", done.out)
+    assert re.search(rf"Examples?:\s+gdp {' '.join(path)}\s", done.out)
     assert "--json" in done.out
 
 

@@ -64,7 +64,7 @@ def test_a_switch_finds_what_the_lab_left_and_takes_the_ports_of_its_line(
 ) -> None:
     assert _lab("robot --iface eth0") == 0
     found: list[SwitchConfig] = []
-    monkeypatch.setattr("gdp.cli.switch.run_switch", lambda settings, *_: found.append(settings))
+    monkeypatch.setattr("gdp.nodes.switch.run_switch", lambda settings, *_: found.append(settings))
     for line in ("--iface lan0", ""):
         assert CliRunner().invoke(switch, line.split()).exit_code == 0
     assert [[port.iface for port in each.ports] for each in found] == [["lan0"], ["eth0"]]

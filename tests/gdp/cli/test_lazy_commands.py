@@ -38,7 +38,7 @@ def test_a_misspelled_command_is_suggested_without_an_import(capsys: pytest.Capt
 
 
 def test_lazy_commands_are_a_mapping_in_the_order_of_the_help() -> None:
-    known = {each: LazyCommand(f"gdp.cli.{each}:{each}") for each in ("trace", "ping")}
+    known = {each: LazyCommand(f"gdp.cli.{each}:{each}", "") for each in ("trace", "ping")}
     commands = LazyCommands(known)
     assert [*commands] == ["trace", "ping"]
     assert commands["ping"] is commands["ping"]

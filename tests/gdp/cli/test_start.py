@@ -1,4 +1,4 @@
-"""Modules loaded at the start of a node: a machine that replaces another must serve within seconds."""
+"""Modules that commands and nodes load: a command answers at once, and a machine that replaces another serves soon."""
 
 from __future__ import annotations
 
@@ -12,22 +12,50 @@ import pytest
 from gdp.cli.rib import rib
 from proxy.cli.proxy import proxy
 
-LARGE = {"networkx", "prometheus_client", "pyroute2", "rich.console", "rosbags.rosbag1", "rosbags.rosbag2", "scapy"}
+LARGE = {"networkx", "prometheus_client", "pyroute2", "rich", "rosbags.rosbag1", "rosbags.rosbag2", "scapy"}
+OF_NODES = {"asyncio", "cryptography.x509", "numpy", "pydantic", "yaml"}  # a short command needs none
+TUNNELS = {"gdp.links.tunnels", "gdp.ports.tunnel.wireguard"}
 
 
 @pytest.mark.parametrize(
-    "modules",
+    ("modules", "needless"),
     [
-        "gdp.cli.switch, gdp.ports.kernel.plane",
-        "gdp.cli.rib",
-        "proxy.cli.proxy, proxy.node.bridge_node",
-        "fog.host.cli",
+        (
+            "gdp.cli.switch, gdp.nodes.switch, gdp.ports.kernel.plane",
+            {"numpy", "gdp.client", "gdp.rib", "gdp.diagnosis.facts", "gdp.config.relay_config", *TUNNELS},
+        ),
+        ("gdp.cli.rib, gdp.nodes.rib", {"numpy", "gdp.client.participant", "gdp.diagnosis.facts", "gdp.switch.core"}),
+        ("proxy.cli.proxy, proxy.node.bridge_node", {"numpy", "gdp.rib", "gdp.diagnosis.facts", "gdp.switch.core"}),
+        ("fog.host.cli", set[str]()),
     ],
 )
-def test_a_node_starts_without_large_libraries_that_it_does_not_need(modules: str) -> None:
+def test_a_node_starts_without_large_libraries_and_parts_of_other_nodes(modules: str, needless: set[str]) -> None:
     code = f"import sys, {modules}; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert LARGE & set(said.split()) == set()
+    assert (LARGE | needless) & set(said.split()) == set()
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        ("gdp.cli.gdp", ["--help"]),
+        ("gdp.cli.gdp", ["--version"]),
+        ("gdp.cli.gdp", ["show", "links"]),
+        ("gdp.cli.gdp", ["name", "--kind", "topic", "--name", "/scan"]),
+        ("gdp.cli.gdp", ["status", "--help"]),
+        ("gdp.cli.switch", ["--help"]),
+        ("gdp.cli.rib", ["--help"]),
+        ("gdp.cli.relay", ["--help"]),
+        ("proxy.cli.proxy", ["--help"]),
+    ],
+)
+def test_a_short_command_loads_nothing_of_a_node(program: str, words: list[str]) -> None:
+    code = (
+        f"import atexit, sys\natexit.register(lambda: print(*sys.modules))\nfrom {program} import main\nmain({words})"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout
+    assert program in said
+    assert (LARGE | OF_NODES) & set(said.split()) == set()
 
 
 @pytest.mark.parametrize("command", [rib, proxy])

@@ -144,8 +144,7 @@ class Pipe:
 
     def _next_s(self) -> float:
         times = [self.publisher.get_timer(), *(end.writer_proxy.get_timer() for end in self.ends.values())]
-        times.append(self._events[0][0] if self._events else None)
-        return min((each for each in times if each is not None), default=float("inf"))
+        return min([*times, self._events[0][0]]) if self._events else min(times)
 
     def _flush(self) -> None:
         for frame in self._polled():

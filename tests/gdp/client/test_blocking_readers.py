@@ -20,7 +20,7 @@ def held_back(blocked_of_step: float, path_bytes_s: float, fast_allowance: int =
         later_s = now_s + blocked_of_step * STEP_S
         blocks.record([PathState(SLOW, 1_500, sent), PathState(FAST, 1_500, 0)], later_s)
         now_s += STEP_S
-    if blocks:
+    if blocks.blocks:
         assert blocks.get_timer() == pytest.approx(due_s)
         assert blocks.slow(due_s - 0.01) == []
     return blocks.slow(due_s + 0.001)
@@ -48,7 +48,7 @@ def test_what_waits_without_a_break_counts_as_blocked_up_to_now() -> None:
     blocks = BlockingReaders(LAG_S)
     blocks.record([PathState(SLOW, 0, 0), PathState(FAST, 1_500, 0)], 10.0)
     assert blocks.slow(10.0 + LAG_S) == [SLOW]
-    assert not blocks
+    assert not blocks.blocks
 
 
 def test_a_reader_that_is_left_alone_holds_back_no_other() -> None:

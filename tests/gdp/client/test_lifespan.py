@@ -52,7 +52,7 @@ def test_a_message_that_waited_longer_than_its_deadline_is_dropped() -> None:
     queue = queue_of(10.0, 10.1, 10.19)
     assert dropped(queue, 10.25) == [1]
     assert dropped(queue, 10.35) == [2]
-    assert len(queue) == 1
+    assert len(queue.waiting) == 1
 
 
 def test_the_time_that_a_message_takes_to_leave_counts_against_its_deadline() -> None:

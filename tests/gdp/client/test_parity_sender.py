@@ -130,7 +130,7 @@ def test_without_loss_that_parity_fills_there_is_none(loss: float | None) -> Non
     of = keys()
     made = sender(of)
     made.handle_sent(sealed(of, 1), loss, None, 0.0)
-    assert len(made) == 0
+    assert len(made.waiting) == 0
     assert not made.is_wanted(loss, 0.06, None)
 
 
@@ -138,7 +138,7 @@ def test_a_rule_switches_it_off() -> None:
     of = keys()
     made = sender(of, is_enabled=False)
     made.handle_sent(sealed(of, 1), 0.05, None, 0.0)
-    assert len(made) == 0
+    assert len(made.waiting) == 0
     assert not made.is_wanted(0.05, 0.06, None)
 
 
@@ -164,11 +164,11 @@ def test_a_few_parity_frames_leave_at_once_and_the_others_when_permitted() -> No
     of = keys()
     made = sender(of, budget=CopyBudget(1.0, 1e9))
     made.handle_sent(sealed(of, 1, 250_000), 0.1, None, 0.0)
-    waiting = len(made)
+    waiting = len(made.waiting)
     assert waiting > 20
     assert [len(made.poll_frames(limit)) for limit in (0, 0, 5)] == [8, 0, 5]
     made.clear()
-    assert len(made) == 0
+    assert len(made.waiting) == 0
 
 
 def test_the_margin_grows_with_requests_and_decays() -> None:

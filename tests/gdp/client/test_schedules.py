@@ -56,7 +56,7 @@ def test_what_is_new_does_not_wait_for_a_round_trip() -> None:
 def test_a_reminder_that_waits_has_a_timer() -> None:
     schedule = HeartbeatSchedule(b"", 0)
     schedule.poll_heartbeat(PLACE, 1.0, 0.3)
-    assert schedule.get_timer() is None
+    assert schedule.get_timer() == float("inf")
     schedule.is_reminder_wanted = True
     assert schedule.get_timer() == pytest.approx(1.3)
 

@@ -166,22 +166,22 @@ def test_only_two_priorities_have_the_flag_that_switches_know() -> None:
 def test_what_the_path_holds_back_is_due_when_the_path_says_so() -> None:
     turns = scheduled(Flood([0]))
     assert turns.poll_turn(1.0) == []
-    assert not turns
-    assert turns.next_due() == 5.0
+    assert not turns.is_ready
+    assert turns.due_s == 5.0
     turns.resume()
-    assert turns
+    assert turns.is_ready
 
 
 def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:
     asked: list[Publisher] = []
     turns, publisher = SendScheduler(asked.append), read_by_one()
     publisher.published = turns.add
-    assert not turns
+    assert not turns.is_ready
     publisher.publish(b"one")
-    assert turns
+    assert turns.is_ready
     (frames,) = turns.poll_turn(101.0)
     assert decode(frames[0]).destination == Name(b"t" * 32)
-    assert not turns
+    assert not turns.is_ready
     assert turns.poll_turn(101.0) == []
     assert asked == [publisher]
 

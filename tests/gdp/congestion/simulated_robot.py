@@ -25,6 +25,7 @@ from gdp.congestion.delivery_rate import Flight
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Kind
+from gdp.intervals import NEVER_S
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from tests.gdp.client.incarnation_ids import reader_of, source_of
@@ -208,23 +209,21 @@ class SimulatedRobot:
             came_s, topic, note = self._notes.popleft()
             self._hear(topic, decode(note), note, now_s - came_s)
         for topic in self.topics:
-            due_s = topic.publisher.get_timer()
-            if due_s is not None and due_s <= now_s:
+            if topic.publisher.get_timer() <= now_s:
                 topic.publisher.handle_timer(now_s)
                 turns.add(topic.publisher)
         if self._paths.handle_timer(now_s):
             turns.resume()
-        due_s = turns.next_due()
-        frames = [frame for part in turns.poll_turn(now_s) for frame in part] if turns or (due_s is not None) else []
+        is_waiting = turns.is_ready or turns.due_s < NEVER_S
+        frames = [frame for part in turns.poll_turn(now_s) for frame in part] if is_waiting else []
         self._wakes_s = float("inf")
         self._robot_free_s = now_s + len(frames) * self._frame_s
         if frames:
             self.at(self._robot_free_s, lambda: self._transmit(frames))
             self._wake_robot(self._robot_free_s)
             return
-        times = [turns.next_due(), self._paths.get_timer(), *(each.publisher.get_timer() for each in self.topics)]
-        next_s = min((each for each in times if each is not None), default=None)
-        if next_s is not None:
+        next_s = min([turns.due_s, self._paths.due_s, *(each.publisher.get_timer() for each in self.topics)])
+        if next_s < NEVER_S:
             self._wake_robot(max(next_s, now_s + 1e-5))
 
     def _hear(self, topic: Topic, header: Header, note: bytes, waited_s: float) -> None:

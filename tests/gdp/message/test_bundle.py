@@ -49,7 +49,7 @@ def test_waiting_messages_go_together_in_order_as_far_as_they_fit() -> None:
         gathered.add(1, message)
     first, second = gathered.poll_batch(4 * 104)[0], gathered.poll_batch(4 * 104 + 50)[0]
     assert [*first, *second] == messages[:8]
-    assert len(gathered) == 2
+    assert len(gathered.messages) == 2
 
 
 def test_a_message_that_no_longer_fits_goes_alone() -> None:
@@ -64,7 +64,7 @@ def test_all_that_was_held_is_given_back() -> None:
     for size in (0, 1, 1_000):
         gathered.add(1, bytes(size))
     held_bytes = gathered.held_bytes
-    while gathered:
+    while gathered.messages:
         gathered.poll_batch(0)
     assert held_bytes > 1_001
     assert gathered.held_bytes == 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.intervals import READER
+from gdp.intervals import NEVER_S, READER
 from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MESSAGES_MAX, NACKS_PER_REPORT, REPAIRS_MAX_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.flow_control import PROBES
@@ -244,13 +244,12 @@ def test_numbers_under_way_stay_within_the_readers_replay_window() -> None:
 
 def test_probes_come_when_readers_are_silent_and_back_off() -> None:
     window = window_of(1, 10)
-    assert window.next_probe() is None
+    assert window.get_timer() == NEVER_S
     window.frames_to_send(5.0)
     times = []
     now_s = 5.0
     for _ in range(10):
-        due_s = window.next_probe()
-        assert due_s is not None
+        due_s = window.get_timer()
         assert not window.probe_due(due_s - 0.001)
         assert window.probe_due(due_s)
         times.append(due_s - now_s)
@@ -258,7 +257,7 @@ def test_probes_come_when_readers_are_silent_and_back_off() -> None:
     assert times == sorted(times)
     assert times[-1] == pytest.approx(PROBES.most_s)
     window.handle_acknack(A, has(2), now_s)
-    assert window.next_probe() is None
+    assert window.get_timer() == NEVER_S
 
 
 def test_a_reader_that_does_not_move_for_its_lease_is_slow() -> None:
@@ -298,11 +297,10 @@ def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has
     behind_s = 10.0 + lag_s / 2  # when A confirmed the third
     assert window.slow_readers(behind_s + lag_s - 0.01) == []
     due_s = window.readers.next_slow()
-    assert due_s is not None
     assert due_s == pytest.approx(behind_s + lag_s, abs=0.01)
     assert window.slow_readers(due_s) == [B]
     window.drop_reader(B)
-    assert window.readers.next_slow() is None
+    assert window.readers.next_slow() == NEVER_S
     assert window.is_acknowledged()
 
 
@@ -314,7 +312,7 @@ def test_a_reader_that_lagged_behind_a_removed_one_is_not_slow() -> None:
     window.frames_to_send(0.0)
     window.handle_acknack(A, has(2), 0.1)
     window.drop_reader(A)
-    assert window.readers.next_slow() is None
+    assert window.readers.next_slow() == NEVER_S
     assert window.slow_readers(2.0) == []
     assert window.slow_readers(READER.lease_s + 0.2) == [B]
 

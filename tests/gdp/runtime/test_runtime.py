@@ -73,3 +73,14 @@ def test_another_stop_ends_the_wait() -> None:
 def test_the_wait_ends_with_its_time() -> None:
     runtime, _ = loop(0)
     assert not runtime.linger(time.monotonic() + 0.02)
+
+
+def test_a_period_without_work_wakes_no_loop_and_its_function_is_called_once_there_is_some() -> None:
+    runtime, _ = loop(0)
+    work: list[str] = []
+    runtime.every(0.0, lambda _now: work.clear(), lambda: work)
+    assert runtime.next_due_s() is None
+    work.append("a change")
+    assert runtime.next_due_s() is not None
+    runtime.step(time.monotonic())
+    assert work == []
