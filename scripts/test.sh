@@ -13,6 +13,8 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 scripts/setup.sh --quiet --dev
 out=.ci/out
+# Clones share what Hypothesis reads in the source, by its content.
+export HYPOTHESIS_STORAGE_DIRECTORY=${HYPOTHESIS_STORAGE_DIRECTORY:-${GDP_TEST_CACHE:-$HOME/.cache/gdp-ros}/hypothesis}
 unset PYTHONDONTWRITEBYTECODE  # workers and the programs that they start share what one of them has compiled
 mkdir -p "$out"
 scratch=$(mktemp -d)

@@ -30,7 +30,7 @@ from gdp.client.delivery import NOT_BEGUN, Delivery, Ended
 from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
+from gdp.frame.codec import HOPS_AT, SECOND_PATH, Header, decode, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.intervals import NEVER_S, READER
 from gdp.limits import (
@@ -198,16 +198,20 @@ class WriterProxy:
         """Process the frames of ``arrivals[at:]`` that continue the message under way; return how many."""
         taken = self._data.add_batch(arrivals, at, now_s)
         if taken:
+            header, last = decode(arrivals[at].frame), arrivals[at + taken - 1]
+            number, part = header.number, header.part + taken - 1
             if isinstance(self._copies, StripedPaths):
                 second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
-                number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
             self.recovery.keep_run(arrivals, at, taken, now_s)
-            receipts, last = sum(seal for _, seal in burst.samples(arrivals, at, taken)), arrivals[at + taken - 1]
-            number, part = NUMBER_AND_PART.unpack_from(last.frame, NUMBER_AT)
-            self.schedule.count(taken * len(last.frame), taken, receipts, number, part, now_s - last.waited_s)
+            receipts = sum(seal for _, seal in burst.samples(arrivals, at, taken))
+            is_in_order = self._data.progress(number) > part
+            size = len(last.frame) if is_in_order else header.length
+            self.schedule.count(taken * size, taken, receipts, number, part, now_s - last.waited_s)
             if self.state is WriterProxyState.LIVE:
-                self.schedule.handle_run(now_s)
+                self.schedule.handle_run(now_s, is_in_order=is_in_order)
+                if not is_in_order and not self.delivery.is_reliable:
+                    self._late.handle_part(header, now_s, taken)
         return taken
 
     def handle_timer(self, now_s: float) -> None:

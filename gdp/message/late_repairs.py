@@ -123,8 +123,8 @@ class LateRepairs:
         """Return whether ``poll_missing`` may return something."""
         return self.due_s <= now_s + _EPSILON_S
 
-    def handle_part(self, header: Header, now_s: float) -> None:
-        """Process a new fragment, which did not complete its message."""
+    def handle_part(self, header: Header, now_s: float, count: int = 1) -> None:
+        """Process a new fragment, and those that followed it at once; they did not complete their message."""
         number, part = header.number, header.part
         entry = self.incomplete.get(number)
         if entry is None:
@@ -139,7 +139,7 @@ class LateRepairs:
             entry.gap_s, entry.gap_end = now_s, part
             self.due_s = min(self.due_s, now_s + self._delay_s())
         if part >= known_end:
-            entry.next_part = part + 1
+            entry.next_part = part + count
             entry.until_s = now_s + REPAIR_S
 
     def handle_complete(self, number: int, part: int, now_s: float) -> None:

@@ -22,9 +22,9 @@ from typing import NamedTuple, Protocol
 
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, Plaintext
-from gdp.crypto.envelope import SHARED_FLAGS, Opened, Opener, digest_of, salt_of
+from gdp.crypto.envelope import SEAL_BYTES, SHARED_FLAGS, TAG_BYTES, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
@@ -136,15 +136,16 @@ class Reassembler:
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
         """Add frames of ``arrivals[at:]`` that continue the message under way with inner fragments in order.
 
-        Almost every fragment of a large message takes this short path. The frame that ends the run is for ``add``.
+        They follow all that came, or the newest fragment behind a gap. Almost every fragment of a large message takes
+        this short path. The frame that ends the run is for ``add``.
 
         Returns:
             how many were added.
         """
         message = self._unfinished.get(self._under_way)
-        if message is None or message.early:
+        if message is None:
             return 0
-        frame, head, first = arrivals[at].frame, message.head, message.hashed
+        frame, head, first = arrivals[at].frame, message.head, message.top + 1
         if (
             frame[NUMBER_AT:PARTS_AT] != head[NUMBER_AT:PART_AT] + first.to_bytes(4, "big")
             or frame[DESTINATION_AT:BODY_AT] != head[DESTINATION_AT:]
@@ -153,21 +154,40 @@ class Reassembler:
         wanted = min(len(arrivals) - at, message.parts - 1 - first)
         if wanted <= 0:
             return 0
+        taken = (self._add_early if message.early else self._add_next)(message, wanted, arrivals, at)
+        if taken:
+            message.top += taken
+            message.touched_s = now_s
+            self.new_parts += taken
+            self.full_parts += taken
+        return taken
+
+    def _add_early(self, message: _PartialMessage, wanted: int, arrivals: Sequence[ReceivedFrame], at: int) -> int:
+        size, length, first = message.length - SEAL_BYTES, message.length, message.top + 1
+        cost = 2 * size + TAG_BYTES + _PART_OVERHEAD_BYTES
+        if self.copies is not None or not self._reserve_memory(wanted * cost):
+            return 0
+        cipher, plain = message.opener.cipher_of(message.salt), burst.PLAINTEXT(wanted * size)
+        taken = cipher.open_run(message.head, length, first, wanted, arrivals, at, None, plain)
+        self._release_memory((wanted - taken) * cost)
+        message.held_bytes += taken * cost
+        opened = plain.collect()
+        for each, arrival in enumerate(arrivals[at : at + taken]):
+            sealed = arrival.frame[BODY_AT : HEADER_BYTES + length]
+            message.early[first + each] = opened[each * size : (each + 1) * size], sealed
+        return taken
+
+    def _add_next(self, message: _PartialMessage, wanted: int, arrivals: Sequence[ReceivedFrame], at: int) -> int:
         cost = message.length + _PART_OVERHEAD_BYTES
         if message.prepaid_bytes < wanted * cost:
             if not self._reserve_memory(_PREPAID_BYTES + wanted * cost):
                 return 0
             message.held_bytes += _PREPAID_BYTES + wanted * cost
             message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
-        cipher, running = message.opener.cipher_of(message.salt), message.running
-        taken = cipher.open_run(head, message.length, first, wanted, arrivals, at, running, message.plain)
-        if taken:
-            message.hashed += taken
-            message.prepaid_bytes -= taken * cost
-            message.top = message.hashed - 1
-            message.touched_s = now_s
-            self.new_parts += taken
-            self.full_parts += taken
+        cipher, span = message.opener.cipher_of(message.salt), (message.length, message.hashed, wanted)
+        taken = cipher.open_run(message.head, *span, arrivals, at, message.running, message.plain)
+        message.hashed += taken
+        message.prepaid_bytes -= taken * cost
         return taken
 
     def add(self, header: Header, frame: bytes, now_s: float) -> ReassembledMessage | None:
@@ -215,7 +235,7 @@ class Reassembler:
         if number in self._unfinished:  # another sender stated a larger number of fragments
             self._drop(number)
             self.drops[DropReason.BAD_PARTS] += 1
-        self.highest = max(self.highest, number)
+        self.highest = number if number > self.highest else self.highest
         self.new_parts += 1
         self.window.finish(number)
         if self.copies is not None:
@@ -268,9 +288,10 @@ class Reassembler:
             self.repeats.handle_first(number, header.part, now_s)
         if signature:
             message.signature = signature
-        if in_order:
+        if in_order or header.part < header.parts - 1:
             message.head, message.length = frame[:BODY_AT], header.length
             self._under_way = number
+        if in_order:
             if not header.part:
                 message.plain = burst.PLAINTEXT(header.parts * len(plain))
                 message.before, plain = plain[: self._head_bytes], plain[self._head_bytes :]

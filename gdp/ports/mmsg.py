@@ -46,11 +46,6 @@ def send_failure(number: int) -> tuple[DropReason, bool]:
     return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
 
 
-def _take_max(slot_bytes: int) -> int:
-    """Return how many slots one call fills."""
-    return max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
-
-
 def _send_all(send: Callable[[int], int], at: int, end: int, drops: list[int]) -> int:
     """Send frames ``at`` to ``end``; ``send`` returns how many left from a place on, or minus the errno."""
     left = 0
@@ -101,7 +96,7 @@ class MmsgBatch:
         headers = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
         self._receive.argtypes, self._send.argtypes = (*headers, ctypes.c_void_p), headers
         self.slot_bytes = slot_bytes
-        self._take_max = _take_max(slot_bytes)
+        self._take_max = max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
         self.pool = bytearray(SLOTS * slot_bytes)
         self._head = bytearray(bytes(ETHER_BYTES - 2) + _ETHERTYPE)
         base = ctypes.addressof(ctypes.c_char.from_buffer(self.pool))
@@ -109,19 +104,16 @@ class MmsgBatch:
 
         self._in_vectors, self._in = (_IoVec * SLOTS)(), (_MmsgHdr * SLOTS)()
         self._out_vectors, self._out = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
+        self._own_vectors, self._own = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
+        tables = (self._in, self._in_vectors, 1), (self._out, self._out_vectors, 2), (self._own, self._own_vectors, 2)
         for slot in range(SLOTS):
             at = base + slot * slot_bytes
             self._in_vectors[slot] = _IoVec(at, slot_bytes)
-            self._out_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
+            self._out_vectors[2 * slot] = self._own_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
             self._out_vectors[2 * slot + 1] = _IoVec(at + ETHER_BYTES, 0)
-            for messages, vectors, each in (self._in, self._in_vectors, 1), (self._out, self._out_vectors, 2):
+            for messages, vectors, each in tables:
                 messages[slot].header.vectors = ctypes.addressof(vectors) + each * slot * ctypes.sizeof(_IoVec)
                 messages[slot].header.vector_count = each
-        self._own_vectors, self._own = (_IoVec * (2 * SLOTS))(), (_MmsgHdr * SLOTS)()
-        for slot in range(SLOTS):
-            self._own_vectors[2 * slot] = _IoVec(head, ETHER_BYTES)
-            self._own[slot].header.vectors = ctypes.addressof(self._own_vectors) + 2 * slot * ctypes.sizeof(_IoVec)
-            self._own[slot].header.vector_count = 2
         self._own_at = ctypes.addressof(self._own)
         self._pointers = (ctypes.c_char_p * SLOTS)()
         self._addresses = memoryview(self._pointers).cast("B").cast("L")

@@ -261,7 +261,7 @@ def _message_by(twin: int, seed: int, *, is_signed: bool) -> tuple[object, ...]:
             assert sealer.seal(number + 10 * number, 2, sealed, 600).message() == sealed.message() == prefix + body
             sealer._last_number = number
         sent = list(frames)
-        for _ in range(chance.randrange(6)):
+        for _ in range(chance.randrange(min(6, len(frames)))):
             at = chance.randrange(len(frames))
             frames[at : at + 1] = chance.choice([[], [frames[at]] * 2, [frames[at][:-1] + b"?"]])
         budget = ReassemblyQuota(total_bytes=chance.choice([6_000, 1 << 20]))

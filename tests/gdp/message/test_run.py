@@ -83,3 +83,21 @@ def test_memory_is_charged_before_a_run_is_opened() -> None:
     assert joined == []
     assert to.drops[DropReason.MEMORY_FULL] > 0
     assert budget.held_bytes <= 12_000
+
+
+@given(st.integers(0, 1 << 32), st.integers(1, 70), st.floats(0, 0.3))
+def test_parts_behind_gaps_go_the_short_way_to_the_same_state(seed: int, at_once: int, loss: float) -> None:
+    random, frames, ends = Random(seed), seal(1, LONG), (reassembler(), reassembler())
+    lost = [frame for frame in frames if random.random() < loss]
+    came = [frame for frame in frames if frame not in lost]
+    joined, short = take(ends[0], came, at_once)
+    assert add_all(ends[1], came) == joined
+    assert short >= len(came) - len(lost) - 2 - len(frames) // at_once - 2
+    states = [
+        (to.missing(1, 99, to_end=True), to.extent(1), to.progress(1), to.new_parts, to.full_parts) for to in ends
+    ]
+    assert states[0] == states[1]
+    assert ends[0].drops == ends[1].drops
+    for to in ends if lost else ():
+        assert [each.message for each in add_all(to, lost)] == [LONG]
+        assert to.unfinished_bytes == 0
