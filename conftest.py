@@ -3,7 +3,7 @@
 import os
 import sys
 
-pytest_plugins = ["tests.pool"]
+pytest_plugins = ["tests.pool", "tests.quarantine"]
 if os.environ.get("GDP_WITHOUT_EXTENSIONS") == "1":
     sys.modules["gdp_extensions"] = None  # type: ignore[assignment]
     collect_ignore = ["tests/gdp_extensions"]

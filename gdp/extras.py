@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
@@ -53,8 +54,12 @@ def install_command(extras: str) -> str:
 @cache
 def find_entry_point(group: str, name: str) -> EntryPoint | None:
     """Return an entry point whose package is there; None: none is. The answer stays the same in this process."""
-    from importlib.metadata import entry_points  # slow, and most commands need none
+    from importlib.metadata import PackageNotFoundError, distribution, entry_points  # slow; most commands need none
 
+    with suppress(PackageNotFoundError):  # our own: without a search through all packages
+        for each in distribution("gdp-ros").entry_points.select(group=group, name=name):
+            if find_spec(each.module.partition(".")[0]) is not None:
+                return each
     found = entry_points(group=group, name=name)
     return next((each for each in found if find_spec(each.module.partition(".")[0]) is not None), None)
 

@@ -10,6 +10,7 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,25 +48,17 @@ TYPES: Final = {  # topic: type, messages a second (0: one, latched)
 def scene() -> NDArray[np.uint8]:
     """Return the ground that the camera passes over: uint8 [TEXTURE, TEXTURE, 3], RGB; integers only, so exact."""
     random = np.random.default_rng(7)
-    total = np.zeros((TEXTURE, TEXTURE, 3), np.int64)
+    total = np.zeros((TEXTURE, TEXTURE, 3), np.int32)
     for cells, weight in ((8, 4), (32, 2), (128, 1)):
         patch = TEXTURE // cells
-        coarse = random.integers(0, 256, (cells, cells, 3), dtype=np.int64)
-        far_y, far_x = np.roll(coarse, -1, 0), np.roll(coarse, -1, 1)
-        far = np.roll(far_y, -1, 1)
-        across = np.arange(patch, dtype=np.int64)
-        y = across[:, None, None]
-        x = across[None, :, None]
-        for row in range(cells):
-            for column in range(cells):
-                here = row, column
-                smooth = (
-                    coarse[here] * (patch - y) * (patch - x)
-                    + far_y[here] * y * (patch - x)
-                    + far_x[here] * (patch - y) * x
-                    + far[here] * y * x
-                ) // (patch * patch)
-                total[row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] += weight * smooth
+        coarse = random.integers(0, 256, (cells, cells, 3), dtype=np.int64).astype(np.int32)
+        across = np.arange(TEXTURE, dtype=np.int32) % patch
+        y, x = across[:, None, None], across[None, :, None]
+        here, below = (each.repeat(patch, 0) for each in (coarse, np.roll(coarse, -1, 0)))
+        rows = here * (patch - y) + below * y  # between two rows of cells
+        left, right = (each.repeat(patch, 1) for each in (rows, np.roll(rows, -1, 1)))
+        smooth: NDArray[Any] = (left * (patch - x) + right * x) // (patch * patch)
+        total += weight * smooth
     ground = total // 7
     ticks = np.arange(TEXTURE) % 128 < 3  # tile joints
     ground[ticks] //= 3
@@ -82,8 +75,12 @@ class Drive:
         if ros == 1:  # the one type that rosbags does not bring
             transforms = "geometry_msgs/TransformStamped[] transforms\n"
             self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
-        self.ground = np.tile(scene(), (2, 2, 1))
         self.seq = 0
+
+    @cached_property
+    def ground(self) -> NDArray[np.uint8]:
+        """The scene, twice in each direction."""
+        return np.tile(scene(), (2, 2, 1))
 
     def make(self, type_name: str, given: Fields) -> object:
         """Return a message of a type with these fields; a number that is not given is 0."""

@@ -16,13 +16,9 @@ from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.options import Host
 from gdp.cli.output import show
-from gdp.crypto.certificates import Role
 from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, known_names, rated_rows
 from gdp.names import Name
-from gdp.nodes.delegation_store import DelegationStore
-from gdp.nodes.membership import load_member
-from gdp.session.settings import settings_of
 from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
 from gdp.terminal import echo
@@ -175,6 +171,11 @@ def _held_by(node: Path) -> NodeTopics:
     Raises:
         LocalError: the node does not exist, or its files are wrong.
     """
+    from gdp.crypto.certificates import Role
+    from gdp.nodes.delegation_store import DelegationStore
+    from gdp.nodes.membership import load_member
+    from gdp.session.settings import settings_of
+
     settings = settings_of(node)
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)
     rows = [held_row(topic) for topic in DelegationStore(settings.delegation_directory, identity)]

@@ -76,7 +76,7 @@ class AckNackSchedule:
         """
         number, data = header.number, self._data
         if header.parts == 1 and number == highest + 1 == expected and self.due_s <= now_s + REPORT_DELAY_S:
-            if self._is_owed():
+            if self._unreported_bytes >= _FIRST_BYTES and self._is_owed():
                 self.due_s = now_s
             return  # a complete message in order changes nothing else
         is_next = number == highest or (number == highest + 1 and (highest < expected or data.is_finished(highest)))
@@ -108,8 +108,6 @@ class AckNackSchedule:
         A writer's congestion window has grown by what was reported since the last loss, and must never run empty. At
         first the writer knows nothing of the path, and two frames are enough.
         """
-        if self._unreported_bytes < _FIRST_BYTES:
-            return False
         first_bytes = max(self._total_bytes // 8, _FIRST_BYTES)
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
         return self._unreported_bytes >= min(first_bytes, every_bytes)

@@ -173,8 +173,12 @@ class GoverningPaths:
     @property
     def base_rtt_s(self) -> float | None:
         """Return the round trip of the longest path while it is empty, in seconds; None: not measured."""
-        models = [path.controller.model for path in self._measured()]
-        return max([model.base_rtt_s for model in models if model.rtt_s is not None], default=None)
+        longest_s: float | None = None
+        for path in self._measured():
+            model = path.controller.model
+            if model.rtt_s is not None and (longest_s is None or model.base_rtt_s > longest_s):
+                longest_s = model.base_rtt_s
+        return longest_s
 
     def patience_s(self, now_s: float) -> float:
         """Return how long the answer of the slowest reader may take."""

@@ -125,7 +125,7 @@ class SentFrames:
         sizes: list[tuple[int, int]] = []
         for at in range(0, count, _FLIGHT_FRAMES):
             flight = frames[at : at + _FLIGHT_FRAMES]
-            sizes.append((sum(map(len, flight)), min(count - at, _FLIGHT_FRAMES)))
+            sizes.append((sum(map(len, flight)), len(flight)))
         self._count += count
         self._note_places(frames, before + 1, is_repair=is_repair)
         for name in names:

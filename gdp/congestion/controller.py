@@ -160,7 +160,8 @@ class PathController:
         for flight in flights:
             if not self.rate.remove(flight):
                 continue
-            size, frames, first_s = size + flight.size, frames + flight.frames, min(first_s, flight.sent_s)
+            size, frames = size + flight.size, frames + flight.frames
+            first_s = flight.sent_s if flight.sent_s < first_s else first_s
             if newest is None or flight.sent_s > newest.sent_s:
                 newest = flight
         if newest is None:

@@ -23,6 +23,8 @@ class State(Enum):
     COMPETITIVE = "competitive"  # another flow keeps the queue full: it follows CUBIC
     PROBE = "probe"  # it is halved, to see whether the queue empties
 
+    __hash__ = object.__hash__  # of a single object; that of Enum is one of its name, in Python
+
 
 class Signal(Enum):
     """What was measured."""
@@ -34,6 +36,8 @@ class Signal(Enum):
     PROBE_OVER = "probe over"
     PATH_SHRANK = "path shrank"  # most of what leaves is lost, round after round
     PATH_CHANGED = "path changed"
+
+    __hash__ = object.__hash__
 
 
 _S, _I = State, Signal

@@ -246,7 +246,12 @@ class Sealed(Sequence[bytes]):
 
     def __getitem__(self, at: int | slice) -> bytes | list[bytes]:
         parts = self._parts
-        end = at.indices(parts)[1] if isinstance(at, slice) else at % parts + 1 if -parts <= at < parts else parts
+        if not isinstance(at, slice):
+            end = at % parts + 1 if -parts <= at < parts else parts
+        elif at.stop is None or at.stop < 0:
+            end = at.indices(parts)[1]
+        else:
+            end = at.stop if at.stop < parts else parts
         if end > len(self._frames):
             self._seal_until(end)
         return self._frames[at]

@@ -36,7 +36,6 @@ from gdp.links.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
-from gdp.nodes.relay import relay_control_path
 from gdp.requests import Backoff
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, read_public, write_all
@@ -211,6 +210,8 @@ class Agent:
         path = self._files.directory / RELAY_FILE
         with contextlib.suppress(NotRunningError):
             config = RelayConfig.load(path)
+            from gdp.nodes.relay import relay_control_path
+
             ask_node(relay_control_path(config, load_card(config.identity / CARD).name), Command.DRAIN, RELOAD_S)
 
     def _take_mail(self, channel: Channel) -> None:

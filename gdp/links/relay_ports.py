@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gdp.errors import LocalError
 from gdp.intervals import FORGET_S
@@ -18,7 +18,9 @@ from gdp.ports.netlink import LINK_GROUP, LinkAttribute, NetlinkSocket, Notifica
 from gdp.ports.tap import relay_alias
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
-from gdp.switch.core import SwitchCore
+
+if TYPE_CHECKING:  # a relay, which knows the devices by their mark, loads no switch
+    from gdp.switch.core import SwitchCore
 
 __all__ = ["RELAY_COST", "VIA", "RelayPorts"]
 

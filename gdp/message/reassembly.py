@@ -235,7 +235,7 @@ class Reassembler:
         if number in self._unfinished:  # another sender stated a larger number of fragments
             self._drop(number)
             self.drops[DropReason.BAD_PARTS] += 1
-        self.highest = max(self.highest, number)
+        self.highest = number if number > self.highest else self.highest
         self.new_parts += 1
         self.window.finish(number)
         if self.copies is not None:

@@ -123,7 +123,7 @@ class SendWindow:
             oldest = next(iter(self.cache.messages))
             if oldest >= self.readers.least():
                 evicted.append(oldest)
-            self._release(oldest)
+            self._release([oldest])
         self.evicted += len(evicted)
         self._newest = number
         self.cache.add(number, frames, size, self._now_s if added_s is None else added_s)
@@ -163,8 +163,8 @@ class SendWindow:
         """
         self._sent_before = move.new_number(max(self._sent_before, self.sent[0]))
         ages_s = {move.new_number(number): each.added_s for number, each in self.cache.messages.items()}
-        for number in list(self.cache.messages):
-            self._release(number)
+        if self.cache.messages:
+            self._release(list(self.cache.messages))
         self._repairs.clear()
         self._late_repairs.clear()
         self._cancelled = {move.new_number(number) for number in self._cancelled}
@@ -222,10 +222,9 @@ class SendWindow:
             suspended.acked_at = min(position, self._sent_at)
             self.readers.resume(reader, now_s)
         state = self.readers.active[reader]
-        if next_number > state.next_number:
-            state.next_number = next_number
-            self.readers.refresh()
+        state.next_number = next_number if next_number > state.next_number else state.next_number
         if self.unsent:
+            self.readers.refresh()
             self._skip_unwanted()
         before = self.readers.acked_at(self._sent_at)
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
@@ -354,17 +353,24 @@ class SendWindow:
         )
 
     def _release_acknowledged(self) -> None:
+        messages, released = self.cache.messages, list[int]()
         for number in self.cache.beyond_depth(self._now_s, self.readers.least()):
-            message = self.cache.messages[number]
+            message = messages[number]
             if self.readers.active and message.begin_at + message.size > self._sent_at:
                 break
-            self._release(number)
+            released.append(number)
+        if released:
+            self._release(released)
 
-    def _release(self, number: int) -> None:
-        message = self._forget(number)
-        end_at = message.begin_at + message.size
+    def _release(self, numbers: list[int]) -> None:
+        """Remove messages, whose numbers rise; none of them is sent."""
+        end_at = 0
+        for number in numbers:
+            message = self.cache.remove(number)
+            end_at = message.begin_at + message.size
+        self._cancelled.difference_update(numbers)
         self._sent_at = end_at if end_at > self._sent_at else self._sent_at
-        while self.unsent and self.unsent[0][0] <= number:
+        while self.unsent and self.unsent[0][0] <= numbers[-1]:
             self.unsent.popleft()
 
     def _forget(self, number: int) -> CachedMessage:

@@ -24,14 +24,13 @@ _LARGE_BYTES: Final = 32 << 20  # the largest value that glibc accepts
 def tune_memory() -> None:
     """Keep the heap at the size that messages need, and exclude the objects of the start from garbage collection.
 
-    Frames and messages form no cycles, so the collector would find nothing among them. Repeated scans of all modules
-    would only delay some of them.
+    The start leaves a few dozen objects of garbage, which are not worth a search. Frames and messages form no cycles,
+    so the collector would find nothing among them. Repeated scans of all modules would only delay some of them.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:  # glibc only; other libraries need no tuning
         mallopt(_M_TRIM_THRESHOLD, _KEEP_BYTES)
         mallopt(_M_TOP_PAD, _PAD_BYTES)
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
-    gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 100)

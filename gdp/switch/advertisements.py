@@ -99,15 +99,11 @@ class AdvertisementHandler:
         if advertisement.right in HEARS:
             cache = self._state.resolver.cache
             try:
-                is_first = self._multicast.add_reader(
-                    advertisement, at, cache.of(advertisement.name, now.mono_s), now.mono_s
-                )
+                self._multicast.add_reader(advertisement, at, cache.of(advertisement.name, now.mono_s), now.mono_s)
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
             self._state.dependents.record_advertisement(advertisement, at)
-            if is_first:
-                self._state.resolver.queries.watch(advertisement.name, now.mono_s)
             for location in cache.of(advertisement.name, now.mono_s):
                 self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         # no RIB sends an AdvertiseAck to a node that has moved
@@ -201,8 +197,8 @@ class AdvertisementHandler:
         name, right = withdrawal.name, withdrawal.right
         if withdrawal.sequence <= self._sequence_of(name, neighbour):
             raise StatementError(DropReason.STALE, "a withdrawal of what was advertised again")
-        if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
-            self._state.resolver.queries.unwatch(name)
+        if right in HEARS:
+            self._multicast.remove_reader(name, (neighbour.port, neighbour.mac))
         if right is not Right.READ and self._state.attached.remove(name, neighbour.name) is not None:
             self._unicast.remove(name)
             self._rib_client.relay(statement.wire, now.mono_s)

@@ -261,8 +261,7 @@ class SwitchCore:
             self.unicast.entry_removed(key)
         for attachment in self.attached.expire(now_s):
             self.unicast.remove(attachment.advertisement.name)
-        for topic in self.multicast.handle_timer(now_s):
-            self.resolver.queries.unwatch(topic)
+        self.multicast.handle_timer(now_s)
         self.relocations.handle_timer(now_s)
         self.rib_client.send_due(now_s)
         self._revoker.sync.handle_timer(now_s)

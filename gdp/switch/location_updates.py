@@ -101,8 +101,8 @@ class LocationUpdates:
             StatementError: it is not valid.
         """
         location, now_s = self._state.evidence.from_relay(statement, now), now.mono_s
-        if location.right in HEARS and self._multicast.reader_moved(location):
-            self._state.resolver.queries.unwatch(location.name)
+        if location.right in HEARS:
+            self._multicast.reader_moved(location)
         self.acknowledge_relocation(location, now_s)
         if location.right is not Right.READ and self.is_newer(location):
             self.receive(location, statement.wire, now_s)

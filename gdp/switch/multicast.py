@@ -70,8 +70,8 @@ class MulticastTrees:
         self.drops = self._entries.drops
         self.upstream = UpstreamJoins(state, self._entries, self._joins)
 
-    def add_reader(self, advertisement: Advertisement, at: Downstream, locations: list[Location], now_s: float) -> bool:
-        """Add the verified advertisement of an attached reader; return whether it is the name's first here.
+    def add_reader(self, advertisement: Advertisement, at: Downstream, locations: list[Location], now_s: float) -> None:
+        """Add the verified advertisement of an attached reader; with the first one of a name it is watched.
 
         Raises:
             StatementError: QUOTA, the node reads too many topics.
@@ -79,14 +79,16 @@ class MulticastTrees:
         is_first = self._state.readers.put(advertisement, at, now_s)
         for location in locations:
             self.publisher_found(location, now_s)
-        return is_first
+        if is_first:
+            self._state.resolver.queries.watch(advertisement.name, now_s)
 
-    def remove_reader(self, topic: Name, at: Downstream) -> bool:
-        """Remove a reader; return whether the topic has none left here."""
+    def remove_reader(self, topic: Name, at: Downstream) -> None:
+        """Remove a reader; with the last one of a topic its watch ends."""
         is_last = self._state.readers.remove(topic, at)
         for tree in self.trees.of_topic(topic):
             self._cut(tree, at)
-        return is_last
+        if is_last:
+            self._state.resolver.queries.unwatch(topic)
 
     def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""
@@ -145,12 +147,11 @@ class MulticastTrees:
             for at in self._state.readers.of(topic):
                 self._cut(tree, at)
 
-    def reader_moved(self, location: Location) -> bool:
-        """Remove a reader that is attached elsewhere now; return whether the topic has none left here."""
+    def reader_moved(self, location: Location) -> None:
+        """Remove a reader that is attached elsewhere now."""
         for at, reader in list(self._state.readers.of(location.name).items()):
             if reader.advertisement.node == location.advertiser and reader.advertisement.sequence < location.sequence:
-                return self.remove_reader(location.name, at)
-        return False
+                self.remove_reader(location.name, at)
 
     def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
         """Handle a verified join (or, with no lease, a leave) from a downstream switch.
@@ -308,9 +309,10 @@ class MulticastTrees:
                 self.upstream.restate(tree)
         self._entries.reinstall_second()
 
-    def handle_timer(self, now_s: float) -> list[Name]:
-        """Prune and renew trees; return the topics that lost their last reader here."""
-        orphaned = [topic for topic, at in self._state.readers.expired(now_s) if self.remove_reader(topic, at)]
+    def handle_timer(self, now_s: float) -> None:
+        """Remove readers whose lease has ended; prune and renew trees."""
+        for topic, at in self._state.readers.expired(now_s):
+            self.remove_reader(topic, at)
         pairs_s = self._pairs.get_timer()
         if pairs_s is not None and pairs_s <= now_s:
             self._pairs.handle_timer(now_s)
@@ -319,7 +321,6 @@ class MulticastTrees:
             if self.trees.get(tree.topic, tree.publisher, tree.path) is tree:
                 self._tree_due(tree, now_s)
         self._joins.handle_timer(now_s)
-        return orphaned
 
     def _tree_due(self, tree: Tree, now_s: float) -> None:
         for at in [at for at, branch in tree.branches.items() if branch.expires_s <= now_s]:

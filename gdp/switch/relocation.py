@@ -27,6 +27,7 @@ from gdp.control.relayed_statement import relayed
 from gdp.frame.kinds import Kind
 from gdp.intervals import PACE_S
 from gdp.names import ZERO, Name
+from gdp.requests import Backoff, Requests
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
@@ -38,7 +39,8 @@ __all__ = ["GRACE_S", "Relocations"]
 GRACE_S: Final = 4.0  # for which the former switch handles frames for a moved node, redirects senders, and responds
 _DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
 _REMEMBERED_MAX: Final = 4_096
-_NOTICE_AT_S: Final = (0.0, 0.1, 0.4, 1.2)  # one datagram may be lost
+_NOTICES: Final = Backoff(0.1, 0.8)  # until the former switch answers; one datagram may be lost
+_NOTICE_TRIES: Final = 5
 
 _Key = tuple[Name, Name]  # name and advertiser
 
@@ -48,12 +50,6 @@ class _Notice:
     to: Name
     statement: bytes
     sequence: int
-    begun_s: float
-    sent: int = 0
-
-    @property
-    def due_s(self) -> float:
-        return self.begun_s + _NOTICE_AT_S[self.sent]
 
 
 @dataclass(slots=True)
@@ -74,6 +70,7 @@ class Relocations:
         self._multicast = multicast
         self._unicast = unicast
         self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
+        self._requests = Requests[_Key]()
         self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose responses are accepted, until when
         self._departed: OrderedDict[_Key, float] = OrderedDict()
         self._moved: OrderedDict[_Key, _Moved] = OrderedDict()
@@ -85,19 +82,18 @@ class Relocations:
         if advertisement.previous in (ZERO, self._state.me):
             return
         statement = relayed(advertisement.wire, self._state.identity, self._state.policy.transit)
-        _remember(
-            self._notices,
-            (advertisement.name, advertisement.node),
-            _Notice(advertisement.previous, statement, advertisement.sequence, now_s),
-        )
+        key = advertisement.name, advertisement.node
+        _remember(self._notices, key, _Notice(advertisement.previous, statement, advertisement.sequence))
+        self._requests.start(key, now_s)
         _remember(self._former, advertisement.previous, now_s + GRACE_S)
         self.handle_timer(now_s)
 
     def acknowledged(self, name: Name, advertiser: Name, sequence: int) -> None:
         """Record that the former switch has the advertisement with this ``sequence``."""
-        notice = self._notices.get((name, advertiser))
+        key = name, advertiser
+        notice = self._notices.get(key)
         if notice is not None and sequence >= notice.sequence:
-            del self._notices[name, advertiser]
+            self._forget(key)
 
     def departed(self, advertisement: Advertisement, now_s: float) -> None:
         """Record that a node is not attached here any more."""
@@ -151,17 +147,21 @@ class Relocations:
 
     def handle_timer(self, now_s: float) -> None:
         """Send the notices that are due."""
-        for key, notice in list(self._notices.items()):
-            if notice.due_s > now_s:
-                continue
-            self._unicast.send_statement(Kind.RELOCATE, notice.statement, notice.to, now_s)
-            notice.sent += 1
-            if notice.sent == len(_NOTICE_AT_S):
-                del self._notices[key]
+        for key in self._requests.poll_due(now_s):
+            notice = self._notices.get(key)  # None: too many were newer
+            if notice is not None and self._requests.tries(key) < _NOTICE_TRIES:
+                self._unicast.send_statement(Kind.RELOCATE, notice.statement, notice.to, now_s)
+                self._requests.sent(key, now_s, _NOTICES)
+            else:
+                self._forget(key)
+
+    def _forget(self, key: _Key) -> None:
+        self._notices.pop(key, None)
+        self._requests.cancel(key)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next notice, or None."""
-        return min((notice.due_s for notice in self._notices.values()), default=None)
+        return self._requests.next_due()
 
     def _redirect(self, neighbour: Neighbour, name: Name, statement: bytes, now_s: float) -> None:
         if self._may_say(name, neighbour, now_s):

@@ -148,30 +148,26 @@ class RevocationHandler:
         """Close what carries the revoked certificate; topics that lose all readers here are no longer watched."""
         issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
         self._state.policy.audit.record(Action.REVOKED, "certificate", who=issuer, about=about)
-        orphaned: list[Name] = []
         for holder in self._state.dependents.resting_on(revocation.fingerprint):
             if isinstance(holder, AttachedAdvertisement):
-                orphaned += self._close_advertisement(holder, now)
+                self._close_advertisement(holder, now)
             elif isinstance(holder, KnownLocation):
                 self._close_place(holder, now)
             else:
                 self._doubt(holder, now)
         self._hello_protocol.recheck(revocation.fingerprint, now)
-        for topic in orphaned:
-            self._state.resolver.queries.unwatch(topic)
 
-    def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> list[Name]:
+    def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> None:
         attachment = self._state.attached.get(holder.name, holder.node)
         if attachment is not None and not self._state.evidence.still_holds(attachment.advertisement, now):
             self._state.attached.remove(holder.name, holder.node)
             self._unicast.remove(holder.name)
         advertisement = self._state.readers.advertisement_of(holder.name, holder.at)
         if advertisement is None or self._state.evidence.still_holds(advertisement, now):
-            return []
-        is_last = self._multicast.remove_reader(holder.name, holder.at)
+            return
+        self._multicast.remove_reader(holder.name, holder.at)
         for tree in self._state.trees.of_topic(holder.name):
             self._doubt(JoinedBranch(tree.topic, tree.publisher, holder.at), now)
-        return [holder.name] if is_last else []
 
     def _close_place(self, holder: KnownLocation, now: Timestamps) -> None:
         place = self._state.resolver.cache.get(holder.name, holder.advertiser)

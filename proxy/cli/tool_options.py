@@ -18,7 +18,6 @@ import typer
 from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
 from gdp.errors import GdpError
-from gdp.links.uplink import wait_for_device
 from gdp.terminal import echo, for_stdout
 from gdp.trust.right import Right
 from proxy.cli.node_options import Delegations, Iface
@@ -88,6 +87,7 @@ class ToolOptions(NamedTuple):
         Raises:
             LocalError: there is no such node or device, or the node lacks the right.
         """
+        from gdp.links.uplink import wait_for_device
         from proxy.node.tool_member import find_access
 
         access = find_access(node, self.iface, self.delegations, wanted)

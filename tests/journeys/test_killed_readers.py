@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from gdp.intervals import FORGET_S
+from gdp.intervals import ADVERTISEMENT, FORGET_S
 from gdp.intervals import READER as REPORTS
 from gdp.message.loss import LossReason
 from lab.simulation import Simulation
@@ -110,3 +110,18 @@ def test_a_reader_that_is_killed_again_and_again_reports_each_message_once() -> 
     assert got == sorted(set(got))
     assert sorted({*got, *lost}) == list(range(flow.publisher.messages))
     assert len(got) + len(lost) <= flow.publisher.messages + 4  # the last one of a life may not be confirmed
+
+
+@pytest.mark.parametrize("readers", [(READER,), (READER, OTHER)])
+def test_a_switch_stops_watching_the_topics_of_a_reader_that_died_unless_another_reads_them(
+    readers: tuple[str, ...],
+) -> None:
+    world = Simulation(topology=chain(2))
+    world.add_member(OTHER, "s2")
+    assert world.run_until_attached()
+    flow = flowing(world, source=SOURCE, readers=readers)
+    queries = world.switches["s2"].resolver.queries
+    assert flow.topic.name in queries
+    world.network.stop(READER)
+    world.network.run(4 * ADVERTISEMENT.lease_s)
+    assert (flow.topic.name in queries) is (OTHER in readers)

@@ -26,6 +26,7 @@ TUNNELS = {"gdp.links.tunnels", "gdp.ports.tunnel.wireguard"}
         ),
         ("gdp.cli.rib, gdp.nodes.rib", {"numpy", "gdp.client.participant", "gdp.diagnosis.facts", "gdp.switch.core"}),
         ("proxy.cli.proxy, proxy.node.bridge_node", {"numpy", "gdp.rib", "gdp.diagnosis.facts", "gdp.switch.core"}),
+        ("gdp.cli.relay, gdp.nodes.relay", {"numpy", "gdp.client", "gdp.rib", "gdp.switch.core"}),
         ("fog.host.cli", set[str]()),
     ],
 )
@@ -43,6 +44,7 @@ def test_a_node_starts_without_large_libraries_and_parts_of_other_nodes(modules:
         ("gdp.cli.gdp", ["show", "links"]),
         ("gdp.cli.gdp", ["name", "--kind", "topic", "--name", "/scan"]),
         ("gdp.cli.gdp", ["status", "--help"]),
+        ("gdp.cli.gdp", ["topic", "list"]),
         ("gdp.cli.switch", ["--help"]),
         ("gdp.cli.rib", ["--help"]),
         ("gdp.cli.relay", ["--help"]),
