@@ -18,6 +18,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import Pool
 from pathlib import Path
 from typing import IO, Final
 
@@ -181,7 +182,9 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, help="file for each frame of --seed")
     options = parser.parse_args()
     if options.save:
-        found = {str(seed): (trace.frames, trace.digest) for seed in range(COUNT) for trace in [record(seed)]}
+        with Pool() as pool:
+            traces = pool.map(record, range(COUNT), chunksize=1)
+        found = {str(seed): (trace.frames, trace.digest) for seed, trace in enumerate(traces)}
         lines = ",\n".join(f"{json.dumps(seed)}: {json.dumps(each)}" for seed, each in found.items())
         TRACES.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
         return
