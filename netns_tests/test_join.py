@@ -69,6 +69,11 @@ def devices(directory: Path) -> set[object]:
     return {each["device"] for each in links(directory)}
 
 
+def is_found(name: str, node: Path) -> bool:
+    """Return whether a node reaches the member that advertises a name, which it does a moment after its tunnel."""
+    return not subprocess.run([*GDP, "trace", name, "--node", str(node)], capture_output=True, check=False).returncode
+
+
 def switch_name(directory: Path) -> str:
     """Return the name of a machine's switch."""
     return load_card(directory / "switch" / CARD).name.to_text()
@@ -98,7 +103,9 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
             stack.enter_context(running(host, tmp_path, *join, answer=token))
         until(lambda: up(lab) == {"robot", "arm"}, said, PATIENCE_S)
         until(lambda: "border" in up(tmp_path / "robot"), said, PATIENCE_S)
-        until(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), said, PATIENCE_S)
+        logs = [tmp_path / f"{each.label}.log" for each in (robot, arm)]
+        until(lambda: all("tunnels are up: border" in each.read_text() for each in logs), said, PATIENCE_S)
+        until(lambda: is_found(switch_name(tmp_path / "arm"), tmp_path / "robot" / "switch"), said, PATIENCE_S)
         rows = {
             each["label"]: each for each in json.loads(gdp("domain", "ls", "lab", "--directory", str(lab), "--json"))
         }
