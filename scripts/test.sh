@@ -47,12 +47,12 @@ case "${1:-}" in
         exit
         ;;
 esac
-# The checks compute and many tests wait, so they share the cores; so do the workers, of which there are two more than cores.
+# The checks compute and many tests wait, so they share the cores; so do the workers, of which there is one more than cores.
 scripts/check.sh >"$scratch/check.log" 2>&1 &
 checks=$!
 trap 'kill "$checks" 2>/dev/null || true; exit 130' INT TERM
 ended=0 status=0
-run -n "$(($(nproc) + 2))" "${selected[@]}" "${judged[@]}" --seconds "$out/seconds.json" --durations 25 --junit-xml "$out/tests.xml" "$@" ||
+run -n "$(($(nproc) + 1))" "${selected[@]}" "${judged[@]}" --seconds "$out/seconds.json" --durations 25 --junit-xml "$out/tests.xml" "$@" ||
     ended=$?
 wait "$checks" || status=1
 cat "$scratch/check.log"
