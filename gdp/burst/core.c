@@ -21,6 +21,18 @@ PyObject *failure(const char *what)
     return NULL;
 }
 
+void *allocate(PyTypeObject *type, Py_ssize_t items)
+{
+    return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, items);
+}
+
+void free_object(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
 static PyModuleDef definition = {
     PyModuleDef_HEAD_INIT,
     .m_name = "gdp.burst.core",

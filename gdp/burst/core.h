@@ -48,6 +48,9 @@ void release_frames(Frame *frames, Py_ssize_t count);
 PyObject *refusal(const char *why); /* a ValueError */
 PyObject *failure(const char *what); /* of OpenSSL */
 
+void *allocate(PyTypeObject *type, Py_ssize_t items); /* a new object */
+void free_object(PyObject *self);                     /* what a deallocator ends with */
+
 /* Add their types and functions to the module; return 0 and an exception if that fails. */
 int add_messages(PyObject *module);
 int add_frames(PyObject *module);

@@ -40,7 +40,6 @@ static PyObject *read_slot(const char *slot, Py_ssize_t size, PyObject *port, Py
         Py_XDECREF(*mac);
         *mac = PyBytes_FromStringAndSize(slot + MAC, MAC);
     }
-    allocfunc allocate = (allocfunc)PyType_GetSlot(received_frame, Py_tp_alloc);
     PyObject *arrival = allocate(received_frame, 4);
     if (arrival != NULL && put_item(arrival, 0, same(port)) && put_item(arrival, 1, same(*mac)) &&
         put_item(arrival, FRAME, PyBytes_FromStringAndSize(slot + ETHER, size)) && put_item(arrival, 3, same(waited_s)))
@@ -65,13 +64,11 @@ static const char *slot_of(const Arrivals *self, Py_ssize_t at)
 
 static void arrivals_free(Arrivals *self)
 {
-    PyTypeObject *type = Py_TYPE(self);
     Py_XDECREF(self->pool);
     Py_XDECREF(self->port);
     Py_XDECREF(self->waited_s);
     Py_XDECREF(self->mac);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    free_object((PyObject *)self);
 }
 
 static Py_ssize_t arrivals_length(Arrivals *self)
@@ -164,7 +161,7 @@ static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keyw
         return NULL;
     if (slot_bytes < ETHER || slot_bytes > ETHER + FRAME_MAX || slots < 1 || slots > AT_ONCE)
         return refusal("slots for frames, of one system call");
-    Receiver *self = (Receiver *)((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
+    Receiver *self = allocate(type, 0);
     if (self == NULL)
         return NULL;
     self->slot_bytes = slot_bytes;
@@ -174,10 +171,8 @@ static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keyw
 
 static void receiver_free(Receiver *self)
 {
-    PyTypeObject *type = Py_TYPE(self);
     Py_XDECREF(self->pool);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    free_object((PyObject *)self);
 }
 
 /* Returns for how many seconds the frame that was read last had waited, as sockets.waited_s. */
@@ -202,7 +197,7 @@ static PyObject *receiver_receive(Receiver *self, PyObject *args)
         Py_XDECREF(self->pool);
         self->pool = PyByteArray_FromStringAndSize(NULL, self->slots * self->slot_bytes);
     }
-    Arrivals *arrivals = (Arrivals *)((allocfunc)PyType_GetSlot(arrivals_type, Py_tp_alloc))(arrivals_type, 0);
+    Arrivals *arrivals = allocate(arrivals_type, 0);
     if (self->pool == NULL || arrivals == NULL) {
         Py_XDECREF(arrivals);
         return NULL;

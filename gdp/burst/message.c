@@ -50,18 +50,6 @@ static uint32_t number_at(const uint8_t *from)
     return (uint32_t)from[0] << 24 | (uint32_t)from[1] << 16 | (uint32_t)from[2] << 8 | from[3];
 }
 
-static void free_object(PyObject *self)
-{
-    PyTypeObject *type = Py_TYPE(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
-
-static void *allocate(PyTypeObject *type)
-{
-    return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
-}
-
 /* ---- the hash that a signature covers ---- */
 
 static PyObject *digest_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
@@ -71,7 +59,7 @@ static PyObject *digest_new(PyTypeObject *type, PyObject *args, PyObject *keywor
     (void)keywords;
     if (!PyArg_ParseTuple(args, "y#:RunningDigest", &first, &size))
         return NULL;
-    RunningDigest *self = allocate(type);
+    RunningDigest *self = allocate(type, 0);
     if (self == NULL)
         return NULL;
     self->context = EVP_MD_CTX_new();
@@ -129,7 +117,7 @@ static PyObject *plaintext_new(PyTypeObject *type, PyObject *args, PyObject *key
     (void)keywords;
     if (!PyArg_ParseTuple(args, "n:Plaintext", &expected))
         return NULL;
-    Plaintext *self = allocate(type);
+    Plaintext *self = allocate(type, 0);
     if (self != NULL)
         self->expected = expected;
     return (PyObject *)self;
@@ -228,7 +216,7 @@ static int set_tag(MessageCipher *self, const uint8_t *tag)
     return EVP_CIPHER_CTX_set_params(self->context, given);
 }
 
-/* Encrypts ``length`` bytes to where the ciphertext of a part goes on; returns 0 if OpenSSL fails. */
+/* Encrypts ``length`` bytes to where the ciphertext of a part continues; returns 0 if OpenSSL fails. */
 static int encrypt(MessageCipher *self, uint8_t **body, const uint8_t *plain, Py_ssize_t length)
 {
     int written = 0;
@@ -447,7 +435,7 @@ static PyObject *cipher_new(PyTypeObject *type, PyObject *args, PyObject *keywor
         return NULL;
     if (size != KEY)
         return refusal("a key has 32 bytes");
-    MessageCipher *self = allocate(type);
+    MessageCipher *self = allocate(type, 0);
     if (self == NULL)
         return NULL;
     memcpy(self->key, key, KEY);
