@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
-__all__ = ["BROADCAST", "OutgoingFrames", "ProtocolCore", "ReceivedFrame", "Timestamps"]
+__all__ = ["BROADCAST", "OutgoingFrames", "ProtocolCore", "ReceivedFrame", "Timestamps", "new_tuple"]
 
 BROADCAST: Final = b"\xff" * 6
+new_tuple: Final = tuple.__new__  # of a named tuple: one call, where its constructor is two and ``_make`` three
 
 
 class Timestamps(NamedTuple):

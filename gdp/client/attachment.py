@@ -40,7 +40,7 @@ from gdp.intervals import SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff, Requests
-from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps, new_tuple
 from gdp.trust.advertisement import MS, UnverifiedAdvertisement
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
@@ -59,7 +59,6 @@ _IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT: Final = SoftState(1_800, periods=4)  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
 _Key: TypeAlias = tuple[Name, Right]
-_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 
 
 @dataclass(slots=True, kw_only=True)
@@ -220,7 +219,7 @@ class Attachment:
     def send(self, frames: list[bytes]) -> None:
         """Send frames to the switch; without one they are counted as lost."""
         if self.switch is not None:
-            self.outgoing.append(_tuple(OutgoingFrames, (self.switch.port, self.switch.mac, frames)))
+            self.outgoing.append(new_tuple(OutgoingFrames, (self.switch.port, self.switch.mac, frames)))
         else:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 

@@ -26,11 +26,11 @@ from gdp.message.reassembly import ReassembledMessage, Reassembler
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.renumbering import Renumbering
 from gdp.names import Name
+from gdp.sansio import new_tuple
 
 __all__ = ["NOT_BEGUN", "Delivered", "Delivery", "Ended"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
-_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 _OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
 
 
@@ -329,7 +329,7 @@ class Delivery:
         publisher, incarnation = self._publisher, self._incarnation
         for place, message in enumerate(messages):
             delivered = publisher, incarnation, number, message, parts, hops, place, sequence + place
-            self.ready.append(_tuple(Delivered, delivered))
+            self.ready.append(new_tuple(Delivered, delivered))
 
     @property
     def _gap_reason(self) -> LossReason:

@@ -27,7 +27,7 @@ from gdp.intervals import SERVER
 from gdp.message.loss import Losses, LossReason, LostRange
 from gdp.message.reassembly import VerifiesDigest
 from gdp.names import Name
-from gdp.sansio import Timestamps
+from gdp.sansio import Timestamps, new_tuple
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.delegation import Delegation
 from gdp.trust.lru import Lru
@@ -36,7 +36,6 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
 
-_tuple: Final = tuple.__new__  # one call, where the constructor of a named tuple is two
 ENDED_MAX: Final = 4_096  # closed writer proxies whose end is remembered
 ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may return
 
@@ -137,11 +136,11 @@ class Subscription:
         topic, description = writer_proxy.topic, writer_proxy.description
         if writer_proxy.delivery.ready:
             for each in writer_proxy.delivery.poll():
-                messages.append(_tuple(Message, (topic, each, description, False)))
+                messages.append(new_tuple(Message, (topic, each, description, False)))
         private = self.private.get(source) if self.private else None
         if private is not None and private.delivery.ready and writer_proxy.state is WriterProxyState.LIVE:
             for each in private.delivery.poll():
-                messages.append(_tuple(Message, (topic, each, description, True)))
+                messages.append(new_tuple(Message, (topic, each, description, True)))
         return messages
 
 

@@ -17,6 +17,7 @@ from gdp.errors import DropReason, FrameError
 from gdp.frame.kinds import ETHERTYPE, VERSION
 from gdp.limits import PARTS_MAX
 from gdp.names import NAME_BYTES
+from gdp.sansio import new_tuple
 
 __all__ = [
     "DESTINATION_AT",
@@ -62,7 +63,6 @@ HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
 SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 
 NUMBER_AND_PART: Final = struct.Struct("!QI")  # at ``NUMBER_AT``
-_tuple: Final = tuple.__new__  # one call, where ``Header._make`` is three
 _HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
 _BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
@@ -110,7 +110,7 @@ def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
         raise FrameError(DropReason.TRUNCATED, "header")
     if frame[at] != VERSION:
         raise FrameError(DropReason.BAD_VERSION, str(frame[at]))
-    header = _tuple(Header, _BEHIND_VERSION.unpack_from(frame, at))
+    header = new_tuple(Header, _BEHIND_VERSION.unpack_from(frame, at))
     _, _, _, _, length, _, part, parts, _, _, _ = header
     if size - HEADER_BYTES < length:
         raise FrameError(DropReason.TRUNCATED, "payload")
