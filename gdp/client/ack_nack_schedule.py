@@ -5,6 +5,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from gdp.frame.codec import Header
@@ -47,18 +48,21 @@ class AckNackSchedule:
         self._has_come = False  # something has, since the report before
         self._requests = 1  # of what is missing, with the next one, while nothing came
 
-    def count(self, size: int, frames: int, receipts: int, number: int, part: int, came_s: float) -> None:
+    def count(
+        self, size: int, frames: int, samples: Sequence[tuple[int, int]], number: int, part: int, came_s: float
+    ) -> None:
         """Count received bytes that no report confirms yet.
 
         Args:
             frames: count of those that came; none of what parity has restored.
-            receipts: sum of the samples among them.
+            samples: place and seal of each sample among them.
             number: of the newest one's message; unless a later one came before, because it is a repair.
         """
         self._unreported_bytes += size
         self._total_bytes += size
         self.received += frames
-        self.receipts += receipts
+        if samples:
+            self.receipts += sum([seal for _, seal in samples])
         if (number, part) > self.newest[:2]:
             self.newest = number, part, came_s
 

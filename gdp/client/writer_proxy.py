@@ -204,10 +204,10 @@ class WriterProxy:
                 second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
             self.recovery.keep_run(arrivals, at, taken, now_s)
-            receipts = sum(seal for _, seal in burst.samples(arrivals, at, taken))
+            samples = burst.samples(arrivals, at, taken)
             is_in_order = self._data.progress(number) > part
             size = len(last.frame) if is_in_order else header.length
-            self.schedule.count(taken * size, taken, receipts, number, part, now_s - last.waited_s)
+            self.schedule.count(taken * size, taken, samples, number, part, now_s - last.waited_s)
             if self.state is WriterProxyState.LIVE:
                 self.schedule.handle_run(now_s, is_in_order=is_in_order)
                 if not is_in_order and not self.delivery.is_reliable:
@@ -263,9 +263,7 @@ class WriterProxy:
         schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
         expected = self.delivery.expected
         part, sequence = self._data.progress(expected), self.delivery.sequence
-        share = 0
-        if self._copies is not None and isinstance(self._copies, StripedPaths):
-            share = self._copies.poll_share()
+        share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
         newest, newest_part, came_s = schedule.newest
         acknack = AckNack(
             AckNackFlag.NONE, expected, part, missing or late, sequence, self.losses.total, share,
@@ -322,7 +320,7 @@ class WriterProxy:
                 reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
         striped, is_done = None, False
-        if self._copies is not None and isinstance(self._copies, StripedPaths):
+        if isinstance(self._copies, StripedPaths):
             striped, is_done = self._copies, reassembler.window.is_finished(header.number)
         is_whole = header.parts == 1
         seen, highest = reassembler.new_parts, reassembler.highest
@@ -338,8 +336,7 @@ class WriterProxy:
             self.recovery.recovered += is_restored
             came = 1 - is_restored
             samples = burst.samples((frame,), 0, came)
-            receipts = sum([seal for _, seal in samples]) if samples else 0
-            self.schedule.count(header.length, came, receipts, header.number, header.part, came_s)
+            self.schedule.count(header.length, came, samples, header.number, header.part, came_s)
             if reassembled is None:
                 self.recovery.keep(header, frame, now_s)
             if self.state is WriterProxyState.LIVE:

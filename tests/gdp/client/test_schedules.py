@@ -69,7 +69,7 @@ def test_what_stays_missing_while_nothing_comes_is_requested_ever_less_often() -
         waits.append((schedule.due_s - now_s) / REPORT_DELAY_S)
         now_s = schedule.due_s
     assert waits == pytest.approx([2, 4, 8, 16, 16, 16, 16])
-    schedule.count(100, 1, 0, 1, 0, now_s)
+    schedule.count(100, 1, (), 1, 0, now_s)
     schedule.start_report()
     schedule.handle_reported(now_s, is_missing=True)
     assert schedule.due_s - now_s == pytest.approx(REPORT_DELAY_S)
