@@ -15,7 +15,7 @@ from typing import Protocol
 from gdp.intervals import NEVER_S, UPKEEP_S
 from gdp.ports.plane import HasFileno
 from gdp.runtime.memory_tuning import tune_memory
-from gdp.runtime.runtime import now
+from gdp.runtime.runtime import Periodic, now
 from gdp.runtime.signals import handled_signals
 from gdp.sansio import Timestamps
 
@@ -29,23 +29,14 @@ class Timed(Protocol):
         """Do what is due at a monotonic second; return the second of the next call."""
 
 
-class _Periodic:
-    """Function that is called once in a period, however often the timers are."""
-
-    def __init__(self, period_s: float, function: Callable[[Timestamps], None], has_work: Callable[[], object]) -> None:
-        self._period_s = period_s
-        self._function = function
-        self._has_work = has_work
-        self._due_s = float("-inf")
+class _TimedPeriodic(Periodic):
+    """Function that the loop calls once in a period, however often the timers are."""
 
     def handle_timer(self, now_s: float) -> float:
         """Call the function if it is due; return the second of the next call."""
-        if not self._has_work():
-            return NEVER_S
-        if now_s >= self._due_s:
-            self._due_s = now_s + self._period_s
-            self._function(now())
-        return self._due_s
+        if now_s >= self.due_s:
+            self.handle(now())
+        return NEVER_S if self.next_s is None else self.next_s
 
 
 class RelayLoop:
@@ -93,7 +84,7 @@ class RelayLoop:
         self, period_s: float, function: Callable[[Timestamps], None], has_work: Callable[[], object] = lambda: True
     ) -> None:
         """Call a function each ``period_s``, the first time at once; not while it has no work."""
-        self.add_timed(_Periodic(period_s, function, has_work))
+        self.add_timed(_TimedPeriodic(period_s, function, has_work))
 
     def remove_timed(self, part: Timed) -> None:
         """Call a part's timers no more."""

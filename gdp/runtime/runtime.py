@@ -22,7 +22,7 @@ from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.signals import handled_signals
 from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps
 
-__all__ = ["DRAIN_MAX_S", "Runtime", "now"]
+__all__ = ["DRAIN_MAX_S", "Periodic", "Runtime", "now"]
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,9 @@ def now() -> Timestamps:
 
 
 @dataclass(slots=True)
-class _Periodic:
+class Periodic:
+    """Function that a loop calls once in a period, and not while it has no work."""
+
     period_s: float
     call: Callable[[Timestamps], None]
     has_work: Callable[[], object]
@@ -46,6 +48,12 @@ class _Periodic:
     def next_s(self) -> float | None:
         """Return when it is due; None: it waits for work, which a step of the loop brings."""
         return self.due_s if self.has_work() else None
+
+    def handle(self, moment: Timestamps) -> None:
+        """Call the function if it is due."""
+        if moment.mono_s >= self.due_s and self.has_work():
+            self.due_s = moment.mono_s + self.period_s
+            self.call(moment)
 
 
 class Runtime:
@@ -67,7 +75,7 @@ class Runtime:
         self._is_woken = False  # by a watched source: the driver has work
         self._streak = 0  # consecutive steps with frames and without a check of the timers
         self._deadline_s: float | None = None
-        self._periodic: list[_Periodic] = []
+        self._periodic: list[Periodic] = []
         self._after_receive: list[Callable[[], None]] = []
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
@@ -163,7 +171,7 @@ class Runtime:
         Args:
             has_work: its answer changes within a step of the loop alone, or the loop is woken otherwise.
         """
-        self._periodic.append(_Periodic(period_s, function, has_work))
+        self._periodic.append(Periodic(period_s, function, has_work))
 
     def after_receive(self, function: Callable[[], None]) -> None:
         """Call ``function`` each time that the core has handled frames; it must be cheap."""
@@ -198,9 +206,7 @@ class Runtime:
             self._machine.handle_timer(moment)
             self._deadline_s = self._machine.get_timer()
         for each in self._periodic:
-            if moment.mono_s >= each.due_s and each.has_work():
-                each.due_s = moment.mono_s + each.period_s
-                each.call(moment)
+            each.handle(moment)
 
     def _end_when_drained(self) -> None:
         if self._drain_until_s is None:
