@@ -152,6 +152,7 @@ class MulticastTrees:
         for at, reader in list(self._state.readers.of(location.name).items()):
             if reader.advertisement.node == location.advertiser and reader.advertisement.sequence < location.sequence:
                 self.remove_reader(location.name, at)
+                return
 
     def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
         """Handle a verified join (or, with no lease, a leave) from a downstream switch.
