@@ -114,9 +114,8 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
             raise FailedError(f"{row.what}: no steady flow before any event")
-        overlay.watch(
-            options.settle_s, is_strict=True
-        )  # path computation waits longer in a network that has just started (RFC 8405)
+        # path computation waits longer in a network that has just started (RFC 8405)
+        overlay.watch(options.settle_s, is_strict=True)
         for at in range(rounds):
             _once(overlay, flow, row, at, found, options)
         books = overlay.books

@@ -154,8 +154,7 @@ class Overlay:
                 self.kill(rib)
                 self.restart(rib)
         elif self.store is not None and targets[0] == STORE:
-            is_kill, is_primary = kind is not FaultKind.FREEZE_PRIMARY, kind is not FaultKind.KILL_REPLICA
-            progress(f"           {self.store.take(fault, is_kill=is_kill, is_primary=is_primary)}")
+            progress(f"           {self.store.take(fault)}")
         for link in links_of(fault):
             self.spaces.cut(*link)
 

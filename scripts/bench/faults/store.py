@@ -81,11 +81,12 @@ class StoreCluster:
         """Return the keys of a RIB's file that make it use the cluster."""
         return dict(self._config)
 
-    def take(self, fault: Fault, *, is_kill: bool, is_primary: bool) -> str:
+    def take(self, fault: Fault) -> str:
         """Kill or stop a replica, or a primary that has a replica in step; return which."""
+        is_primary, stops = fault.kind is not FaultKind.KILL_REPLICA, fault.kind is FaultKind.FREEZE_PRIMARY
         fit = until(lambda: self._fit(is_primary=is_primary), lambda: "a whole store after a fault", _WHOLE_S)
         server = self._away[fault] = fit[round(fault.amount) % len(fit)]
-        os.kill(self._pid(server), signal.SIGKILL if is_kill else signal.SIGSTOP)
+        os.kill(self._pid(server), signal.SIGSTOP if stops else signal.SIGKILL)
         return f"server {server}"
 
     def give_back(self, fault: Fault) -> None:
