@@ -10,6 +10,8 @@ import pytest
 from gdp.cli.gdp import app
 from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.version import versioned
+from gdp.crypto.certificates import Role
+from gdp.management.running_nodes import _ROLES
 
 _IMPORTED = """
 import sys
@@ -52,3 +54,7 @@ def test_lazy_commands_are_a_mapping_in_the_order_of_the_help() -> None:
             commands[missing]
         with pytest.raises(KeyError):
             del commands[missing]
+
+
+def test_the_roles_of_running_nodes_are_those_of_memberships() -> None:
+    assert {each.value for each in Role} == _ROLES
