@@ -128,6 +128,22 @@ class Master:
             self._proxy("close")()
             raise MasterError(str(error)[:_REASON_MAX] or type(error).__name__) from error
 
+    def subscribed_type(self, node: str, topic: str) -> str:
+        """Return the type that a node reads a topic as, ``*`` for any; "" if it does not say.
+
+        The master knows one type of a topic, and keeps that when its publisher is gone. Source: ROS wiki, Slave API.
+        """
+        try:
+            (uri,) = self.call_batch(("lookupNode", node))
+            slave = Master(str(uri), self._node)
+            try:
+                (named,) = slave.call_batch(("getSubscriptions",))
+            finally:
+                slave.close()
+            return dict(_pairs(named)).get(topic, "")
+        except (MasterError, OSError):  # OSError: an address of another protocol
+            return ""
+
     def close(self) -> None:
         """Close the connection; the next request opens another."""
         self._proxy("close")()

@@ -228,13 +228,25 @@ class Node:
             if get_service_manager().get_service(subject.name) is not None:
                 return f"{subject.name} is served by this proxy already"
             return ""
-        for end in look.ends if look is not None else ():
-            if end.name == subject.topic and end.role != "serves" and end.type_name != subject.known.name:
+        for end in sorted(look.ends) if look is not None else ():
+            if end.name == subject.topic and self._is_other_type(end, subject.known.name):
                 return f"{subject.topic} is a {end.type_name} here ({end.node}), not a {subject.known.name}"
         ours = get_topic_manager().get_publisher_impl(subject.topic)
         if ours is not None and ours.data_class._md5sum != subject.known.md5:
             return f"{subject.topic} is published by this proxy as {ours.type} with another definition"
         return ""
+
+    def _is_other_type(self, end: LocalEnd, type_name: str) -> bool:
+        """Return whether a publisher or subscriber contradicts a type: tools that read any type do not."""
+        if end.role == "serves" or end.type_name == type_name:
+            return False
+        if end.role == "publishes":
+            return True
+        master = Master(self._master, self._id)
+        try:
+            return master.subscribed_type(end.node, end.name) not in {"*", type_name}
+        finally:
+            master.close()
 
     # the watch
 

@@ -240,6 +240,25 @@ def test_a_topic_of_another_local_type_is_a_fault_until_that_is_gone(net: Net, e
     assert listener.line().split()[0] == f"/{NODE}"
 
 
+def test_a_reader_of_any_type_is_no_contradiction_though_the_master_keeps_the_type_of_a_publisher_that_left(
+    net: Net, ear: Ear
+) -> None:
+    talker = net.peer(TALKER.format(node="talker", topic="/kept", latch=False))
+    strict = net.peer(
+        "from std_msgs.msg import String\n" + LISTENER.format(node="strict", topic="/kept", type="String")
+    )
+    listener = net.peer(LISTENER.format(node="listener", topic="/kept", type="AnyMsg"))
+    ear.until(lambda: {"/talker", "/strict", "/listener"} <= {entity.node for entity in ear.endpoint.graph()})
+    handle = ear.endpoint.advertise(Channel("/kept", "std_msgs/msg/Empty", 1, hash="d41d8cd98f00b204e9800998ecf8427e"))
+    assert "/talker" in ear.wait(EndpointError, 1, handle)[0].reason
+    talker.end()
+    assert "/strict" in ear.wait(EndpointError, 2, handle)[1].reason
+    strict.end()
+    ear.until(lambda: ear.endpoint.subscribers(handle) == 1)
+    ear.endpoint.publish(handle, b"")
+    assert listener.line().split()[0] == f"/{NODE}"
+
+
 def test_a_type_that_is_not_installed_is_advertised_by_its_definition(net: Net, ear: Ear) -> None:
     text = (
         "Header header\nstring data\n" + "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
