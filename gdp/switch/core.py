@@ -465,6 +465,5 @@ class SwitchCore:
             self.multicast.neighbour_lost((neighbour.port, neighbour.mac), now_s)
             for attachment in self.attached.of(neighbour.name):
                 if attachment.port == neighbour.port:
-                    self.relocations.departed(attachment.advertisement, now_s)
-                    self.attached.remove(attachment.advertisement.name, neighbour.name)
+                    self.attached.depart(attachment.advertisement.name, neighbour.name, now_s)
                     self.unicast.remove(attachment.advertisement.name)

@@ -16,7 +16,6 @@ that it does not know, or denies a name that it could not know. The name resolve
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
@@ -142,7 +141,7 @@ class RibClient:
         for name, watch_s in self._state.resolver.queries_to_send(now_s):
             is_heard = bool(self._state.readers.of(name))
             query = Query(name, watch_s, self._state.policy.revoked.digest_about(name) if is_heard else None)
-            wire = self._state.signed_wire(query)
+            wire = self._state.identity.signed(query)
             self._to_rib(wire, now_s, self._rib_for(name, now_s))
 
     def _trip_s(self, rib: Name) -> float:
@@ -262,12 +261,12 @@ class RibClient:
 
     def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
-            place = self._state.evidence.from_answer(response, now)
+            place = self._locations.verified(response, now, self._source(member.name))
         except StatementError:
             # it is of no use here, but still counts as a response
             self._receive_negative(response.name, member, now.mono_s)
             raise
-        self._locations.receive(replace(place, source=self._source(member.name)), wire, now.mono_s)
+        self._locations.receive(place, wire, now.mono_s)
 
     def _source(self, rib: Name) -> tuple[Name, bytes]:
         known = self._state.paths.ribs().get(rib)
@@ -296,7 +295,7 @@ class RibClient:
             self._relocations.acknowledged(ack.name, ack.advertiser, ack.sequence)
             return
         statement.expect(StatementType.ANSWER)
-        place = self._state.evidence.from_answer(Response.from_fields(statement.fields), now)
+        place = self._locations.verified(Response.from_fields(statement.fields), now)
         known = self._locations.get(place.name, place.advertiser)
         if known is None or known.sequence < place.sequence:
             self._locations.receive(place, statement.wire, now.mono_s)
