@@ -188,7 +188,7 @@ class SwitchCore:
         """Return what the control plane dropped, by reason."""
         own = self._drops + self._reassembler.drops + self.hello_protocol.drops + self._channels.drops
         own += self.diagnostics.drops
-        return own + self._flooding.drops + self.resolver.drops + self.multicast.drops + self.unicast.drops
+        return own + self._flooding.drops + self.resolver.pending.drops + self.multicast.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Add a port, or update the MTU or cost of one that is up."""
@@ -295,7 +295,7 @@ class SwitchCore:
 
     def query_name(self, name: Name, now_s: float) -> None:
         """Query a name at the RIB at once, known or not, for a tool of this machine."""
-        self.resolver.queries.request(name, now_s)
+        self.resolver.request(name, now_s)
         self.rib_client.send_due(now_s)
         self._rest_due_s = None
 

@@ -80,7 +80,7 @@ class MulticastTrees:
         for location in locations:
             self.publisher_found(location, now_s)
         if is_first:
-            self._state.resolver.queries.watch(advertisement.name, now_s)
+            self._state.resolver.watch(advertisement.name, now_s)
 
     def remove_reader(self, topic: Name, at: Downstream) -> None:
         """Remove a reader; with the last one of a topic its watch ends."""
@@ -88,7 +88,7 @@ class MulticastTrees:
         for tree in self.trees.of_topic(topic):
             self._cut(tree, at)
         if is_last:
-            self._state.resolver.queries.unwatch(topic)
+            self._state.resolver.unwatch(topic)
 
     def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""

@@ -21,6 +21,7 @@ from gdp.intervals import LINK_STATE, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
+from gdp.switch.name_resolver import owner_of
 from gdp.switch.paths import Path
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
@@ -59,7 +60,7 @@ class Unicast:
     def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
         """Handle a neighbour's frame without a table entry; return the name whose location it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
-        return self._find(destination, source, frame, self._state.resolver.owner_of(neighbour), now_s)
+        return self._find(destination, source, frame, owner_of(neighbour), now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the same path as forwarded frames."""
@@ -201,27 +202,26 @@ class Unicast:
         found = self._state.resolver.resolve(destination, now_s, owner)
         if found is None:
             return destination
-        if found.reason is not None:
-            self._install_negative(destination, source, found.reason, now_s)
+        if isinstance(found, DropReason):
+            self._install_negative(destination, source, found, now_s)
             return None
-        places = found.locations
-        if all(place.domain == self._own_domain for place in places) and self._is_of_own_domain(source, now_s):
-            best = self._nearest(places, frozenset({self._own_domain}), now_s)
+        if all(place.domain == self._own_domain for place in found) and self._is_of_own_domain(source, now_s):
+            best = self._nearest(found, frozenset({self._own_domain}), now_s)
             if best is not None:
                 self._install_way(destination, b"", best[0], source, best[1], now_s)
                 return None
         transit = self._transit
         if not self._is_known_here(source):
-            origin = self._state.resolver.resolve_source(source, now_s, owner)
+            origin = self._state.resolver.resolve_any(source, now_s, owner)
             if origin is None:
                 return source
-            if origin.reason is not None:
-                self._install_negative(destination, source, origin.reason, now_s)
+            if isinstance(origin, DropReason):
+                self._install_negative(destination, source, origin, now_s)
                 return None
-            transit = origin.locations[0].transit | {origin.locations[0].domain}
-        best = self._nearest(places, transit & self._transit, now_s)
+            transit = origin[0].transit | {origin[0].domain}
+        best = self._nearest(found, transit & self._transit, now_s)
         if best is None:
-            reasons = [self._why(place.switch, place.domain) for place in places]
+            reasons = [self._why(place.switch, place.domain) for place in found]
             self._install_negative(destination, source, max(reasons, default=DropReason.NO_ROUTE), now_s)
         else:
             self._install_way(destination, source, best[0], source, best[1], now_s)

@@ -18,7 +18,7 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
-from gdp.switch.pending_frames import PendingFrames
+from gdp.switch.name_resolver import PendingFrames
 from gdp.switch.unicast import Unicast
 from lab import simulation as worlds
 from lab.network import SimLink, SimNetwork
