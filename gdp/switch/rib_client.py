@@ -138,6 +138,10 @@ class RibClient:
                 self.relay(attachment.advertisement.wire, now_s)
         for statement in self.endpoints.statements_to_send(now_s):
             self._to_rib(statement, now_s)
+        self.send_queries(now_s)
+
+    def send_queries(self, now_s: float) -> None:
+        """Send the queries for names that are due."""
         for due in self._state.resolver.queries_to_send(now_s):
             revoked = self._state.policy.revoked.digest_about(due.name) if due.is_watch else None
             wire = self._state.identity.signed(Query(due.name, due.watch_s, revoked))
