@@ -44,7 +44,7 @@ Recovery = Annotated[
     typer.Option(metavar="SPAN", help="from its being taken until another one serves, such as 20min"),
 ]
 HardwareText = Annotated[str, typer.Option("--hardware", help="what each machine must have, such as cpu:16 or T4")]
-Regions = Annotated[list[str], typer.Option("--region", help="only these; may be repeated")]
+Regions = Annotated[list[str], typer.Option("--region", metavar="REGION", help="only these; may be repeated")]
 Provider = Annotated[str, typer.Option(help="whose prices: aws or local")]
 Spot = Annotated[bool, typer.Option("--spot/--on-demand", help="which machines may be added")]
 Mixed = Annotated[bool, typer.Option("--mixed", help="both may be added, whatever is cheaper")]

@@ -61,7 +61,9 @@ main = app.run
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
-Rights = Annotated[list[str], typer.Option("--right", help="publish, read, serve or call; may be repeated")]
+Rights = Annotated[
+    list[str], typer.Option("--right", metavar="RIGHT", help="publish, read, serve or call; may be repeated")
+]
 Epochs = Annotated[str, typer.Option("--epochs", help="whose secrets it gets, such as 0 or 0-3")]
 MayDelegate = Annotated[bool, typer.Option("--may-delegate", help="the node may pass the rights on")]
 TrustedRoot = Annotated[
