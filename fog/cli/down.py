@@ -135,7 +135,7 @@ def _release(site: Site, name: str) -> int:
 
 def _standing(site: Site) -> set[str]:
     """Return the clusters that have machines, by the provider's own records."""
-    if site.provider != "local":
+    if site.config.provider != "local":
         return set()
     from fog.providers.local.machine_handle import list_machines
 

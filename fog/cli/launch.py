@@ -102,8 +102,8 @@ def launch(
         said = loaded.plan
         plan = replace(
             said,
-            idle_s=here.idle_s if said.idle_s is None else said.idle_s,
-            budget_usd=here.budget_usd if said.budget_usd is None else said.budget_usd,
+            idle_s=here.config.idle_s if said.idle_s is None else said.idle_s,
+            budget_usd=here.config.budget_usd if said.budget_usd is None else said.budget_usd,
             machines=in_regions(said.machines, region or []),
         )
         with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
@@ -111,7 +111,7 @@ def launch(
             if None in (chosen := choices(found, plan.machines)):
                 raise LocalError(refusal(provider, plan.machines, chosen))
             plan, target = reached(plan, found)
-            topology = here.topology if here.provider == "local" else None
+            topology = here.topology if here.config.provider == "local" else None
             chosen = choices(found, plan.machines)
             whole = Priced(replace(loaded, plan=plan), chosen, found.latencies, target, topology)
         ends = ends_with

@@ -118,7 +118,7 @@ def push(cluster: ClusterOption = None, site: SiteFile = None, state: State = No
     """
     with opened(site, state) as (here, journal):
         plan = the_cluster(journal, cluster).plan
-        if here.provider != "local" and here.software.is_empty:
+        if here.config.provider != "local" and here.config.software.is_empty:
             raise LocalError(
                 f"{plan.name}: fog.yaml has no software to push; name software.wheels or software.workspace"
             )
