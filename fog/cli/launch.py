@@ -22,14 +22,14 @@ from fog.cli.down import clear, end_cluster
 from fog.cli.market import choices, in_regions, market, reached, refusal
 from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, Started, resolved, run
-from fog.cli.views import a_console, event_line, print_json
+from fog.cli.views import event_line, print_json
 from fog.cluster import ClusterPlan
 from fog.launch.load import Loaded
 from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.infrastructure import command_of, is_up, open_provider, set_up
 from fog.supervisor.journal import Entry, Journal
-from gdp.cli.console import Columns
+from gdp.cli.console import Columns, console
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.stores.keyring import load_salt
@@ -180,7 +180,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
 
 def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
     """Show events until all replicas serve; without a watch, until all machines are up."""
-    console = a_console(stderr=as_json)
+    out = console(stderr=as_json)
     end_s = time.monotonic() + patience_s
     wanted = len(plan.machines)
     trouble = ""
@@ -190,12 +190,12 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
     def news() -> tuple[int, str]:
         last, reported = after, trouble
         for entry in journal.events(plan.name, after=after):
-            _tell(entry, console, as_json=as_json)
+            _tell(entry, out, as_json=as_json)
             last = entry.id
             reported = entry.detail if entry.what in ("trouble", "refused", "failed") else reported
         return last, reported
 
-    with console.status("") as spinner:
+    with out.status("") as spinner:
         while True:
             serving = sum(each.is_serving for each in journal.machines(plan.name, gone=False))
             spinner.update(f"{serving} of {wanted} {serve}")
@@ -212,11 +212,11 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
             ensure(site)
             time.sleep(LOOK_S)
     if not as_json:
-        console.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
+        out.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
 
 
-def _tell(entry: Entry, console: Console, *, as_json: bool) -> None:
+def _tell(entry: Entry, out: Console, *, as_json: bool) -> None:
     if as_json:
         print_json(entry)
     else:
-        console.print(event_line(entry))
+        out.print(event_line(entry))

@@ -23,6 +23,7 @@ from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import UNIT_FOLDER, has_systemd, install_units, installed_units, remove_units
 from gdp.errors import LocalError
 from gdp.intervals import SERVER_S
+from gdp.state.columns import columns
 
 __all__ = ["app"]
 
@@ -170,12 +171,9 @@ def _last_words(unit: str) -> str:
 
 
 def _table(states: Sequence[UnitState]) -> str:
-    rows = [("unit", "state", "at boot", "restarts", "node")]
+    rows = []
     for each in states:
         up = "" if each.uptime_s is None else f", up {each.uptime_s:g} s"
         node = "-" if each.node is None else f"{each.node}{up}"
         rows.append((each.unit, each.active, "yes" if each.enabled else "no", str(each.restarts), node))
-    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return "\n".join(columns(("unit", "state", "at boot", "restarts", "node"), rows))
