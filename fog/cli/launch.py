@@ -13,7 +13,7 @@ from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -50,17 +50,15 @@ class GatewayKind(Enum):
 
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
-Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
+Words = Annotated[list[str] | None, typer.Argument(metavar="[NAME:=VALUE]...")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]
 Detach = Annotated[bool, typer.Option("--detach", help="end when the replicas serve; start no node of the robot")]
 Keep = Annotated[bool, typer.Option("--keep", help="leave the cluster when the robot's nodes end")]
 Gateway = Annotated[
-    Optional[GatewayKind],  # noqa: UP045
-    typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
+    GatewayKind | None, typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines")
 ]
 Regions = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--region", metavar="REGION", help="where machines are made, in order; repeatable"),
+    list[str] | None, typer.Option("--region", metavar="REGION", help="where machines are made, in order; repeatable")
 ]
 # what else ends the cluster, such as another launch
 EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.table import Column, Table
@@ -34,14 +34,11 @@ __all__ = ["cost_table", "plan"]
 _MOST_ROWS = 15
 
 Target = Annotated[float, typer.Option(help="largest share of time without any replica, such as 0.0005")]
-# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
 Uptime = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(metavar="SPAN", help="how long a spot machine serves on average, such as 15h"),
+    str | None, typer.Option(metavar="SPAN", help="how long a spot machine serves on average, such as 15h")
 ]
 Recovery = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(metavar="SPAN", help="from its being taken until another one serves, such as 20min"),
+    str | None, typer.Option(metavar="SPAN", help="from its being taken until another one serves, such as 20min")
 ]
 HardwareText = Annotated[str, typer.Option("--hardware", help="what each machine must have, such as cpu:16 or T4")]
 Regions = Annotated[list[str], typer.Option("--region", metavar="REGION", help="only these; may be repeated")]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Annotated, Final, NoReturn, Optional
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Group
@@ -45,7 +45,7 @@ _FLEETING: Final = {"age_s", "usd", "usd_ever"}
 Everything = Annotated[bool, typer.Option("--all", "-a", help="those that are gone as well")]
 Events = Annotated[bool, typer.Option("--events", help="what happened, the newest last")]
 Follow = Annotated[bool, typer.Option("--follow", "-f", help="go on as things happen, until Ctrl-C")]
-Last = Annotated[Optional[int], typer.Option("--last", "-n", min=1, help="only so many events")]  # noqa: UP045
+Last = Annotated[int | None, typer.Option("--last", "-n", min=1, help="only so many events")]
 
 
 def ls(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -67,8 +67,7 @@ Rights = Annotated[
 Epochs = Annotated[str, typer.Option("--epochs", help="whose secrets it gets, such as 0 or 0-3")]
 MayDelegate = Annotated[bool, typer.Option("--may-delegate", help="the node may pass the rights on")]
 TrustedRoot = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--root", metavar="FILE", help="refuse a card that is not of this domain"),
+    Path | None, typer.Option("--root", metavar="FILE", help="refuse a card that is not of this domain")
 ]
 OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]

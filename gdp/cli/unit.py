@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -35,12 +35,10 @@ _ETC: Final = Path("/etc/gdp")
 app = typer.Typer(help="systemd units of this machine's nodes.", no_args_is_help=True)
 
 Where = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="[PATH]", help="The machine's folder or its machine.yaml; by default /etc/gdp."),
+    Path | None, typer.Argument(metavar="[PATH]", help="The machine's folder or its machine.yaml; by default /etc/gdp.")
 ]
 Whose = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp unit installed."),
+    Path | None, typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp unit installed.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the files, and change nothing.")]
 
