@@ -26,7 +26,6 @@ from typing import Annotated, ClassVar, Final, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.bootstrap.bundles import RobotDevices, robot_boot
-from fog.bootstrap.config import EnrolmentConfig
 from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
@@ -59,6 +58,14 @@ _OWN_DAYS: Final = 3_650.0
 _SITE: Final = "site.json"
 SCRATCH: Final = "scratch"
 _FILE: Final = "fog.yaml"
+
+
+class EnrolmentConfig(Section):
+    """Section ``enrolment:`` of ``fog.yaml``."""
+
+    revoke_misused: bool = Field(
+        default=True, description="Revoke and replace a machine whose token was used again with another key."
+    )
 
 
 class SiteConfig(Section):

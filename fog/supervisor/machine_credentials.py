@@ -14,10 +14,9 @@ from fog.bootstrap.bundles import machine_boot, machine_label
 from fog.bootstrap.domain_members import DomainMembers
 from fog.bootstrap.robot_config import reload
 from fog.cluster import CloudNode, ClusterPlan
-from fog.credentials import IssuedCredentials
 from fog.machine import MachineBundle
 from fog.site import Site
-from fog.supervisor.core.record import Outcome, Record
+from fog.supervisor.core.record import IssuedCredentials, Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from gdp.config.config import SwitchConfig

@@ -23,10 +23,10 @@ from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import HOUR_S, LOOK_S
 from gdp.sharing.folder_exchange import FolderExchange
+from gdp.sharing.grants import ShareReport
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.proxy_files import ProxyFiles, fits
-from gdp.sharing.report import ShareReport
 from gdp.sharing.revocations import publish_revocations
 from gdp.sharing.rules import kind_from_text
 from gdp.sharing.sharing import NOT_USED, WITHDRAWN, Sharing
