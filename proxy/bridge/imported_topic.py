@@ -17,7 +17,7 @@ from gdp.extras import MissingExtraError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.reduction import MessageExpander, expander_of
 from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
@@ -220,8 +220,12 @@ class ImportedTopic:
             expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
             rewriters = [self._rewriter(each.target) for each in incoming]
         except DefinitionError as error:
-            self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
+            self._context.faults.report(
+                what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}; 'fields: default' allows it"
+            )
             return None
+        if differences := differences_of(incoming):
+            self._context.faults.report(what, Fault.OTHER_TYPE, differences)
         try:
             handles = self._output.add(publisher, sources, [each.target for each in incoming])
         except LocalError as error:

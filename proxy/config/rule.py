@@ -230,6 +230,11 @@ class Rule(Section):
         json_schema_extra=_without_default,
     )
     encoding: Encoding = Field(default="json", description="How messages travel; the sender's choice holds.")
+    fields_differ: Literal["strict", "default"] = Field(
+        default="strict",
+        alias="fields",
+        description="Where two machines define a type differently: refuse, or fill missing fields and drop others.",
+    )
     wants_reliable: bool | None = Field(
         default=None, alias="reliable", description="Topics: readers ask for what they miss. `null`: by QoS."
     )
@@ -376,6 +381,11 @@ class Rule(Section):
     def overlay_name(self) -> Name:
         """Return the 256-bit overlay name."""
         return self.overlay_metadata.name(self.owner.compressed)
+
+    @property
+    def is_strict(self) -> bool:
+        """Return whether both sides must have the same fields."""
+        return self.fields_differ == "strict"
 
     @property
     def is_ordered(self) -> bool:

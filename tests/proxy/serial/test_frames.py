@@ -7,9 +7,7 @@ from dataclasses import fields
 from random import Random
 from typing import Any, Final
 
-import numpy as np
 import pytest
-from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -18,6 +16,7 @@ from proxy.config.frames import Frames
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.frames import FrameRewriter
 from tests.proxy.bridge.known import channel
+from tests.proxy.serial.drawn import drawn_message, wire_of
 
 STORES: Final[dict[RosVersion, Typestore]] = {
     1: get_typestore(Stores.ROS1_NOETIC),
@@ -26,29 +25,7 @@ STORES: Final[dict[RosVersion, Typestore]] = {
 FIELDS: Final = ("frame_id", "child_frame_id")
 ADDED: Final = Frames(add="robot1/", common=("map",))
 NAMES: Final = ("base_link", "map", "", "/odom", "żółw")
-_BITS: Final = {"bool": "?", "octet": "B", "byte": "B", "char": "B"}
-
-
-def _values(store: Typestore, desc: Any, draw: Random, name: str) -> Any:
-    """Return a drawn value of a field as rosbags describes it."""
-    what, detail = desc
-    if what == Nodetype.NAME:
-        return _message(store, detail, draw)
-    if what == Nodetype.BASE:
-        if detail[0] in ("string", "wstring"):
-            return draw.choice(NAMES) if name in FIELDS else "x" * draw.randrange(9)
-        return draw.randrange(2) if detail[0] != "bool" else bool(draw.randrange(2))
-    inner, count = detail
-    is_numbers = inner[0] == Nodetype.BASE and inner[1][0] not in ("string", "wstring")
-    count = count if what == Nodetype.ARRAY else draw.choice((0, 1, 3, 5_000 if is_numbers else 2))
-    if is_numbers:
-        return np.resize(np.array([0, 1, 1]), count).astype(_BITS.get(inner[1][0], inner[1][0]))
-    return [_values(store, inner, draw, name) for _ in range(count)]
-
-
-def _message(store: Typestore, type_name: str, draw: Random) -> Any:
-    named = {name: _values(store, desc, draw, name) for name, desc in store.fielddefs[type_name][1]}
-    return store.types[type_name](**named)
+TEXTS: Final = dict.fromkeys(FIELDS, NAMES)
 
 
 def _rename(value: Any, renamed: Callable[[bytes], bytes]) -> int:
@@ -66,10 +43,6 @@ def _rename(value: Any, renamed: Callable[[bytes], bytes]) -> int:
     return count
 
 
-def _wire(store: Typestore, ros: RosVersion, message: Any, type_name: str) -> bytes:
-    return bytes(store.serialize_ros1(message, type_name) if ros == 1 else store.serialize_cdr(message, type_name))
-
-
 def _typed() -> Iterator[tuple[RosVersion, str]]:
     for ros, store in STORES.items():
         for type_name in sorted(store.fielddefs):
@@ -81,11 +54,11 @@ def _typed() -> Iterator[tuple[RosVersion, str]]:
 def test_frames_of_every_standard_type_are_renamed_and_nothing_else(ros: RosVersion) -> None:
     store, with_frames = STORES[ros], 0
     for number, type_name in enumerate(name for each, name in _typed() if each == ros):
-        message = _message(store, type_name, Random(number))
-        raw = _wire(store, ros, message, type_name)
+        message = drawn_message(store, type_name, Random(number), TEXTS)
+        raw = wire_of(store, ros, message, type_name)
         got = FrameRewriter(channel(type_name, ros), ADDED.rename).rewrite(raw)
         with_frames += bool(_rename(message, ADDED.rename))
-        assert got == _wire(store, ros, message, type_name), type_name
+        assert got == wire_of(store, ros, message, type_name), type_name
     assert with_frames >= 50
 
 
