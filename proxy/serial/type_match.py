@@ -7,9 +7,8 @@ allowed where a rule says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
 from typing import Final, TypeAlias
 
 from proxy.serial.channel import RosVersion
@@ -23,7 +22,6 @@ __all__ = ["Amend", "Pair", "Side", "match"]
 Amend: TypeAlias = "Callable[[object], None]"  # completes the tree of a value for the other side, or refuses it
 
 _Field: TypeAlias = "tuple[str, Type]"
-_FieldPair: TypeAlias = "tuple[_Field, _Field] | tuple[_Field, None] | tuple[None, _Field]"
 
 _WORDS: Final = {"?": "bool", "b": "int8", "B": "uint8", "h": "int16", "H": "uint16", "i": "int32", "I": "uint32"}
 _WORDS64: Final = {"q": "int64", "Q": "uint64", "f": "float32", "d": "float64"}
@@ -103,12 +101,11 @@ class _Matcher:
         amends: list[tuple[str, Amend]] = []
         theirs = [each for each in there.fields if each[0] not in unpaired]
         ours = [each for each in here.fields if each[0] not in unpaired]
-        for one, other in self._paired(theirs, ours, path):
-            if one is None:
-                write[other[0]] = other[1]
-                filled[other[0]] = default_tree(here, self._target.ros, self._target.defaults)[other[0]]
-                continue
+        partners = self._partners(theirs, ours, path)
+        for one, other in zip(theirs, partners, strict=True):
             if other is None:
+                if self._is_strict:
+                    raise _difference(_join(path, one[0]), one[1], None)
                 read.append(one)
                 continue
             at = _join(path, other[0])
@@ -120,31 +117,29 @@ class _Matcher:
             write[other[0]] = writing
             if amend is not None:
                 amends.append((other[0], amend))
+        if missing := [each for each in ours if each[0] not in write]:
+            if self._is_strict:
+                raise _difference(_join(path, missing[0][0]), None, missing[0][1])
+            defaults = default_tree(here, self._target.ros, self._target.defaults)
+            filled |= {name: defaults[name] for name, _ in missing}
+            write |= dict(missing)
         amend = _amend_record(filled, tuple(amends)) if filled or amends else None
         fields = tuple((name, write[name]) for name, _ in here.fields)
         return Pair(Record(there.name, tuple(read)), Record(here.name, fields), amend)
 
-    def _paired(self, theirs: list[_Field], ours: list[_Field], path: str) -> Iterator[_FieldPair]:
-        """Yield the fields of both sides together, theirs in wire order; None: that side has none."""
+    def _partners(self, theirs: list[_Field], ours: list[_Field], path: str) -> list[_Field | None]:
+        """Return the field here of each field there, by place or by name; None: there is none."""
         if self._is_strict:
-            for one, other in zip_longest(theirs, ours):
-                if one is None or other is None:
-                    name = (one or other)[0]
-                    raise _difference(_join(path, name), one and one[1], other and other[1])
-                yield one, other
-            return
-        left = {name.lower(): (name, kind) for name, kind in ours}
-        shared = [name for each, _ in theirs if (name := each.lower()) in left]
-        if shared != [name for name in left if name in shared]:
+            return [*ours[: len(theirs)], *[None] * (len(theirs) - len(ours))]
+        left = {each[0].lower(): each for each in ours}
+        partners = [left.pop(name.lower(), None) for name, _ in theirs]
+        missing = {name for name, _ in left.values()}
+        if [each for each in partners if each is not None] != [each for each in ours if each[0] not in missing]:
             self.differences.append(f"{path or 'the type'}: its fields have another order there")
-        for each in theirs:
-            found = left.pop(each[0].lower(), None)
-            if found is None:
-                self.differences.append(f"{_join(path, each[0])}: not known here, dropped")
-            yield each, found
-        for missing in left.values():
-            self.differences.append(f"{_join(path, missing[0])}: not known there, has its default")
-            yield None, missing
+        dropped = [name for (name, _), partner in zip(theirs, partners, strict=True) if partner is None]
+        self.differences += [f"{_join(path, name)}: not known here, dropped" for name in dropped]
+        self.differences += [f"{_join(path, name)}: not known there, has its default" for name, _ in left.values()]
+        return partners
 
     def _limits(self, there: tuple[str, str], here: tuple[str, str]) -> tuple[int, int]:
         """Return the bounds that are tighter here than there, zero for none."""
