@@ -56,7 +56,7 @@ class SessionOffload:
         self._head_for = head_for
         self.refused: Counter[DropReason] = Counter()
         self.has_changed = False
-        self.on_runs: Callable[[list[Neighbour], Timestamps], None] = lambda _heard, _now: None
+        self.on_runs: Callable[[list[Neighbour], Timestamps], object] = lambda _heard, _now: None
 
     def offers(self, now_s: float) -> list[KeepaliveOffer]:
         """Return the steady sessions; those that are not among them are the node's."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gdp.due_queue import earliest
-from gdp.intervals import LOOK_S
+from gdp.intervals import LOOK_S, NEVER_S
 from gdp.limits import COST_DEFAULT
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
@@ -233,7 +233,9 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        return earliest(self._machine.get_timer(), *(each.next_s for each in self._periodic))
+        keepalives = self._keepalives
+        tick_s = None if keepalives is None or keepalives.due_s == NEVER_S else keepalives.due_s
+        return earliest(self._machine.get_timer(), tick_s, *(each.next_s for each in self._periodic))
 
     def _wait(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""
