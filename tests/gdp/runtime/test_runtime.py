@@ -41,6 +41,7 @@ def loop(frames: int) -> tuple[Runtime, list[bytes]]:
     plane = SimpleNamespace(
         ports={},
         frames_from=lambda _: 0,
+        keepalives=None,
         on_link=lambda _: None,
         poll=poll,
         transmit=lambda port, mac, out: sent.extend(out),
