@@ -13,6 +13,7 @@ __all__ = [
     "BROADCAST",
     "KeepaliveOffer",
     "KeepaliveRun",
+    "NodeCore",
     "OutgoingFrames",
     "ProtocolCore",
     "ReceivedFrame",
@@ -145,10 +146,6 @@ class KeepaliveOffload(Protocol):
 class ProtocolCore(Protocol):
     """A switch, a RIB or a participant, as an I/O layer or a simulated network drives it."""
 
-    @property
-    def offload(self) -> KeepaliveOffload:
-        """The keepalive sessions that a data plane may run."""
-
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to use a port.
 
@@ -180,3 +177,11 @@ class ProtocolCore(Protocol):
 
     def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: preparing them took time."""
+
+
+class NodeCore(ProtocolCore, Protocol):
+    """A core on a data plane, which may take over keepalive sessions."""
+
+    @property
+    def offload(self) -> KeepaliveOffload:
+        """The keepalive sessions that a data plane may run."""

@@ -20,7 +20,7 @@ from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
 from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.signals import handled_signals
-from gdp.sansio import KeepaliveRun, ProtocolCore, ReceivedFrame, Timestamps
+from gdp.sansio import KeepaliveRun, NodeCore, ReceivedFrame, Timestamps
 
 __all__ = ["DRAIN_MAX_S", "Periodic", "Runtime", "now"]
 
@@ -65,7 +65,7 @@ class Runtime:
     """
 
     def __init__(
-        self, machine: ProtocolCore, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
+        self, machine: NodeCore, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
     ) -> None:
         self._machine = machine
         self._plane = plane

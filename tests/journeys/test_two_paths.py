@@ -19,6 +19,7 @@ from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
+from gdp.switch.join_handler import reader_of
 from gdp.switch.trees import Tree
 from gdp.trust.right import Right
 from lab.network import SimLink
@@ -74,7 +75,7 @@ def site(links: list[tuple[str, str, int]], readers: tuple[str, ...], source: st
         (DomainPlan("home", tuple(nodes)),),
         (Attachment(nodes[0], "rib", "rib"), *members),
     )
-    world = Simulation(topology=topology, keepalive_ms=None, **more)  # type: ignore[arg-type]
+    world = Simulation(topology=topology, **more)  # type: ignore[arg-type]
     cables: Cables = []
     for link in links:
         if first[frozenset(link[:2])] is link:
@@ -261,7 +262,7 @@ def test_a_path_of_each_tree_crosses_to_another_domain_at_its_own_border() -> No
             Attachment("s0", "proxy", "robot"), Attachment("s5", "proxy", "rs5"),
         ),
     )  # fmt: skip
-    world = Simulation(topology=topology, keepalive_ms=None)
+    world = Simulation(topology=topology)
     at = Site(world, [(a, b, world.cables[frozenset((a, b))]) for a, b, _ in links])
     world.network.taps.append(at.tap)
     assert world.run_until_attached(20.0)
@@ -302,7 +303,7 @@ def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
     now = at.world.network.now
     check: Callable[[], object] = partial(middle.multicast.join, join, neighbour, now.mono_s)
     if wrong == "one path asked":
-        check = partial(middle.state.evidence.of_join, join, now)
+        check = partial(reader_of, join, middle.state.verifier, now)
     with pytest.raises(StatementError):
         check()
 
