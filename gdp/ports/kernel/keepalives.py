@@ -14,6 +14,7 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 from typing import Any, Final
 
 from gdp.control.keepalive import JITTER, REPORT
@@ -92,7 +93,7 @@ class KeepaliveSessions:
         self._maps: list[KernelMap] = []
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
-        self._free = list(range(_SESSIONS_MAX))
+        self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
         self._report_at_s = NEVER_S
         self._late_s = 0.0
         self._send_at_s, self._together_s = NEVER_S, 0.0
@@ -158,7 +159,7 @@ class KeepaliveSessions:
         return runs
 
     def _begin(self, key: tuple[int, bytes], offer: KeepaliveOffer, mac: bytes) -> KeepaliveRun:
-        slot, ifindex = self._free.pop(), self._links[offer.port][1]
+        slot, ifindex = heappop(self._free), self._links[offer.port][1]
         run = PreparedRun(self._programs[1], _NUMBER.pack(slot).ljust(FRAME_BYTES, b"\0"))
         end = offer.name + _NUMBER.pack(ifindex)
         session = _Session(offer, slot, run, end, offer.send_at_s, offer.heard_s)
@@ -183,15 +184,17 @@ class KeepaliveSessions:
         self._configured.put(_NUMBER.pack(session.slot), value + struct.pack("=II", self._links[offer.port][1], 0))
 
     def _end(self, key: tuple[int, bytes]) -> KeepaliveRun:
-        session = self._sessions.pop(key)
+        session = self._sessions[key]
         self._ends.remove(session.end)
         run = self._report(session, self._read()[session.slot])._replace(is_over=True)
-        self._free.append(session.slot)
+        del self._sessions[key]
+        heappush(self._free, session.slot)
         self._plan(time.monotonic())
         return run
 
     def _read(self) -> list[tuple[Any, ...]]:
-        return list(_STATE.iter_unpack(self._states.read_array(_SESSIONS_MAX)))
+        count = max((each.slot for each in self._sessions.values()), default=-1) + 1
+        return list(_STATE.iter_unpack(self._states.read_array(count)))
 
     def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
