@@ -22,7 +22,7 @@ from typing import Final
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.redundancy import CopyBudget
 from gdp.crypto.envelope import SIGNATURE_BYTES, TAG_BYTES, fragment_capacity
-from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT
+from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT, PACE_AT, PARTS_MASK
 from gdp.frame.kinds import Flag
 from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
@@ -140,6 +140,7 @@ class ParitySender:
             if not frame[FLAGS_AT] & _PARITY:
                 continue
             number, part, parts = _NUMBER_PART_PARTS.unpack_from(frame, NUMBER_AT)
+            parts &= PARTS_MASK
             if part == 0 and number > self._number:
                 self._number, self._part, self._frames, self._made = number, 0, [], 0
             if number != self._number or part != self._part:
@@ -193,12 +194,12 @@ class ParitySender:
             erasure.encode([shard_of(frames[part - span.start], size) for part in block.parts], count)
             for block, count in zip(blocks, counts, strict=True)
         ]
-        flags, seal = frames[0][FLAGS_AT], self._keys.parity.seal
+        flags, pace, seal = frames[0][FLAGS_AT], frames[0][PACE_AT], self._keys.parity.seal
         for index in range(most):
             for block, count, of_block in zip(blocks, counts, shards, strict=True):
                 if index < count:
                     body = Parity(block.first, index, count, of_block[index]).to_wire()
-                    self.waiting.append(seal(self._number, self._made, parts, flags, body))
+                    self.waiting.append(seal(self._number, self._made, parts, flags, body, pace))
                     self._made += 1
         self._at_once = min(self._at_once + len(self.waiting), _AT_ONCE)
         self._remember(self._number)
