@@ -28,7 +28,7 @@ from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
 from gdp.message.parity import OVERHEAD_BYTES, SHARD_OVERHEAD_BYTES, Parity, blocks_of, shard_of, span_of
 
-__all__ = ["PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
+__all__ = ["LOSS_MIN", "PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
 
 PARITY_BYTES: Final = OVERHEAD_BYTES + TAG_BYTES  # so much smaller are the frames of a message with parity
 LOSS_MIN, LOSS_MAX = 0.001, 0.2  # less needs no parity, and more is no loss that parity can fill
@@ -109,6 +109,7 @@ class ParitySender:
         self.is_enabled = is_enabled
         self.sent = 0
         self.margin = 0.0
+        self._least_pace = 0
         self._number, self._part = -1, 0  # the message under way, and the part that is sent next
         self._frames: list[bytes] = []  # of its present span
         self._made = 0  # parity frames of this message
@@ -126,14 +127,16 @@ class ParitySender:
         return self.is_enabled and is_useful(loss, rtt_s, deadline_s) and self.is_available
 
     def handle_sent(
-        self, frames: Sequence[bytes], loss: float | None, path_bytes_s: float | None, now_s: float
+        self, frames: Sequence[bytes], loss: float | None, path_bytes_s: float | None, now_s: float, pace: int = 0
     ) -> None:
         """Note DATA frames that leave now, and queue the parity of the spans that they complete.
 
         Args:
             loss: measured share of lost frames, 0 to 1; None: unknown.
             path_bytes_s: what the path carries; None: unknown.
+            pace: the lowest of the readers that lose frames; others need no parity.
         """
+        self._least_pace = pace
         if not self.is_enabled or loss is None:
             return
         for frame in frames:
@@ -194,7 +197,7 @@ class ParitySender:
             erasure.encode([shard_of(frames[part - span.start], size) for part in block.parts], count)
             for block, count in zip(blocks, counts, strict=True)
         ]
-        flags, pace, seal = frames[0][FLAGS_AT], frames[0][PACE_AT], self._keys.parity.seal
+        flags, pace, seal = frames[0][FLAGS_AT], max(frames[0][PACE_AT], self._least_pace), self._keys.parity.seal
         for index in range(most):
             for block, count, of_block in zip(blocks, counts, shards, strict=True):
                 if index < count:
