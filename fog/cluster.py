@@ -121,36 +121,19 @@ class ClusterPlan:
         Raises:
             LocalError: the text is not a plan.
         """
+        from pydantic import TypeAdapter, ValidationError  # a launch file that only makes a plan needs no such check
+
+        from gdp.config.schema import first_fault
+
         try:
             items = json.loads(text)
-            nodes = [
-                CloudNode(each["package"], each["executable"], tuple(each["arguments"]), each["environment"])
-                for each in items["nodes"]
-            ]
-            machines = [
-                MachineRequest(
-                    Hardware(**each["hardware"]),
-                    each["region"],
-                    each["is_spot"],
-                    each.get("may_be_on_demand", False),
-                )
-                for each in items["machines"]
-            ]
-            carried = [ExportedInterface(**each) for each in items["carried"]]
-            return cls(
-                items["name"],
-                tuple(nodes),
-                tuple(machines),
-                tuple(carried),
-                idle_s=items["idle_s"],
-                budget_usd=items["budget_usd"],
-                availability=items.get("availability"),
-                pushed_unix_s=items.get("pushed_unix_s"),
-                scale=None if items.get("scale") is None else policy_from_keys(items["scale"]),
-            )
+            scale = None if items.get("scale") is None else policy_from_keys(items["scale"])
+            return TypeAdapter(cls).validate_python({**items, "scale": scale})
         except json.JSONDecodeError as error:
             raise LocalError(f"line {error.lineno}: JSON is expected: {error.msg}") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except ValidationError as error:
+            raise LocalError(f"not the plan of a cluster: {first_fault(error)}") from error
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise LocalError(f"not the plan of a cluster: {error!r}") from error
 
 

@@ -19,14 +19,13 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal, TypedDict
+from typing import Annotated, ClassVar, Final, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.bootstrap.bundles import RobotDevices, robot_boot
-from fog.bootstrap.config import EnrolmentConfig
 from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
@@ -59,6 +58,14 @@ _OWN_DAYS: Final = 3_650.0
 _SITE: Final = "site.json"
 SCRATCH: Final = "scratch"
 _FILE: Final = "fog.yaml"
+
+
+class EnrolmentConfig(Section):
+    """Section ``enrolment:`` of ``fog.yaml``."""
+
+    revoke_misused: bool = Field(
+        default=True, description="Revoke and replace a machine whose token was used again with another key."
+    )
 
 
 class SiteConfig(Section):
@@ -189,21 +196,7 @@ class SiteConfig(Section):
         return load(cls, path)
 
 
-class _Settings(TypedDict):
-    provider: ProviderName
-    aws: AwsConfig
-    skypilot: SkyPilotConfig
-    topology: Gateway
-    machine_iface: str
-    credential_days: float
-    lease_s: float
-    idle_s: float | None
-    budget_usd: float | None
-    latency_ms: Mapping[str, float]
-    latency: LatencyConfig
-    enrolment: EnrolmentConfig
-    software: SoftwareConfig
-    software_address: str
+NO_FILE: Final = SiteConfig.model_construct()  # settings of a self-contained site: the defaults
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,6 +206,8 @@ class Site:
     Args:
         id: six hex digits.
         file: its ``fog.yaml``; None: self-contained.
+        config: the content of the file.
+        topology: the tree of gateways in use.
         revocations: folder, and the switch's file that names it; None: revocations are not published.
         watch: directory of keys, and device; None: only the provider reports on machines.
         border: what ``gdp domain create`` made, whose domain rented machines join; None: machines run on this host.
@@ -227,20 +222,8 @@ class Site:
     watch: tuple[Path, str] | None
     uplink: str
     devices: RobotDevices | None = None
-    provider: ProviderName = "local"
-    aws: AwsConfig = field(default_factory=AwsConfig)
-    skypilot: SkyPilotConfig = field(default_factory=SkyPilotConfig)
+    config: SiteConfig = NO_FILE
     topology: Gateway = AUTOMATIC
-    machine_iface: str = "eth0"
-    credential_days: float = 7.0
-    lease_s: float = ADVERTISEMENT.lease_s
-    idle_s: float | None = None
-    budget_usd: float | None = None
-    latency_ms: Mapping[str, float] = field(default_factory=dict)
-    latency: LatencyConfig = field(default_factory=LatencyConfig)
-    enrolment: EnrolmentConfig = field(default_factory=EnrolmentConfig)
-    software: SoftwareConfig = field(default_factory=SoftwareConfig)
-    software_address: str = ""
     border: Path | None = None
 
     @property
@@ -251,9 +234,9 @@ class Site:
     @property
     def software_listens(self) -> tuple[str, int]:
         """Return host and port on which the supervisor serves software; an empty host: every address."""
-        if self.software.listen is not None:
-            return listening_host_port(self.software.listen)
-        return "", split_host_port(self.software_address)[1]
+        if self.config.software.listen is not None:
+            return listening_host_port(self.config.software.listen)
+        return "", split_host_port(self.config.software_address)[1]
 
     @property
     def enrolment_socket(self) -> Path:
@@ -280,15 +263,16 @@ class Site:
             revocations=folder / "revocations" if self.revocations is None else self.revocations[0],
             listen=0,
             servers=(f"unix:{self.enrolment_socket}",),
-            member_days=self.credential_days,
+            member_days=self.config.credential_days,
         )
         return DomainFiles(directory=folder, config=config)
 
     @property
     def latencies(self) -> Latencies:
         """Return the known latencies of regions."""
-        config = self.latency.for_aws() if self.provider == "aws" else self.latency
-        return Latencies(self.state, config, self.latency_ms)
+        latency = self.config.latency
+        latency = latency.for_aws() if self.config.provider == "aws" else latency
+        return Latencies(self.state, latency, self.config.latency_ms)
 
     @property
     def robot(self) -> Path | None:
@@ -347,19 +331,18 @@ def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
         return
     with tempfile.TemporaryDirectory(prefix="gdp-fog-") as empty:
         authority = Authority(folder / "domain", folder / "owner")
-        site = Site(
+        yield Site(
             id="000000",
             state=Path(empty),
-            file=None,
+            file=None if config is None else file,
             authority=authority,
             robots=(),
             revocations=None,
             watch=None,
             uplink="",
+            config=NO_FILE if config is None else config,
+            topology=AUTOMATIC if config is None else config.topology,
         )
-        if config is not None:
-            site = replace(site, file=file, **_settings(config))
-        yield site
 
 
 def _stands_where(file: Path | None, state: Path | None) -> tuple[Path | None, SiteConfig | None, Path]:
@@ -469,7 +452,8 @@ def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Si
         watch=watch,
         uplink=config.uplink or f"fog{identifier}-up",
         border=None if config.border is None else config.border.absolute(),
-        **_settings(config),
+        config=config,
+        topology=config.topology,
     )
 
 
@@ -505,23 +489,3 @@ def _places(config: SiteConfig) -> _Places:
         switch=switch,
         watch=WATCH_IFACE if WATCH_IFACE in SwitchConfig.load(switch).attach else None,
     )
-
-
-def _settings(config: SiteConfig) -> _Settings:
-    """Return the settings that a site takes unchanged from its file."""
-    return {
-        "provider": config.provider,
-        "aws": config.aws,
-        "skypilot": config.skypilot,
-        "topology": config.topology,
-        "machine_iface": config.device,
-        "credential_days": config.credential_days,
-        "lease_s": config.lease_s,
-        "idle_s": config.idle_s,
-        "budget_usd": config.budget_usd,
-        "latency_ms": config.latency_ms,
-        "latency": config.latency,
-        "enrolment": config.enrolment,
-        "software": config.software,
-        "software_address": config.software_address,
-    }

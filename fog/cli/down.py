@@ -15,12 +15,13 @@ from typing import Annotated, Final
 import typer
 
 from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened
-from fog.cli.views import a_console, event_line, print_json
+from fog.cli.views import event_line, print_json
 from fog.machine import MachineState
 from fog.site import Site
 from fog.supervisor.background import ensure, is_running, pid_of
 from fog.supervisor.infrastructure import local_provider, open_provider, tear_down
 from fog.supervisor.journal import Journal
+from gdp.cli.console import console
 from gdp.errors import LocalError, StoreError
 from gdp.intervals import LOOK_S, STOP_S
 from gdp.terminal import echo
@@ -79,12 +80,12 @@ def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
 
 def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:
     """Release all machines of a cluster, wait until they are gone, and print their number."""
-    console = a_console(stderr=as_json)
+    out = console(stderr=as_json)
     last = max((each.id for each in journal.events(last=1)), default=0)
     journal.unwant(name, why, time.time())
     is_known = any(each.plan.name == name for each in journal.clusters())
     count = len(journal.machines(name, gone=False))
-    with console.status(f"{name}: machines are given back"):
+    with out.status(f"{name}: machines are given back"):
         if is_known and count:
             ensure(site)
         end_s = time.monotonic() + _PATIENCE_S
@@ -101,7 +102,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
             journal.put(record.ended(record.ending or Outcome.RELEASED, why, now_s), now_s, "released", why)
     for entry in journal.events(name, after=last):
         if not as_json:
-            console.print(event_line(entry))
+            out.print(event_line(entry))
     return max(count, rest)
 
 
@@ -135,7 +136,7 @@ def _release(site: Site, name: str) -> int:
 
 def _standing(site: Site) -> set[str]:
     """Return the clusters that have machines, by the provider's own records."""
-    if site.provider != "local":
+    if site.config.provider != "local":
         return set()
     from fog.providers.local.machine_handle import list_machines
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
@@ -22,14 +22,14 @@ from fog.cli.down import clear, end_cluster
 from fog.cli.market import choices, in_regions, market, reached, refusal
 from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, Started, resolved, run
-from fog.cli.views import a_console, event_line, print_json
+from fog.cli.views import event_line, print_json
 from fog.cluster import ClusterPlan
 from fog.launch.load import Loaded
 from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.infrastructure import command_of, is_up, open_provider, set_up
 from fog.supervisor.journal import Entry, Journal
-from gdp.cli.console import Columns
+from gdp.cli.console import Columns, console
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.stores.keyring import load_salt
@@ -50,17 +50,15 @@ class GatewayKind(Enum):
 
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="a launch file (.py), or a plan (.json)")]
-Words = Annotated[Optional[list[str]], typer.Argument(metavar="[NAME:=VALUE]...")]  # noqa: UP045
+Words = Annotated[list[str] | None, typer.Argument(metavar="[NAME:=VALUE]...")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show machines and price, start nothing")]
 Detach = Annotated[bool, typer.Option("--detach", help="end when the replicas serve; start no node of the robot")]
 Keep = Annotated[bool, typer.Option("--keep", help="leave the cluster when the robot's nodes end")]
 Gateway = Annotated[
-    Optional[GatewayKind],  # noqa: UP045
-    typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
+    GatewayKind | None, typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines")
 ]
 Regions = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--region", metavar="REGION", help="where machines are made, in order; repeatable"),
+    list[str] | None, typer.Option("--region", metavar="REGION", help="where machines are made, in order; repeatable")
 ]
 # what else ends the cluster, such as another launch
 EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]
@@ -102,8 +100,8 @@ def launch(
         said = loaded.plan
         plan = replace(
             said,
-            idle_s=here.idle_s if said.idle_s is None else said.idle_s,
-            budget_usd=here.budget_usd if said.budget_usd is None else said.budget_usd,
+            idle_s=here.config.idle_s if said.idle_s is None else said.idle_s,
+            budget_usd=here.config.budget_usd if said.budget_usd is None else said.budget_usd,
             machines=in_regions(said.machines, region or []),
         )
         with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
@@ -111,7 +109,7 @@ def launch(
             if None in (chosen := choices(found, plan.machines)):
                 raise LocalError(refusal(provider, plan.machines, chosen))
             plan, target = reached(plan, found)
-            topology = here.topology if here.provider == "local" else None
+            topology = here.topology if here.config.provider == "local" else None
             chosen = choices(found, plan.machines)
             whole = Priced(replace(loaded, plan=plan), chosen, found.latencies, target, topology)
         ends = ends_with
@@ -180,7 +178,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
 
 def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
     """Show events until all replicas serve; without a watch, until all machines are up."""
-    console = a_console(stderr=as_json)
+    out = console(stderr=as_json)
     end_s = time.monotonic() + patience_s
     wanted = len(plan.machines)
     trouble = ""
@@ -190,12 +188,12 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
     def news() -> tuple[int, str]:
         last, reported = after, trouble
         for entry in journal.events(plan.name, after=after):
-            _tell(entry, console, as_json=as_json)
+            _tell(entry, out, as_json=as_json)
             last = entry.id
             reported = entry.detail if entry.what in ("trouble", "refused", "failed") else reported
         return last, reported
 
-    with console.status("") as spinner:
+    with out.status("") as spinner:
         while True:
             serving = sum(each.is_serving for each in journal.machines(plan.name, gone=False))
             spinner.update(f"{serving} of {wanted} {serve}")
@@ -212,11 +210,11 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
             ensure(site)
             time.sleep(LOOK_S)
     if not as_json:
-        console.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
+        out.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
 
 
-def _tell(entry: Entry, console: Console, *, as_json: bool) -> None:
+def _tell(entry: Entry, out: Console, *, as_json: bool) -> None:
     if as_json:
         print_json(entry)
     else:
-        console.print(event_line(entry))
+        out.print(event_line(entry))

@@ -16,7 +16,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from fog.cli.views import a_console, latency_lines, ms_text
+from fog.cli.views import latency_lines, ms_text
 from fog.cluster import CloudNode
 from fog.hardware import Offer
 from fog.latency.known import Latency
@@ -26,6 +26,7 @@ from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway
+from gdp.cli.console import console
 from gdp.terminal import echo
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
@@ -133,7 +134,7 @@ def show_plan(said: Priced, ends: str = BY_HAND, *, as_json: bool) -> None:
         if offer:
             found = offer.region, ms_text(said.latencies[offer.region]), offer.type_name, f"{offer.usd_per_hour:.4f}"
         table.add_row(wanted.hardware.to_text(), kind, *map(Text, found), style=None if offer else "red")
-    a_console().print(Group(table, *_lines(said, fields, ends)))
+    console().print(Group(table, *_lines(said, fields, ends)))
 
 
 def _lines(said: Priced, fields: dict[str, object], ends: str) -> list[Text]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -31,19 +31,17 @@ __all__ = [
     "the_cluster",
 ]
 
-# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
 SiteFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--site", metavar="FILE", help="fog.yaml; without it the one in this folder, else a site of its own"),
 ]
 State = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--state", metavar="DIR", help="where clusters are remembered; default: $FOG_STATE, ~/.local/state"),
 ]
-ClusterName = Annotated[Optional[str], typer.Argument(metavar="[CLUSTER]", help="only this one")]  # noqa: UP045
+ClusterName = Annotated[str | None, typer.Argument(metavar="[CLUSTER]", help="only this one")]
 ClusterOption = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--cluster", metavar="NAME", help="which cluster, where there are several"),
+    str | None, typer.Option("--cluster", metavar="NAME", help="which cluster, where there are several")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON")]
 

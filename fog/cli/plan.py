@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.table import Column, Table
@@ -16,14 +16,14 @@ from fog.catalog.aws import aws_prices
 from fog.catalog.measured import measured
 from fog.catalog.prices import price_list, regions_of
 from fog.cli.options import SiteFile, State
-from fog.cli.views import a_console, latency_lines, ms_text
+from fog.cli.views import latency_lines, ms_text
 from fog.hardware import Hardware, Offer
 from fog.plan.answer import Answer, Question, answer
 from fog.plan.choice import BY_BOTH, Weights
 from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.site import peek_site
-from gdp.cli.console import Columns, folding
+from gdp.cli.console import Columns, console, folding
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 from gdp.intervals import DAY_S
@@ -34,17 +34,14 @@ __all__ = ["cost_table", "plan"]
 _MOST_ROWS = 15
 
 Target = Annotated[float, typer.Option(help="largest share of time without any replica, such as 0.0005")]
-# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
 Uptime = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(metavar="SPAN", help="how long a spot machine serves on average, such as 15h"),
+    str | None, typer.Option(metavar="SPAN", help="how long a spot machine serves on average, such as 15h")
 ]
 Recovery = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(metavar="SPAN", help="from its being taken until another one serves, such as 20min"),
+    str | None, typer.Option(metavar="SPAN", help="from its being taken until another one serves, such as 20min")
 ]
 HardwareText = Annotated[str, typer.Option("--hardware", help="what each machine must have, such as cpu:16 or T4")]
-Regions = Annotated[list[str], typer.Option("--region", help="only these; may be repeated")]
+Regions = Annotated[list[str], typer.Option("--region", metavar="REGION", help="only these; may be repeated")]
 Provider = Annotated[str, typer.Option(help="whose prices: aws or local")]
 Spot = Annotated[bool, typer.Option("--spot/--on-demand", help="which machines may be added")]
 Mixed = Annotated[bool, typer.Option("--mixed", help="both may be added, whatever is cheaper")]
@@ -168,20 +165,20 @@ def cost_table(
                 f"{usd.usd_per_hour * HOURS_A_MONTH:.2f}" if usd else "-",
                 str(row["taken_a_month"] or "-"),
             )
-        console = a_console()
-        console.print(table)
+        out = console()
+        out.print(table)
         if len(shown) < len(rows):
-            console.print(f"{len(rows) - len(shown)} more: --all")
+            out.print(f"{len(rows) - len(shown)} more: --all")
         for line in latency_lines({str(row["region"]): latencies[str(row["region"])] for row in shown}):
-            console.print(f"ms. {line}", style="dim")
+            out.print(f"ms. {line}", style="dim")
         for source in _sources(provider):
-            console.print(f"USD. {source}", style="dim")
+            out.print(f"USD. {source}", style="dim")
 
 
 def _show(question: Question, result: Answer) -> None:
-    console = a_console()
+    out = console()
     pool = result.independent
-    console.print(
+    out.print(
         f"[bold]replicas: {result.replicas}[/bold] ({len(result.choices)} to be added): none is up for "
         f"{result.p_system:.4%} of the time, and {question.target:.4%} is allowed; one is down for {result.p_vm:.3%}",
     )
@@ -194,7 +191,7 @@ def _show(question: Question, result: Answer) -> None:
         table.add_row("share a region, for the target", *(("-", "never", "") if here is None else (str(here), "", "")))
         as_recorded = result.as_recorded
         table.add_row("stay as short as recorded", str(as_recorded.replicas), *_chance(as_recorded.chance))
-    console.print(table)
+    out.print(table)
     if result.choices:
         table = folding(Table("region", "type", "kind", "USD/h", "USD/month", "why", title="the choice"))
         for choice in result.choices:
@@ -204,10 +201,10 @@ def _show(question: Question, result: Answer) -> None:
             table.add_row(offer.region, offer.type_name, kind, f"{offer.usd_per_hour:.4f}", month, choice.why)
         table.add_section()
         table.add_row("all", "", "", f"{result.usd_per_hour:.4f}", f"{result.usd_per_hour * HOURS_A_MONTH:.2f}", "")
-        console.print(table)
-    console.print("Assumed:")
+        out.print(table)
+    out.print("Assumed:")
     for line in result.assumptions:
-        console.print(f"- {line}", style="dim")
+        out.print(f"- {line}", style="dim")
 
 
 def _document(question: Question, result: Answer) -> dict[str, object]:

@@ -9,7 +9,7 @@ import os
 import time
 from contextlib import closing
 from dataclasses import replace
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -36,7 +36,7 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="show what it would cost
 Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="such as m3; see fog status")]
 Program = Annotated[str, typer.Argument(metavar="[PROGRAM]", help="node, proxy or switch; empty: the machine itself")]
 Lines = Annotated[int, typer.Option("--lines", "-n", min=1, help="only the last so many")]
-Lock = Annotated[Optional[int], typer.Option("--lock", hidden=True)]  # noqa: UP045
+Lock = Annotated[int | None, typer.Option("--lock", hidden=True)]
 Stay = Annotated[bool, typer.Option("--stay", help="go on also while nothing is wanted; for systemd")]
 
 
@@ -118,7 +118,7 @@ def push(cluster: ClusterOption = None, site: SiteFile = None, state: State = No
     """
     with opened(site, state) as (here, journal):
         plan = the_cluster(journal, cluster).plan
-        if here.provider != "local" and here.software.is_empty:
+        if here.config.provider != "local" and here.config.software.is_empty:
             raise LocalError(
                 f"{plan.name}: fog.yaml has no software to push; name software.wheels or software.workspace"
             )

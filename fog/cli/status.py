@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Annotated, Final, NoReturn, Optional
+from typing import Annotated, Final, NoReturn
 
 import typer
 from rich.console import Group
@@ -17,7 +17,6 @@ from rich.table import Table
 
 from fog.cli.options import AsJson, ClusterName, SiteFile, State, opened, the_cluster
 from fog.cli.views import (
-    a_console,
     cluster_fields,
     clusters_table,
     cost_fields,
@@ -33,7 +32,7 @@ from fog.site import Site
 from fog.supervisor.background import pid_of
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
-from gdp.cli.console import Columns
+from gdp.cli.console import Columns, console
 from gdp.intervals import WATCH_S
 from gdp.terminal import echo
 
@@ -46,7 +45,7 @@ _FLEETING: Final = {"age_s", "usd", "usd_ever"}
 Everything = Annotated[bool, typer.Option("--all", "-a", help="those that are gone as well")]
 Events = Annotated[bool, typer.Option("--events", help="what happened, the newest last")]
 Follow = Annotated[bool, typer.Option("--follow", "-f", help="go on as things happen, until Ctrl-C")]
-Last = Annotated[Optional[int], typer.Option("--last", "-n", min=1, help="only so many events")]  # noqa: UP045
+Last = Annotated[int | None, typer.Option("--last", "-n", min=1, help="only so many events")]
 
 
 def ls(
@@ -101,13 +100,13 @@ def status(
                 _events(journal, name, last or _EVENTS, follow=follow, as_json=as_json)
             elif as_json:
                 _as_json(lambda: _status(here, journal, journal.cluster(name), gone=all_), follow=follow)
-            elif follow and not a_console().is_terminal:
+            elif follow and not console().is_terminal:
                 show(_page(here, journal, found, gone=all_))
                 _follow(
                     journal, name, max((each.id for each in journal.events(name, last=1)), default=0), as_json=False
                 )
             elif follow:
-                with Live(console=a_console(), auto_refresh=False) as live:
+                with Live(console=console(), auto_refresh=False) as live:
                     while True:
                         live.update(_page(here, journal, journal.cluster(name), gone=all_), refresh=True)
                         time.sleep(WATCH_S)
@@ -190,14 +189,14 @@ def _events(journal: Journal, name: str, last: int, *, follow: bool, as_json: bo
 
 def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoReturn:
     """Print one line per event until Ctrl-C."""
-    console = a_console()
+    out = console()
     while True:
         for entry in journal.events(name, after=after):
             after = entry.id
             if as_json:
                 print_json(entry)
             else:
-                console.print(event_line(entry))
+                out.print(event_line(entry))
         sys.stdout.flush()
         time.sleep(WATCH_S)
 

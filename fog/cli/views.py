@@ -11,7 +11,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Final
 
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -25,7 +25,6 @@ from gdp.printable import escaped
 from gdp.terminal import echo
 
 __all__ = [
-    "a_console",
     "cluster_fields",
     "clusters_table",
     "cost_fields",
@@ -204,14 +203,9 @@ def _detail(entry: Entry) -> Text:
     return Text(escaped("; ".join(words)))
 
 
-def a_console(*, stderr: bool = False) -> Console:
-    """Return a console: as wide as ``--columns`` or the terminal, or without a terminal as wide as its output."""
-    return console(stderr=stderr)
-
-
 def show(*parts: RenderableType) -> None:
     """Print tables."""
-    shown = a_console()
+    shown = console()
     if shown.is_terminal:
         for part in parts:
             shown.print(part)

@@ -6,7 +6,7 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -20,11 +20,11 @@ __all__ = ["wheels_command"]
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="where the wheels are written; `software.wheels`")]
 Sources = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Argument(metavar="[SOURCE]...", help="a folder with the nodes' Python project, or a requirement of pip"),
 ]
 Build = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--build", metavar="NAME", help="a package without a wheel on the index, which is built here"),
 ]
 Python = Annotated[str, typer.Option("--python", metavar="X.Y", help="of the machines; Debian 12 has 3.11")]

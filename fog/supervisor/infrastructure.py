@@ -50,9 +50,9 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
     Raises:
         LocalError: a requirement is not installed, or its settings are wrong.
     """
-    if site.provider == "local":
+    if site.config.provider == "local":
         return local_provider(site, regions)
-    return _PROVIDERS.get(site.provider, f"provider {site.provider}")(site)
+    return _PROVIDERS.get(site.config.provider, f"provider {site.config.provider}")(site)
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:
@@ -73,7 +73,7 @@ def command_of(site: Site, node: CloudNode) -> Sequence[str]:
     Raises:
         LocalError: machines share this host, and this host has no such node.
     """
-    return command_line(node, os.environ) if site.provider == "local" else deferred(node)
+    return command_line(node, os.environ) if site.config.provider == "local" else deferred(node)
 
 
 def set_up(site: Site) -> None:
@@ -83,7 +83,7 @@ def set_up(site: Site) -> None:
         LocalError: the kernel refuses, or the robot's side does not come up; the text names its logs.
     """
     with site.locked("ground"):
-        if site.provider == "local":
+        if site.config.provider == "local":
             local_provider(site).open_network()
         if site.robot is not None and not is_up(site):
             _start_robot(site, site.robot)
@@ -101,7 +101,7 @@ def tear_down(site: Site) -> None:
         if site.devices is not None:
             for name in (site.devices.proxy, site.devices.rib, site.devices.watch):
                 delete(None, f"{name}-s")  # left over by a killed switch
-        if site.provider == "local":
+        if site.config.provider == "local":
             provider = local_provider(site)
             provider.close_network()
             provider.sweep()

@@ -9,16 +9,16 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from fog.cluster import ClusterPlan, MachineRequest
-from fog.credentials import IssuedCredentials
-from fog.hardware import Hardware, Offer
-from fog.machine import MachineSpec, MachineState
-from fog.supervisor.core.record import Outcome, Record
+from pydantic import TypeAdapter, ValidationError
+
+from fog.cluster import ClusterPlan
+from fog.supervisor.core.record import Record
+from gdp.config.schema import first_fault
 from gdp.errors import LocalError, StoreError
 from gdp.stores.transactions import TransactionFile
 
@@ -41,6 +41,7 @@ CREATE TABLE IF NOT EXISTS events (
   what TEXT NOT NULL, detail TEXT NOT NULL, since_unix_s REAL, lines TEXT NOT NULL DEFAULT ''
 ) STRICT;
 """
+_RECORD: Final = TypeAdapter(Record)
 _LATER: Final = {"since_unix_s": "REAL", "lines": "TEXT NOT NULL DEFAULT ''"}  # columns that an older journal lacks
 
 
@@ -208,9 +209,10 @@ class Journal(TransactionFile):
 
     def _machine(self, cluster: str, name: str, record: str) -> Record:
         try:
-            return _record(json.loads(record))
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise StoreError(f"{self.path}: machines: {cluster} {name}: not the record of one: {error!r}") from error
+            return _RECORD.validate_json(record, strict=True)
+        except ValidationError as error:
+            reason = first_fault(error)
+            raise StoreError(f"{self.path}: machines: {cluster} {name}: not the record of one: {reason}") from error
 
 
 def _tell(
@@ -236,28 +238,6 @@ def _plain(value: object) -> object:
     if isinstance(value, Enum):
         return value.value
     raise TypeError(f"not for the journal: {value!r}")
-
-
-def _record(items: dict[str, object]) -> Record:
-    match items:
-        case {"spec": dict(spec), "wanted": dict(wanted), "issued_credentials": dict(issued_credentials), **rest}:
-            offer = spec["offer"]
-            return replace(
-                Record(**{**rest, "spec": None, "wanted": None, "issued_credentials": None}),  # type: ignore[arg-type]
-                spec=MachineSpec(
-                    spec["cluster"], spec["name"], Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
-                ),
-                wanted=MachineRequest(
-                    Hardware(**wanted["hardware"]),
-                    wanted["region"],
-                    wanted["is_spot"],
-                    wanted.get("may_be_on_demand", False),
-                ),
-                issued_credentials=IssuedCredentials(issued_credentials["proxy"], issued_credentials["until_unix_s"]),
-                state=MachineState(rest["state"]),
-                ending=None if rest["ending"] is None else Outcome(rest["ending"]),
-            )
-    raise ValueError("a part is missing")
 
 
 def _number(record: Record) -> int:

@@ -12,7 +12,6 @@ from typing import Final
 
 from fog.bootstrap.bundles import node_names
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
-from fog.credentials import IssuedCredentials
 from fog.hardware import Offer
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
@@ -21,7 +20,7 @@ from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
 from fog.supervisor.core.reconcile import Action, Drain, Launch
-from fog.supervisor.core.record import Outcome, Record
+from fog.supervisor.core.record import IssuedCredentials, Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal

@@ -14,10 +14,9 @@ from fog.bootstrap.bundles import machine_boot, machine_label
 from fog.bootstrap.domain_members import DomainMembers
 from fog.bootstrap.robot_config import reload
 from fog.cluster import CloudNode, ClusterPlan
-from fog.credentials import IssuedCredentials
 from fog.machine import MachineBundle
 from fog.site import Site
-from fog.supervisor.core.record import Outcome, Record
+from fog.supervisor.core.record import IssuedCredentials, Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from gdp.config.config import SwitchConfig
@@ -79,9 +78,9 @@ class MachineCredentials:
             name,
             command,
             token,
-            iface=self._site.machine_iface if self._site.border is None else "",
+            iface=self._site.config.device if self._site.border is None else "",
             uplink=uplink,
-            lease_s=self._site.lease_s,
+            lease_s=self._site.config.lease_s,
             has_relay=self._members.has_relay,
             software=software,
         )
@@ -128,7 +127,7 @@ class MachineCredentials:
 
     def _end_of_credentials(self, now_s: float) -> float:
         root = load_domain(self._site.authority.domain).root
-        until_s = min(now_s + self._site.credential_days * DAY_S, float(root.validity.not_after_unix_s))
+        until_s = min(now_s + self._site.config.credential_days * DAY_S, float(root.validity.not_after_unix_s))
         if until_s <= now_s:
             raise LocalError("the root of the domain has run out")
         return until_s
@@ -136,7 +135,7 @@ class MachineCredentials:
     def _handle_misused(self, record: Record, detail: str, release: Release, now_s: float) -> None:
         cluster = record.spec.cluster
         log.error("token misused cluster=%s machine=%s: %s", cluster, record.name, detail)
-        if not self._site.enrolment.revoke_misused or record.is_gone:
+        if not self._site.config.enrolment.revoke_misused or record.is_gone:
             self._events.put(record, "alarm", detail, now_s)
             return
         ending = Outcome.FAILED if record.served_unix_s is None else Outcome.PREEMPTED

@@ -53,7 +53,7 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
     Raises:
         LocalError: another supervisor runs, the provider is not available, or a port for machines is taken.
     """
-    timeouts = Timeouts() if site.provider == "local" else Timeouts(boot_s=JOIN_DEADLINE_S)
+    timeouts = Timeouts() if site.config.provider == "local" else Timeouts(boot_s=JOIN_DEADLINE_S)
     with (
         held(site, lock),
         closing(Journal(site.journal)) as journal,
@@ -79,7 +79,7 @@ def _members(site: Site) -> Iterator[DomainMembers]:
 @contextmanager
 def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[str, bytes]]]:
     """Serve the software of rented machines; yield what returns the files by which a new machine fetches it."""
-    if site.provider == "local" or site.software.is_empty:
+    if site.config.provider == "local" or site.config.software.is_empty:
         yield dict
         return
     host, port = site.software_listens
@@ -89,8 +89,8 @@ def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[st
         raise LocalError(f"software: listen on {host or '*'}:{port}: {error.strerror or error}") from error
     with ExitStack() as stack:
         stack.callback(listening.close)
-        url = f"https://{site.software_address}"
-        server = SoftwareServer(listening, site.software_folder, site.software, url, time.time)
+        url = f"https://{site.config.software_address}"
+        server = SoftwareServer(listening, site.software_folder, site.config.software, url, time.time)
         stack.callback(server.close)
         yield partial(server.bundle_file, lifetime_s)
 

@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -58,15 +58,13 @@ app.add_typer(rollover.app, name="rollover")
 
 Domain = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the domain's directory, with its root key")]
 Node = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--node", metavar="DIR", help="a node's directory at hand; it is completed in place"),
+    Path | None, typer.Option("--node", metavar="DIR", help="a node's directory at hand; it is completed in place")
 ]
 Request = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--request", metavar="FILE", help="a node.csr from elsewhere; needs --out"),
+    Path | None, typer.Option("--request", metavar="FILE", help="a node.csr from elsewhere; needs --out")
 ]
 ExpectedRole = Annotated[
-    Optional[Role],  # noqa: UP045
+    Role | None,
     typer.Option(
         "--role",
         help="what the node is to be, a leaf for a switch that carries no transit; compared with its request. "
@@ -74,17 +72,14 @@ ExpectedRole = Annotated[
     ),
 ]
 ExpectedLabel = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--label", help="its name for people; compared with its request. Asked for at a terminal"),
+    str | None, typer.Option("--label", help="its name for people; compared with its request. Asked for at a terminal")
 ]
 Nodes = Annotated[list[Path], typer.Option("--node", metavar="DIR", help="a node's directory at hand; repeatable")]
 OldCertificate = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--cert", metavar="FILE", help="the membership of a node elsewhere; needs --out"),
+    Path | None, typer.Option("--cert", metavar="FILE", help="the membership of a node elsewhere; needs --out")
 ]
 Before = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option("--before-days", min=0.0, help="renew only what ends within so many days"),
+    float | None, typer.Option("--before-days", min=0.0, help="renew only what ends within so many days")
 ]
 RootFile = Annotated[Path, typer.Option("--root", metavar="FILE", help="the domain's root certificate")]
 CertificateFile = Annotated[Path, typer.Argument(metavar="FILE", help="a membership, PEM or DER")]
@@ -251,7 +246,7 @@ def install(
 def show_(
     file: Annotated[Path, typer.Argument(metavar="NODE_DIR|FILE", help="a node's directory, or a membership")],
     root: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--root", metavar="FILE", help="the domain's root certificate; default: that of NODE_DIR"),
     ] = None,
     as_json: options.Json = False,

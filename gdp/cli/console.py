@@ -6,7 +6,7 @@ I/O. A program that reads a pipe needs whole lines, so nothing is wrapped or cut
 from __future__ import annotations
 
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Annotated, Final, Optional
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -27,9 +27,8 @@ def _choose(columns: int | None) -> int | None:
     return columns
 
 
-# typer reads this annotation at run time, on Python 3.10 too: hence Optional.
 Columns = Annotated[
-    Optional[int],  # noqa: UP045
+    int | None,
     typer.Option(
         "--columns",
         metavar="N",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -27,13 +27,13 @@ _FAILED: Final = 1
 _NOT_RUNNING: Final = 3
 
 NodeDirectory = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Argument(
         metavar="NODE_DIR", autocompletion=complete_node, help="Directory of the node's keys, or of the state of fog."
     ),
 ]
 Socket = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--socket", metavar="FILE", help="The node's control_socket, where its configuration names one."),
 ]
 Timeout = Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="How long to wait for each response.")]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -61,12 +61,13 @@ main = app.run
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
-Rights = Annotated[list[str], typer.Option("--right", help="publish, read, serve or call; may be repeated")]
+Rights = Annotated[
+    list[str], typer.Option("--right", metavar="RIGHT", help="publish, read, serve or call; may be repeated")
+]
 Epochs = Annotated[str, typer.Option("--epochs", help="whose secrets it gets, such as 0 or 0-3")]
 MayDelegate = Annotated[bool, typer.Option("--may-delegate", help="the node may pass the rights on")]
 TrustedRoot = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--root", metavar="FILE", help="refuse a card that is not of this domain"),
+    Path | None, typer.Option("--root", metavar="FILE", help="refuse a card that is not of this domain")
 ]
 OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]

@@ -28,6 +28,7 @@ from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import POLL_MAX_S, bind_server, serve_domain
 from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible
+from gdp.state.columns import columns
 from gdp.terminal import echo
 from gdp.trust.join_token import JoinRole
 
@@ -139,11 +140,8 @@ def ls(
         return
     titles = {"label": "label", "role": "role", "name": "name", "joined": "joined", "seen": "last seen",
               "expires": "expires", "state": "state"}  # fmt: skip
-    table = [titles, *({key: str(row[key] or "-") for key in titles} for row in rows)]
-    table = [{**each, "name": each["name"][:8]} for each in table]
-    widths = {key: max(len(each[key]) for each in table) for key in titles}
-    for each in table:
-        echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
+    cells = [[str(row[key] or "-")[: 8 if key == "name" else None] for key in titles] for row in rows]
+    echo("\n".join(columns([*titles.values()], cells)))
 
 
 def remove(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -34,8 +34,7 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="An incident that gdp
 def save(
     node: Annotated[str, typer.Argument(metavar="NODE", help="Its directory, label or control socket.")],
     output: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--output", metavar="FILE", help="Default: NODE-TIME.incident."),
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Default: NODE-TIME.incident.")
     ] = None,
     force: options.Force = False,
     as_json: options.Json = False,
@@ -78,7 +77,7 @@ def show_incident(file: File, as_json: options.Json = False) -> None:
 def replay(
     file: File,
     keys: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--keys", metavar="DIR", help="Directory of the node's keys, which open what it drew."),
     ] = None,
     as_json: options.Json = False,

@@ -11,7 +11,7 @@ import socket
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -49,11 +49,10 @@ _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]")
 JOIN_TOKEN: Final = Secret("join token", "--token-file", "GDP_TOKEN")
 
 Argument = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Argument(metavar="[-]", help="ask for the token, as without a file and without GDP_TOKEN"),
+    str | None, typer.Argument(metavar="[-]", help="ask for the token, as without a file and without GDP_TOKEN")
 ]
 TokenFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--token-file",
         metavar="FILE",
@@ -62,8 +61,7 @@ TokenFile = Annotated[
     ),
 ]
 LabelText = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--label", help="the machine's name for people; by default its host name"),
+    str | None, typer.Option("--label", help="the machine's name for people; by default its host name")
 ]
 MachinePath = Annotated[Path, typer.Argument(metavar="PATH", help="The machine's folder, or its machine.yaml.")]
 Suggest = Annotated[bool, typer.Option("--suggest", help="Only write proxy.yaml, or proxy.yaml.suggested next to one.")]

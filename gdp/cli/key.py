@@ -6,7 +6,7 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -30,8 +30,7 @@ app = typer.Typer(
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="of a domain, an owner or a node")]
 NewFile = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--new-passphrase-file", metavar="FILE", help="a private file with the new passphrase"),
+    Path | None, typer.Option("--new-passphrase-file", metavar="FILE", help="a private file with the new passphrase")
 ]
 
 

@@ -6,7 +6,8 @@ I/O: imports modules. Source: click's documentation, "Lazily loading subcommands
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections import UserDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,19 +59,21 @@ class LazyCommand:
         return with_version(command)
 
 
-class LazyCommands(MutableMapping[str, Any]):
+class LazyCommands(UserDict[str, Any]):
     """Commands of a group by name, in the order of its help; each is loaded when it is first read.
 
     Args:
         known: where each is.
-
-    Attributes:
-        loaded: those that were read.
     """
 
     def __init__(self, known: Mapping[str, LazyCommand]) -> None:
-        self._known = dict(known)
-        self.loaded: dict[str, Any] = {}
+        super().__init__(known)
+        self._known = known
+
+    @property
+    def loaded(self) -> dict[str, Any]:
+        """Return those that were read."""
+        return {name: each for name, each in self.data.items() if not isinstance(each, LazyCommand)}
 
     def summaries(self) -> list[tuple[str, str]]:
         """Return each name with what its command is for, without a load."""
@@ -82,30 +85,7 @@ class LazyCommands(MutableMapping[str, Any]):
         Raises:
             KeyError: there is none of that name.
         """
-        if name not in self.loaded:
-            self.loaded[name] = self._known[name].import_as(name)
-        return self.loaded[name]
-
-    def __setitem__(self, name: str, command: Any) -> None:
-        """Add or replace a command."""
-        self.loaded[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        """Remove a command."""
-        if name not in self:
-            raise KeyError(name)
-        self._known.pop(name, None)
-        self.loaded.pop(name, None)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether there is such a command, without a load."""
-        return name in self._known or name in self.loaded
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
-        yield from self._known
-        yield from (each for each in self.loaded if each not in self._known)
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return sum(1 for _ in self)
+        found = self.data[name]
+        if isinstance(found, LazyCommand):
+            found = self.data[name] = found.import_as(name)
+        return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -20,7 +20,7 @@ from gdp.names import NAME_BYTES, Name
 __all__ = ["Node", "connect", "find_name", "local_nodes", "names_of_machine"]
 
 Node = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--node",
         metavar="NODE",

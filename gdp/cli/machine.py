@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -35,8 +35,7 @@ __all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run
 BORDER_SEEN_S: Final = 20.0
 
 AtDirectory = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--directory", metavar="DIR", help="where the files are; /var/lib/gdp/NAME for root"),
+    Path | None, typer.Option("--directory", metavar="DIR", help="where the files are; /var/lib/gdp/NAME for root")
 ]
 NoSystemd = Annotated[bool, typer.Option("--no-systemd", help="run in the foreground until Ctrl-C, without units")]
 Start = Annotated[bool, typer.Option("--start/--no-start", help="start the programs of this machine")]

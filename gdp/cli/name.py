@@ -6,7 +6,7 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -18,7 +18,7 @@ from gdp.names import name_of
 __all__ = ["name"]
 
 Owner = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--owner", metavar="FILE", help="the owner's public key, PEM; without it the name is unowned"),
 ]
 

@@ -52,9 +52,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _OURS: Final = ("gdp", "proxy", "fog", "gdp_extensions")
 WRONG: Final = 2  # exit code of a wrong configuration
 
-Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/reference/configuration.md.")]
+Config = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="The YAML file; see docs/reference/configuration.md.")
+]
 FoundConfig = Annotated[
-    Path | None, typer.Option("--config", help="The YAML file; by default the one that this machine has.")
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="The YAML file; by default the one that this machine has."),
 ]
 Check = Annotated[bool, typer.Option("--check", help="Validate the configuration and end.")]
 AwaitIface = Annotated[
@@ -62,7 +65,9 @@ AwaitIface = Annotated[
     typer.Option(min=0.0, metavar="SECONDS", help="Wait so long for the device, which a switch may just be making."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Say what happens as lines of JSON on standard output.")]
-MemberPlane = Annotated[str | None, typer.Option("--data-plane", help="raw or scapy; instead of the file's.")]
+MemberPlane = Annotated[
+    str | None, typer.Option("--data-plane", metavar="PLANE", help="raw or scapy; instead of the file's.")
+]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too; as --log-level debug.")]
 
 

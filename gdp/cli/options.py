@@ -6,7 +6,7 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, NamedTuple, Optional
+from typing import Annotated, NamedTuple
 
 import typer
 
@@ -32,7 +32,6 @@ __all__ = [
 ]
 
 Kind = Annotated[str, typer.Option("--kind", help="topic, service, action, switch, rib, proxy, ...")]
-# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="further metadata; may be repeated")]
 
 _DAYS_MAX = CERTIFICATE_LIFE_MAX_S / 86_400
@@ -42,23 +41,22 @@ Host = Annotated[bool, typer.Option("--host", help="Nodes of other network names
 Days = Annotated[float, typer.Option("--days", min=0.001, max=_DAYS_MAX, help="how long it is valid")]
 Label = Annotated[str, typer.Option("--label", help="its name for people")]
 Directory = Annotated[Path, typer.Argument(metavar="DIR", help="where its files are, or are made")]
-Out = Annotated[Optional[Path], typer.Option("--out", "-o", metavar="FILE", help="write it to this file")]  # noqa: UP045
+Out = Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="write it to this file")]
 Protect = Annotated[bool, typer.Option("--protect", help="put private keys under a passphrase; see gdp key --help")]
 KeyUri = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)"),
+    str | None, typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)")
 ]
 
 
 class NameOptions(NamedTuple):
     """Options that describe a name, apart from its kind."""
 
-    name: Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")] = None  # noqa: UP045
-    type_: Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")] = None  # noqa: UP045
-    author: Annotated[Optional[str], typer.Option("--author", help="who made it")] = None  # noqa: UP045
-    maintainer: Annotated[Optional[str], typer.Option("--maintainer", help="who looks after it")] = None  # noqa: UP045
-    description: Annotated[Optional[str], typer.Option("--description", help="what it is")] = None  # noqa: UP045
-    pin: Annotated[Optional[int], typer.Option("--pin", help="a number that people remember")] = None  # noqa: UP045
+    name: Annotated[str | None, typer.Option("--name", help="its ROS name, such as /camera/image")] = None
+    type_: Annotated[str | None, typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")] = None
+    author: Annotated[str | None, typer.Option("--author", help="who made it")] = None
+    maintainer: Annotated[str | None, typer.Option("--maintainer", help="who looks after it")] = None
+    description: Annotated[str | None, typer.Option("--description", help="what it is")] = None
+    pin: Annotated[int | None, typer.Option("--pin", help="a number that people remember")] = None
     more: More = []  # noqa: RUF012 (the library copies it)
     salt_file: SaltFile = None
 

@@ -48,14 +48,19 @@ class PathProbe:
         begun_s = time.monotonic()
         ping_s = max(_PING_SHARE * (until_s - begun_s), _ROUND_MIN_S)
         (reply,) = self._ask([("ping", {"target": target, "name": self._name, "timeout_s": ping_s})])
-        answered = reply.get("state") == "answered"
-        switches = _number(reply, "switches") if answered else _BLIND_HOPS
-        if answered and reply.get("role") in _SWITCHES and target != self._own:
+        switches = _number(reply, "switches") if _is_answered(reply) else _BLIND_HOPS
+        if _is_answered(reply) and reply.get("role") in _SWITCHES and target != self._own:
             switches += 1  # it belongs to the path itself
-        hops = self._hops(target, switches, until_s)
-        if not answered:
-            while hops and hops[-1]["state"] == "silent":
-                hops.pop()  # as far as known, no node is there
+        replies = self._traces(target, switches, until_s)
+        end = next((at for at, each in enumerate(replies) if each.get("node") == target), None)
+        if end is not None:
+            if not _is_answered(reply):
+                reply = replies[end]  # only the ping or its reply was lost
+            del replies[end + (replies[end].get("role") in _SWITCHES) :]
+        answered = _is_answered(reply)
+        while replies and not answered and replies[-1].get("state") == "silent":
+            replies.pop()  # as far as known, no node is there
+        hops = [_described(each, number) for number, each in enumerate(replies, start=1)]
         seen = {str(hop["node"]) for hop in hops}
         self._add_below(target, hops, seen, until_s)
         return {
@@ -68,20 +73,15 @@ class PathProbe:
             "hops": hops,
         }
 
-    def _hops(self, target: str, switches: int, until_s: float) -> list[dict[str, object]]:
-        """Return the switches on the path, ours first."""
+    def _traces(self, target: str, switches: int, until_s: float) -> list[Mapping[str, object]]:
+        """Return the replies of the nodes on the path, our own switch first."""
         requests: list[tuple[str, Mapping[str, object]]] = []
         if self._is_switch or target == self._own:
             own = self._trace_of(None, target, until_s)  # our own switch
             requests.append(("trace", {**own, "body": {"p": target, "t": target}}))
         for count in range(1, switches + 1):
             requests.append(("trace", {**self._trace_of(target, target, until_s), "hops": min(count, HOPS_MAX - 1)}))
-        replies = self._ask(requests)
-        return [
-            _described(reply, number)
-            for number, reply in enumerate(replies, start=1)
-            if reply.get("node") != target or reply.get("role") in _SWITCHES
-        ]
+        return self._ask(requests)
 
     def _add_below(self, publisher: str, hops: list[dict[str, object]], seen: set[str], until_s: float) -> None:
         """Ask the switches below the branches, level by level."""
@@ -121,7 +121,7 @@ def _described(reply: Mapping[str, object], number: int) -> dict[str, object]:
     """Return the JSON fields of a switch; one that withholds its links shows its domain and delay only."""
     result = reply.get("result")
     facts = dict(result) if isinstance(result, Mapping) else {}
-    is_open = reply.get("state") == "answered" and not reply.get("withheld")
+    is_open = _is_answered(reply) and not reply.get("withheld")
     return {
         "hop": number,
         "state": reply.get("state"),
@@ -129,7 +129,7 @@ def _described(reply: Mapping[str, object], number: int) -> dict[str, object]:
         "label": reply.get("label") if is_open else None,
         "role": reply.get("role"),
         "domain_label": reply.get("domain_label"),
-        "rtt_ms": reply.get("rtt_ms") if reply.get("state") == "answered" else None,
+        "rtt_ms": reply.get("rtt_ms") if _is_answered(reply) else None,
         "withheld": bool(reply.get("withheld")),
         "cut": bool(reply.get("cut")),
         "in": facts.get("in"),
@@ -137,6 +137,10 @@ def _described(reply: Mapping[str, object], number: int) -> dict[str, object]:
         "needs_right": facts.get("w"),
         "branches": facts.get("branches", []),
     }
+
+
+def _is_answered(reply: Mapping[str, object]) -> bool:
+    return reply.get("state") == "answered"
 
 
 def _branches(hop: Mapping[str, object]) -> list[dict[str, object]]:

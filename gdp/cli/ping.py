@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -30,7 +30,7 @@ NameText = Annotated[
     str, typer.Argument(metavar="NAME", help="A ROS name that a proxy of this machine carries, or 64 hex digits.")
 ]
 Count = Annotated[
-    Optional[int],  # noqa: UP045
+    int | None,
     typer.Option("-c", "--count", min=1, metavar="COUNT", help="Stop after so many requests. Default: until Ctrl-C."),
 ]
 Interval = Annotated[

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -32,7 +32,7 @@ app = typer.Typer(no_args_is_help=True, help="Ask RIBs what they know.")
 _NONE: Final = 1
 
 Node = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--node",
         metavar="DIR",

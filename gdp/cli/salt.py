@@ -6,7 +6,7 @@ I/O.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -18,7 +18,7 @@ __all__ = ["NAME_SALT", "SaltFile", "read_salt"]
 NAME_SALT: Final = Secret("salt", "--salt-file", "GDP_SALT")
 
 SaltFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--salt-file",
         metavar="FILE",

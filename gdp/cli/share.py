@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -23,10 +23,10 @@ from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import HOUR_S, LOOK_S
 from gdp.sharing.folder_exchange import FolderExchange
+from gdp.sharing.grants import ShareReport
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.proxy_files import ProxyFiles, fits
-from gdp.sharing.report import ShareReport
 from gdp.sharing.revocations import publish_revocations
 from gdp.sharing.rules import kind_from_text
 from gdp.sharing.sharing import NOT_USED, WITHDRAWN, Sharing
@@ -47,40 +47,32 @@ _NOT_IN_FORCE: Final = (NOT_USED, WITHDRAWN, _WAITS)  # states begin so
 _ISSUED_COLUMNS: Final = ("name", "type", "node", "rights", "until", "state")
 _OFFER_COLUMNS: Final = ("name", "type", "from", "rights", "until", "state")
 
-# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 AnyName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**.")]
 OptionalName = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**."),
+    str | None, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**.")
 ]
 Nodes = Annotated[list[str], typer.Option("--to", metavar="NODE", help="A node or a group; may be repeated.")]
 With = Annotated[list[str], typer.Option("--with", metavar="NODE", help="A node or a group; may be repeated.")]
-Source = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--from", metavar="NODE", help="Only what this node offers."),
-]
+Source = Annotated[str | None, typer.Option("--from", metavar="NODE", help="Only what this node offers.")]
 Kind = Annotated[str, typer.Option("--kind", help="topic, service or action")]
 Type = Annotated[str, typer.Option("--type", help="Its type, such as sensor_msgs/msg/Image; else as it is found.")]
 OwnerDir = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--owner", metavar="DIR", help="The owner's directory. Default: owner, in the machine's directory."),
 ]
 MachineDir = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--directory", metavar="DIR", help="The machine's files. Default: this folder, or where it joined."),
 ]
 ExchangeDir = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--exchange", metavar="DIR", help="A folder that the machines share, in place of the domain's server."
     ),
 ]
-Encoding = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--encoding", help="json, cbor or cdr: how messages travel."),
-]
+Encoding = Annotated[str | None, typer.Option("--encoding", help="json, cbor or cdr: how messages travel.")]
 DeadlineMs = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(
         "--deadline-ms",
         min=0.001,
@@ -90,11 +82,10 @@ DeadlineMs = Annotated[
 ]
 NoRepair = Annotated[bool, typer.Option("--no-repair", help="Best effort: lost parts are not sent again.")]
 Weight = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option("--weight", min=1, max=WEIGHT_MAX, help="Share of a full path, next to others."),
+    int | None, typer.Option("--weight", min=1, max=WEIGHT_MAX, help="Share of a full path, next to others.")
 ]
 MaxBits = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option("--max-bits-s", min=RATE_MIN_BITS_S, max=RATE_MAX_BITS_S, help="Most bits of frames a second."),
 ]
 Wait = Annotated[
@@ -225,10 +216,7 @@ def share(
     owner: OwnerDir = None,
     days: options.Days = SHARE_DAYS,
     plain_name: PlainName = False,
-    revoke: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--revoke", metavar="NODE", help="Take back what NODE got."),
-    ] = None,
+    revoke: Annotated[str | None, typer.Option("--revoke", metavar="NODE", help="Take back what NODE got.")] = None,
     renew: Annotated[
         bool, typer.Option("--renew", help="Renew what is due and take mail, once, where no agent does it.")
     ] = False,

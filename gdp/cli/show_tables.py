@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from enum import Enum
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -43,14 +43,13 @@ What = Annotated[
     Table, typer.Argument(metavar="TABLE", help="neighbors, links, routes, trees, names, tunnels, drops or peers.")
 ]
 OneNode = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option(
         "--node", metavar="NODE", help="This node only: its directory, its label or its control socket. Default: all."
     ),
 ]
 Columns = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--columns", metavar="A,B,C", help="Print these columns only, in this order."),
+    str | None, typer.Option("--columns", metavar="A,B,C", help="Print these columns only, in this order.")
 ]
 
 

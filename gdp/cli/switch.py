@@ -34,9 +34,13 @@ def switch(
     config: FoundConfig = None,
     iface: Annotated[
         list[str] | None,
-        typer.Option(help="A port; once for each. Adds to the file's; replaces those of a found file."),
+        typer.Option(
+            metavar="DEVICE", help="A port; once for each. Adds to the file's; replaces those of a found file."
+        ),
     ] = None,
-    data_plane: Annotated[str | None, typer.Option(help="auto, kernel, raw or scapy; instead of the file's.")] = None,
+    data_plane: Annotated[
+        str | None, typer.Option(metavar="PLANE", help="auto, kernel, raw or scapy; instead of the file's.")
+    ] = None,
     check: Check = False,
     json: Json = False,
     *,

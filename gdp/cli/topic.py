@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Optional
+from typing import Annotated, ClassVar, Final
 
 import typer
 
@@ -45,7 +45,7 @@ JsonLines = Annotated[bool, typer.Option("--json", help="Print one JSON object a
 
 
 Node = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--node",
         envvar="GDP_NODE",

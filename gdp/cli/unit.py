@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -23,6 +23,7 @@ from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import UNIT_FOLDER, has_systemd, install_units, installed_units, remove_units
 from gdp.errors import LocalError
 from gdp.intervals import SERVER_S
+from gdp.state.columns import columns
 
 __all__ = ["app"]
 
@@ -34,12 +35,10 @@ _ETC: Final = Path("/etc/gdp")
 app = typer.Typer(help="systemd units of this machine's nodes.", no_args_is_help=True)
 
 Where = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="[PATH]", help="The machine's folder or its machine.yaml; by default /etc/gdp."),
+    Path | None, typer.Argument(metavar="[PATH]", help="The machine's folder or its machine.yaml; by default /etc/gdp.")
 ]
 Whose = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp unit installed."),
+    Path | None, typer.Argument(metavar="[DIR]", help="The machine's folder; by default all that gdp unit installed.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the files, and change nothing.")]
 
@@ -170,12 +169,9 @@ def _last_words(unit: str) -> str:
 
 
 def _table(states: Sequence[UnitState]) -> str:
-    rows = [("unit", "state", "at boot", "restarts", "node")]
+    rows = []
     for each in states:
         up = "" if each.uptime_s is None else f", up {each.uptime_s:g} s"
         node = "-" if each.node is None else f"{each.node}{up}"
         rows.append((each.unit, each.active, "yes" if each.enabled else "no", str(each.restarts), node))
-    widths = [max(len(row[at]) for row in rows) for at in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return "\n".join(columns(("unit", "state", "at boot", "restarts", "node"), rows))

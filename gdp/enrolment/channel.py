@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Root
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import FLAG, Keyed, text
@@ -57,7 +58,7 @@ def client_context() -> ssl.SSLContext:
     return context
 
 
-class Channel:
+class Channel(ClosedOnExit):
     """A connection whose server has proved to be that of the domain.
 
     Attributes:
@@ -81,12 +82,6 @@ class Channel:
         """End a request that another thread waits for; it raises ``UnreachableError`` there."""
         with contextlib.suppress(OSError):  # closed in the meantime
             socket.socket.shutdown(self._peer, socket.SHUT_RDWR)  # of the plain socket: TLS stays the waiter's
-
-    def __enter__(self) -> Channel:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def request(self, fields: Mapping[str, object], *, timeout_s: float = CONNECT_S) -> Message:
         """Send a request and return the response.

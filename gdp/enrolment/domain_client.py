@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Keyed, inner, many
@@ -93,7 +94,7 @@ class ReceivedMail:
     sent_unix_ms: int
 
 
-class DomainClient:
+class DomainClient(ClosedOnExit):
     """A member's authenticated connection to the enrolment server.
 
     Args:
@@ -127,12 +128,6 @@ class DomainClient:
     def close(self) -> None:
         """Close the connection."""
         self._channel.close()
-
-    def __enter__(self) -> DomainClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def nodes(self) -> list[Machine]:
         """Return the machines of the domain, in the order of their labels; removed ones are left out.

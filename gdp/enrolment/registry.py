@@ -164,12 +164,6 @@ class Registry(TransactionFile):
         write_all(folder, {})
         super().__init__(folder / _FILE, _TABLES)
 
-    def __enter__(self) -> Registry:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     # tokens
 
     def add_token(

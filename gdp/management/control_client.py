@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from gdp.closing import ClosedOnExit
 from gdp.crypto.cbor import decode
 from gdp.errors import LocalError
 from gdp.host.single_instance import lock_directories, lock_directory
@@ -130,7 +131,7 @@ def ask_node(path: Path, command: Command, timeout_s: float, name: Name | None =
     raise NodeEndedError(path)
 
 
-class NodeConnection:
+class NodeConnection(ClosedOnExit):
     """Connection to a node's control socket, for many requests.
 
     Args:
@@ -151,12 +152,6 @@ class NodeConnection:
             self._socket = connect_control(path, timeout_s)
         except OSError as error:
             raise _translated(error, path, timeout_s) from error
-
-    def __enter__(self) -> NodeConnection:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def fileno(self) -> int:
         """Return a descriptor that is readable when a response may have come."""

@@ -9,12 +9,12 @@ import logging
 import os
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Final, TypeVar
+from typing import Final
 
+from gdp.closing import ClosedOnExit
 from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
@@ -32,24 +32,8 @@ log = logging.getLogger(__name__)
 
 CALL_TIMEOUT_S: Final = 10.0
 
-_C = TypeVar("_C")
 
-
-class _ClosedOnExit(ABC):
-    """Context manager that closes itself."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the object. Idempotent."""
-
-    def __enter__(self: _C) -> _C:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-
-class Publisher(BasePublisher[Driver], _ClosedOnExit):
+class Publisher(BasePublisher[Driver], ClosedOnExit):
     """Publisher of one name; made by ``Session.publisher``."""
 
     def put(self, payload: bytes, timeout_s: float | None = None) -> None:
@@ -92,7 +76,7 @@ class Publisher(BasePublisher[Driver], _ClosedOnExit):
             raise self._unconfirmed(timeout_s)
 
 
-class Subscription(BaseSubscription[Driver], _ClosedOnExit):
+class Subscription(BaseSubscription[Driver], ClosedOnExit):
     """Messages of one name as an iterator that waits for the next; made by ``Session.subscribe``."""
 
     def receive(self, timeout_s: float | None = None) -> Message:
@@ -141,7 +125,7 @@ class Subscription(BaseSubscription[Driver], _ClosedOnExit):
 Handler = Callable[[Request], bytes]
 
 
-class Server(BaseServer[Driver, Handler], _ClosedOnExit):
+class Server(BaseServer[Driver, Handler], ClosedOnExit):
     """Server of one name with a handler; made by ``Session.serve``."""
 
     def _start(self, workers: int) -> None:
@@ -292,7 +276,7 @@ class Session(BaseSession[Driver, Publisher, Subscription, Server, Handler]):
             if publisher.readers:
                 self.driver.wait(publisher._publisher.is_acknowledged, deadline_s)
         for opened in list(self._opened):
-            if isinstance(opened, _ClosedOnExit):
+            if isinstance(opened, ClosedOnExit):
                 opened.close()
         self.driver.run(lambda: self.core.close(self.driver.now_s()))
         self.driver.wait(lambda: False, self.driver.now_s() + GOODBYE_S)

@@ -22,8 +22,9 @@ from gdp.intervals import ADVERTISEMENT
 from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
 
-__all__ = ["SessionConfig", "settings_of"]
+__all__ = ["MEMBER_KEYS", "SessionConfig", "settings_of"]
 
+MEMBER_KEYS: Final = {"identity", "domain", "iface", "delegations", "state", "lease_s", "busy_poll_us"}
 _SUFFIXES: Final = (".yaml", ".yml")
 
 
@@ -81,11 +82,11 @@ def settings_of(
         sibling = next((file for suffix in _SUFFIXES if (file := path.with_name(path.name + suffix)).is_file()), None)
         config = None if sibling is None else load(SessionConfig, sibling)
         if config is not None and config.identity.resolve() == path.resolve():
-            values = _values(config)
+            values = config.model_dump(include=MEMBER_KEYS)
         else:
             values = {"identity": path, "iface": f"{path.name}0", "domain": {"root": path / ROOT_CERTIFICATE}}
     elif path.is_file():
-        values = _values(load(SessionConfig, path))
+        values = load(SessionConfig, path).model_dump(include=MEMBER_KEYS)
     else:
         raise LocalError(f"{path}: no such directory or file; give a node's directory, or its configuration file")
     options = {
@@ -101,16 +102,6 @@ def settings_of(
         return SessionConfig.model_validate_json(orjson.dumps(values, default=os.fspath), strict=True)
     except ValidationError as error:
         raise LocalError(f"{path}: {first_fault(error)}") from error
-
-
-def _values(config: SessionConfig) -> dict[str, object]:
-    keys = ("identity", "iface", "delegations", "state", "lease_s", "busy_poll_us")
-    domain = {
-        "root": config.domain.root,
-        "trusts": list(config.domain.trusts),
-        "transit": None if config.domain.transit is None else list(config.domain.transit),
-    }
-    return {**{key: getattr(config, key) for key in keys}, "domain": domain}
 
 
 def _domain(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.config.offered_qos import OfferedQos
@@ -19,14 +19,13 @@ from gdp.names import Name
 from gdp.sharing.exchange import Exchange, Exposure, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
-from gdp.sharing.report import ShareReport
-from gdp.sharing.state import ExposedName, ShareState
+from gdp.sharing.state import ExposedName, Offer, ShareState
 from gdp.stores.keyring import load_delegation, load_owner, save_delegation
 from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["GIVING", "TAKING", "Grants", "described"]
+__all__ = ["GIVING", "TAKING", "Grants", "ShareReport", "described"]
 
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
 _GIVES: Final = frozenset(GIVING.values())
@@ -37,6 +36,28 @@ def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:
     """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
     own = {"kind": kind, "name": name, "type": type_name}
     return Metadata({**own, SALT: salt} if salt else own)
+
+
+@dataclass(slots=True)
+class ShareReport:
+    """What was done, and what could not be done.
+
+    Args:
+        is_running: whether the proxy runs and has taken the change; None: nothing had to change.
+        granted: delegations that were issued.
+        received: offers that came.
+        problems: texts; what they are about is tried again at the next upkeep.
+    """
+
+    is_running: bool | None = None
+    granted: list[IssuedDelegation] = field(default_factory=list)
+    received: list[Offer] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def add_problem(self, error: GdpError) -> None:
+        """Add the text of an error, unless it is there already."""
+        if str(error) not in self.problems:
+            self.problems.append(str(error))
 
 
 @dataclass(slots=True, kw_only=True)

@@ -20,10 +20,9 @@ from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import SALT, Metadata
 from gdp.names import Name
 from gdp.sharing.exchange import Exchange, Exposure, Mail, MailKind, load_groups, resolve_recipients
-from gdp.sharing.grants import GIVING, TAKING, Grants, described
+from gdp.sharing.grants import GIVING, TAKING, Grants, ShareReport, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import LiveNames, ProxyFiles, Side, StatedRule, fits
-from gdp.sharing.report import ShareReport
 from gdp.sharing.rules import check_accepted, check_exposed, check_name, kind_from_text, render, usable
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder, links_of
 from gdp.stores.keyring import CARD, load_card, load_delegation, load_root, load_salt, save_delegation

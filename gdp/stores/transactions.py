@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import StoreError
 
 __all__ = ["TransactionFile"]
@@ -19,7 +20,7 @@ __all__ = ["TransactionFile"]
 _LOCKED_S: Final = 10.0  # wait for another writing process
 
 
-class TransactionFile:
+class TransactionFile(ClosedOnExit):
     """Opened file; ``tables`` are the statements that make its tables where they are not there.
 
     Args:

@@ -230,4 +230,4 @@ def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float
 
 def open_aws(site: Site) -> AwsProvider:
     """Return the provider of a site."""
-    return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.aws)
+    return AwsProvider(lambda hardware, spot: price_list("aws", hardware, spot=spot), site.config.aws)

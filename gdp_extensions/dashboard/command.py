@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -23,11 +23,11 @@ app = Program("gdp dashboard")
 _PORT_MAX: Final = 65_535
 
 Nodes = Annotated[
-    Optional[list[Path]],  # noqa: UP045
+    list[Path] | None,
     typer.Option("--node", metavar="DIR", help="Directory of a node's keys; may be repeated. Default: all nodes here."),
 ]
 States = Annotated[
-    Optional[list[Path]],  # noqa: UP045
+    list[Path] | None,
     typer.Option("--state", metavar="DIR", help="State folder of fog, for its clusters; may be repeated."),
 ]
 Port = Annotated[int, typer.Option(min=0, max=_PORT_MAX, help="Port of 127.0.0.1; 0: the system chooses.")]

@@ -17,10 +17,10 @@ from gdp_extensions.dds.graph_cache import GraphCache
 from gdp_extensions.dds.node import EntityContext, Node
 from gdp_extensions.dds.services import Client, Server
 from gdp_extensions.dds.topics import Publication, Subscription
-from gdp_extensions.dds.types import hash_of, known_channel
 from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
+from proxy.serial.standard_types import standard_channel, type_hash
 
 __all__ = ["DdsEndpoint"]
 
@@ -72,7 +72,7 @@ class DdsEndpoint:
 
     def channel(self, topic: str, type_name: str) -> Channel:
         """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes."""
-        known = known_channel(topic, type_name)
+        known = standard_channel(topic, type_name)
         if known is not None:
             return known
         for peer in self._survey.peers(Role.PUBLISHES, topic, type_name):
@@ -104,7 +104,7 @@ class DdsEndpoint:
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: messages of ROS {channel.ros} cannot be published in DDS")
         handle = next(self._numbers)
-        return self._keep(handle, Publication(self._context(handle), channel, hash_of(channel)))
+        return self._keep(handle, Publication(self._context(handle), channel, _hash_of(channel)))
 
     def publish(self, handle: int, raw: bytes) -> None:
         """Publish one message."""
@@ -180,3 +180,13 @@ class DdsEndpoint:
         if graph != self._shown:
             self._shown = graph
             self._tell(GraphChanged())
+
+
+def _hash_of(channel: Channel) -> str:
+    """Return the ROS 2 type hash of a channel: its own, or that of its definition; empty where it cannot be derived."""
+    if channel.hash.startswith("RIHS01_"):
+        return channel.hash
+    if channel.definition_format:
+        return type_hash(channel.type_name, channel.definition, channel.definition_format)
+    known = standard_channel(channel.topic, channel.type_name)
+    return known.hash if known is not None else ""

@@ -12,10 +12,10 @@ from gdp_extensions.dds import library
 from gdp_extensions.dds.naming import dds_type, user_data
 from gdp_extensions.dds.node import EntityContext, Sample
 from gdp_extensions.dds.profile import offered, requested
-from gdp_extensions.dds.types import known_channel
 from proxy.endpoints.core.endpoint import EndpointError, MessageReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel, Qos
+from proxy.serial.standard_types import standard_channel
 
 __all__ = ["Publication", "Subscription"]
 
@@ -50,7 +50,7 @@ class Subscription:
         self._node.close(self._reader)
 
     def _describe(self, peers_hash: str) -> None:
-        known = known_channel(self._bare.topic, self._bare.type_name)
+        known = standard_channel(self._bare.topic, self._bare.type_name)
         if known is None or (peers_hash and known.hash != peers_hash):
             known = replace(self._bare, hash=peers_hash)
         if known != self._channel:

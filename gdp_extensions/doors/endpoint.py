@@ -36,8 +36,8 @@ from proxy.bridge.core.delegated_rules import DelegatedRules
 from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos
-from proxy.serial.known_types import known_channel
 from proxy.serial.service import Service
+from proxy.serial.standard_types import known_channel
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -23,7 +23,7 @@ DOOR_TOKEN: Final = Secret("door token", "--token-file", "GDP_DOOR_TOKEN")
 _CHARACTERS_MIN: Final = 16
 
 TokenFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option(
         "--token-file",
         metavar="FILE",

@@ -181,4 +181,4 @@ def _accelerators(hardware: Hardware) -> str:
 
 def open_skypilot(site: Site) -> SkyPilotProvider:
     """Return the provider of a site."""
-    return SkyPilotProvider(site.skypilot)
+    return SkyPilotProvider(site.config.skypilot)

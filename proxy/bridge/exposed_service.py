@@ -92,7 +92,7 @@ class ExposedService(ServiceFlow):
         self._early = UndescribedRequests()
         endpoint, rule = dispatcher.endpoint, flow_spec.rule
         self._exchange = replace(self.parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
-        self._remote_clients = RemoteClients(self._exchange, endpoint.ros)
+        self._remote_clients = RemoteClients(self._exchange, endpoint.ros, is_strict=flow_spec.rule.is_strict)
         self._mark = dispatcher.advertise(self, sign(presence_of(flow_spec.local), endpoint.ros))
         self._servers = [dispatcher.create_client(self, *part) for part in self.parts.services]
         self._stopper = None if rule.stop is None else dispatcher.create_client(self, rule.stop, TRIGGER)

@@ -17,7 +17,7 @@ from gdp.extras import MissingExtraError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.reduction import MessageExpander, expander_of
 from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
@@ -29,6 +29,8 @@ from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPubl
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
+from proxy.serial.channel import Channel
+from proxy.serial.frames import FrameRewriter
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
@@ -39,10 +41,11 @@ _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 
 
 class _Decoded(NamedTuple):
-    """Expander, decoder and output of one remote channel."""
+    """Expander, decoder, rewriter and output of one remote channel."""
 
     expander: MessageExpander
     incoming: MessageDecoder
+    frames: FrameRewriter | None  # where the rule renames frames
     handle: int  # of the local output
 
 
@@ -190,8 +193,10 @@ class ImportedTopic:
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
-        expander, incoming, handle = channels[ros_message.channel]
+        expander, incoming, frames, handle = channels[ros_message.channel]
         raw = incoming.decode(*expander.expand(ros_message))
+        if frames is not None:
+            raw = frames.rewrite(raw)
         if len(raw) > rule.max_bytes:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
@@ -213,12 +218,21 @@ class ImportedTopic:
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
             expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
+            rewriters = [self._rewriter(each.target) for each in incoming]
         except DefinitionError as error:
-            self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
+            self._context.faults.report(
+                what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}; 'fields: default' allows it"
+            )
             return None
+        if differences := differences_of(incoming):
+            self._context.faults.report(what, Fault.OTHER_TYPE, differences)
         try:
             handles = self._output.add(publisher, sources, [each.target for each in incoming])
         except LocalError as error:
             self._context.faults.report(what, self._output.refusal, str(error))
             return None
-        return tuple(map(_Decoded, expanders, incoming, handles))
+        return tuple(map(_Decoded, expanders, incoming, rewriters, handles))
+
+    def _rewriter(self, channel: Channel) -> FrameRewriter | None:
+        frames = self._flow_spec.rule.frames
+        return None if frames is None else FrameRewriter(channel, frames.rename)

@@ -96,7 +96,8 @@ class MergedPublisher:
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return a decoder by the remote definition that converts into this machine's."""
-        return MessageDecoder.ready(source, encoding, self._known(), self._dispatcher.endpoint.ros)
+        ros, is_strict = self._dispatcher.endpoint.ros, self._flow_spec.rule.is_strict
+        return MessageDecoder.ready(source, encoding, self._known(), ros, is_strict=is_strict)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Offer the QoS of a remote publisher; its channels share the virtual publisher."""

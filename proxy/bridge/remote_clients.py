@@ -33,10 +33,11 @@ class _Caller:
 
 
 class RemoteClients:
-    """All clients of one service."""
+    """All clients of one service; ``is_strict``: as ``MessageDecoder.ready``."""
 
-    def __init__(self, ours: Exchange, ros: RosVersion) -> None:
+    def __init__(self, ours: Exchange, ros: RosVersion, *, is_strict: bool) -> None:
         self._ours = ours
+        self._is_strict = is_strict
         self._ros = ros
         self._known: dict[bytes, _Caller] = {}
 
@@ -65,7 +66,10 @@ class RemoteClients:
         try:
             theirs = Exchange.from_cbor(description)
             pairs = zip(theirs.services, self._ours.services, strict=False)
-            ready = (MessageDecoder.ready(a.request, theirs.encoding, b.request, self._ros) for a, b in pairs)
+            ready = (
+                MessageDecoder.ready(a.request, theirs.encoding, b.request, self._ros, is_strict=self._is_strict)
+                for a, b in pairs
+            )
             return _Caller(description, tuple(ready))
         except LocalError as error:
             return _Caller(description, unlike=str(error))

@@ -12,6 +12,7 @@ from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch
 from gdp.service.sequencer import Sequencer
+from proxy.bridge.core.decoder import differences_of
 from proxy.bridge.core.goals import Goals
 from proxy.bridge.core.remote_server import RemoteServer
 from proxy.bridge.faults import Fault
@@ -112,7 +113,7 @@ class ServerDiscovery:
         self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
         try:
             server = RemoteServer.set_description(
-                incarnation, description, self._flow.parts, self._flow.dispatcher.endpoint, rule.encoding
+                incarnation, description, self._flow.parts, self._flow.dispatcher.endpoint, rule
             )
             if server.exchange is not None and server.exchange.is_ordered != rule.is_ordered:
                 side = "the far side's" if rule.is_ordered else "this side's"
@@ -124,6 +125,8 @@ class ServerDiscovery:
             self._flow.report(Fault.OTHER_TYPE, str(error))
             return
         self.servers[name] = server
+        if differences := differences_of((*server.answers, *server.news)):
+            self._flow.report(Fault.OTHER_TYPE, differences)
 
     def _announce(self, name: Name, server: RemoteServer, now_s: float) -> None:
         for dispatch in self._calls:

@@ -1,22 +1,21 @@
 """Options that commands share which act as one node.
 
-I/O-free; typer reads these annotations at run time, on Python 3.10 too: hence Optional.
+I/O-free.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 __all__ = ["Delegations", "Iface"]
 
 Iface = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--iface", metavar="DEVICE", help="Device towards the switch. Default: as the node says."),
+    str | None, typer.Option("--iface", metavar="DEVICE", help="Device towards the switch. Default: as the node says.")
 ]
 Delegations = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--delegations", metavar="DIR", help="What owners gave the node. Default: as the node says."),
 ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Final, Optional, cast
+from typing import Annotated, Final, cast
 
 import typer
 import yaml
@@ -37,9 +37,8 @@ RuleName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a 
 ConfigFile = Annotated[Path, typer.Option("--config", metavar="FILE", help="The configuration of the proxy.")]
 RuleKind = Annotated[str, typer.Option("--kind", help="topic, service or action")]
 RuleType = Annotated[str, typer.Option("--type", help="Its type, such as sensor_msgs/msg/Image; else as it is found.")]
-# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 OwnerKey = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--owner", metavar="FILE", help="The owner's public key (owner.pub). Default: proxy.yaml's owner."),
 ]
 Settings = Annotated[

@@ -12,7 +12,7 @@ import sys
 import time
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
@@ -37,21 +37,14 @@ DEFAULT_CONFIG: Final = Path("proxy.yaml")
 
 WatchedName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /robot1/**.")]
 ConfigFile = Annotated[Path, typer.Option("--config", metavar="FILE", help="The configuration of the running proxy.")]
-# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 Deadline = Annotated[
-    Optional[float],  # noqa: UP045
+    float | None,
     typer.Option(
         "--deadline", min=0.1, metavar="SECONDS", help="A publisher is silent that sends nothing for so long."
     ),
 ]
-Duration = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option("--for", min=0.0, metavar="SECONDS", help="End after so many seconds."),
-]
-Count = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option("--count", min=1, help="End after so many events."),
-]
+Duration = Annotated[float | None, typer.Option("--for", min=0.0, metavar="SECONDS", help="End after so many seconds.")]
+Count = Annotated[int | None, typer.Option("--count", min=1, help="End after so many events.")]
 
 
 @app.command(no_args_is_help=True)

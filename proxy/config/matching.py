@@ -84,7 +84,9 @@ class _Seen:
         overlay = (rule.kind, rule.global_name_of(rule.name), tuple(sorted(rule.extra.items())), rule.owner.compressed)
         yield overlay, f"gives the same name: {rule.name}"
         if not rule.is_pattern or self._side == "expose":  # patterns of several owners may be imported into one graph
-            local = (rule.kind, rule.local, self._place_of(rule))
+            # The topics of several robots may become one topic here, such as /tf.
+            robot = rule.prefix if self._side == "import" and rule.kind == "topic" else None
+            local = (rule.kind, rule.local, robot, self._place_of(rule))
             yield local, f"is about {rule.local} of this machine, too"
 
 

@@ -48,6 +48,7 @@ from gdp.ros_names import (
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
+from proxy.config.frames import Frames
 from proxy.config.history import SomeHistory
 from proxy.config.readiness import Readiness
 from proxy.config.reduction import CLOUD, IMAGE, QUALITY, Region, SomeAdapt, SomeCompress
@@ -67,7 +68,7 @@ DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTP
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_KINDS: Final = {  # keys that only the rules of these kinds have
-    "topics": ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS),
+    "topics": ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", "frames", *REDUCTIONS),
     "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
     "services": ("stop", "at_once", "state", "state_node"),
 }
@@ -229,6 +230,11 @@ class Rule(Section):
         json_schema_extra=_without_default,
     )
     encoding: Encoding = Field(default="json", description="How messages travel; the sender's choice holds.")
+    fields_differ: Literal["strict", "default"] = Field(
+        default="strict",
+        alias="fields",
+        description="Where two machines define a type differently: refuse, or fill missing fields and drop others.",
+    )
     wants_reliable: bool | None = Field(
         default=None, alias="reliable", description="Topics: readers ask for what they miss. `null`: by QoS."
     )
@@ -263,6 +269,7 @@ class Rule(Section):
         le=MESSAGE_MAX_BYTES,
         description="Larger messages, as ROS wrote them, are counted only.",
     )
+    frames: Frames | None = Field(default=None, description="Imported topics: names of coordinate frames here.")
     compress: SomeCompress = Field(default=None, description="Exposed topics: compressed bodies.")
     image: PictureFormat | None = Field(
         default=None, description="Exposed sensor_msgs/msg/Image: travels so; needs the extra `images`."
@@ -374,6 +381,11 @@ class Rule(Section):
     def overlay_name(self) -> Name:
         """Return the 256-bit overlay name."""
         return self.overlay_metadata.name(self.owner.compressed)
+
+    @property
+    def is_strict(self) -> bool:
+        """Return whether both sides must have the same fields."""
+        return self.fields_differ == "strict"
 
     @property
     def is_ordered(self) -> bool:

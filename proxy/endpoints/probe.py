@@ -13,8 +13,8 @@ from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, RequestReceived, Role
 from proxy.endpoints.in_process import InProcessEndpoint
 from proxy.serial.channel import Channel, Qos
-from proxy.serial.known_types import known_channel
 from proxy.serial.service import Service
+from proxy.serial.standard_types import known_channel
 
 __all__ = ["Probe"]
 

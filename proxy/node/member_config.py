@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from gdp.config.schema import first_fault
 from gdp.errors import LocalError
-from gdp.session.settings import SessionConfig, settings_of
+from gdp.session.settings import MEMBER_KEYS, settings_of
 from proxy.config.config import ProxyConfig
 
 __all__ = ["member_config"]
@@ -32,24 +32,8 @@ def member_config(node: Path, iface: str | None, delegations: Path | None) -> tu
     directory = settings.delegation_directory
     if not directory.is_dir():
         raise LocalError(f"{directory}: no delegations; install one with 'gdp delegate install FILE --node {node}'")
+    values = settings.model_dump(include=MEMBER_KEYS) | {"delegations": directory}
     try:
-        return ProxyConfig.model_validate_json(orjson.dumps(_values(settings, directory), default=os.fspath)), directory
+        return ProxyConfig.model_validate_json(orjson.dumps(values, default=os.fspath)), directory
     except ValidationError as error:
         raise LocalError(f"{node}: {first_fault(error)}") from error
-
-
-def _values(settings: SessionConfig, directory: Path) -> dict[str, object]:
-    domain = settings.domain
-    return {
-        "identity": settings.identity,
-        "domain": {
-            "root": domain.root,
-            "trusts": list(domain.trusts),
-            "transit": None if domain.transit is None else list(domain.transit),
-        },
-        "iface": settings.iface,
-        "delegations": directory,
-        "state": settings.state,
-        "lease_s": settings.lease_s,
-        "busy_poll_us": settings.busy_poll_us,
-    }

@@ -29,11 +29,9 @@ from gdp.trust.domain import Policy
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.desired_flows import FlowSpec
-from proxy.bridge.core.flow_fields import flow_fields
-from proxy.bridge.core.topic_rows import flow_rows
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
-from proxy.bridge.topic_counts import topic_counts
+from proxy.bridge.flow_rows import flow_fields, flow_rows, topic_counts
 from proxy.serial.channel import Qos
 
 __all__ = ["ProxyState", "described", "proxy_handlers", "proxy_sources"]

@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 import apsw
@@ -28,6 +27,7 @@ from rosbags.rosbag2 import ReaderError as ReaderError2
 from rosbags.rosbag2 import metadata as rosbag2_metadata
 from ruamel.yaml.error import YAMLError
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import ConfigError, LocalError
 from proxy.recordings import mcap_format, salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
@@ -68,7 +68,7 @@ _METADATA_MAX_BYTES: Final = 1 << 20
 _STORAGE: Final = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")
 
 
-class BagDecoder:
+class BagDecoder(ClosedOnExit):
     """An open recording.
 
     Args:
@@ -123,14 +123,6 @@ class BagDecoder:
     def close(self) -> None:
         """Close the files."""
         self._source.close()
-
-    def __enter__(self) -> BagDecoder:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _checked(channel: Channel) -> tuple[Channel, str]:
@@ -227,7 +219,7 @@ class _UnpackedFile(UnpackedSource):
 def _open_mcap(path: Path) -> Source:
     if path.suffix == ".mcap" and salvage_mcap.is_indexed(path):
         try:
-            return _McapSource(path)
+            return _IndexedSource(Reader2(path), functools.partial(salvage_mcap.scan, path))
         except _FOREIGN:
             pass  # a profile or an encoding that rosbags does not read
     return salvage_mcap.scan(path)
@@ -235,7 +227,7 @@ def _open_mcap(path: Path) -> Source:
 
 def _open_ros1(path: Path) -> Source:
     try:
-        return _Rosbag1Source(path)
+        return _IndexedSource(Reader1(path), functools.partial(salvage_ros1.scan, path))
     except _FOREIGN:
         return salvage_ros1.scan(path)  # no index, or a truncated one
 
@@ -243,18 +235,24 @@ def _open_ros1(path: Path) -> Source:
 class _IndexedSource:
     """A recording whose index rosbags can read; what follows damage is found by a scan of the file."""
 
-    def __init__(self, connections: list[Connection], count: int, scan: Callable[[], Source]) -> None:
+    def __init__(self, reader: Reader1 | Reader2, scan: Callable[[], Source]) -> None:
+        self._reader = reader
         self._scan = scan
-        self.channels = [from_connection(connection) for connection in connections]
-        self.count = count
-        self.counts: list[int] | None = [connection.msgcount for connection in connections]
+        reader.open()
+        try:
+            self.channels = [from_connection(connection) for connection in reader.connections]
+        except _FOREIGN:
+            reader.close()
+            raise
+        self.count = reader.message_count
+        self.counts: list[int] | None = [connection.msgcount for connection in reader.connections]
         self.unread = ""
-        self._index = {_key(connection): index for index, connection in enumerate(connections)}
+        self._index = {_key(connection): index for index, connection in enumerate(reader.connections)}
 
-    def _messages(self, read: Callable[[], Iterator[tuple[Connection, int, bytes]]]) -> Iterator[Message]:
+    def messages(self) -> Iterator[Message]:
         given, last_ns, equal = 0, -1, 0  # how many of the newest time
         try:
-            for connection, stamp_ns, raw in read():
+            for connection, stamp_ns, raw in self._reader.messages():
                 if isinstance(raw, int | str):
                     raise ReaderError2("a message that is not bytes")
                 yield Message(self._index[_key(connection)], stamp_ns, bytes(raw))
@@ -289,35 +287,6 @@ class _IndexedSource:
             raise
         except _FOREIGN:
             return  # the count shows what is missing
-
-
-class _Rosbag1Source(_IndexedSource):
-    def __init__(self, path: Path) -> None:
-        self._reader = Reader1(path)
-        self._reader.open()
-        scan = functools.partial(salvage_ros1.scan, path)
-        super().__init__(self._reader.connections, self._reader.message_count, scan)
-
-    def messages(self) -> Iterator[Message]:
-        return self._messages(self._reader.messages)
-
-    def close(self) -> None:
-        self._reader.close()
-
-
-class _McapSource(_IndexedSource):
-    def __init__(self, path: Path) -> None:
-        self._reader = Reader2(path)
-        self._reader.open()
-        try:
-            scan = functools.partial(salvage_mcap.scan, path)
-            super().__init__(self._reader.connections, self._reader.message_count, scan)
-        except _FOREIGN:
-            self._reader.close()
-            raise
-
-    def messages(self) -> Iterator[Message]:
-        return self._messages(self._reader.messages)
 
     def close(self) -> None:
         self._reader.close()

@@ -13,9 +13,9 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import ConfigError, LocalError, RemoteError
 from gdp.printable import printable
 from proxy.recordings.limits import BagLimits
@@ -31,7 +31,7 @@ _SQLITE: Final = b"SQLite format 3\0"
 _Waiting = Callable[[], bool]
 
 
-class BagReader:
+class BagReader(ClosedOnExit):
     """An open recording.
 
     Args:
@@ -104,14 +104,6 @@ class BagReader:
     def close(self) -> None:
         """End the decoder."""
         self._stack.close()
-
-    def __enter__(self) -> BagReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @contextlib.contextmanager
     def _checked(self) -> Iterator[None]:

@@ -15,13 +15,13 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, Final
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag1 import WriterError as WriterError1
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
@@ -41,7 +41,7 @@ _SPARE_BYTES: Final = 256 << 10  # of the disk, for what others write meanwhile 
 _ANY_MD5: Final = "*"  # ROS 1's own value for an unknown one
 
 
-class BagWriter:
+class BagWriter(ClosedOnExit):
     """A recording in progress. Close it, or use it as a context; what was written stays in any case.
 
     Args:
@@ -166,14 +166,6 @@ class BagWriter:
             self._syncs.shutdown()
             with contextlib.suppress(OSError):  # of a write that has failed, and is reported
                 self._format.file.close()
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         if self.is_closed:

@@ -15,7 +15,7 @@ from gdp.errors import DropReason, RemoteError
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.dialect import MisfitError
 from proxy.serial.native_dialect import NativeDialect
-from proxy.serial.schema import Array, DefinitionError, Record, Sequence, Text, Type, msg_name, parse
+from proxy.serial.schema import Array, DefinitionError, Record, Sequence, Text, Type, default_values, msg_name, parse
 from proxy.serial.serializer import Codec
 from proxy.serial.type_match import Amend, Side, match
 from proxy.serial.type_translation import bounds_of, md5_text, retyped, rihs01, text_of, types_of
@@ -62,14 +62,21 @@ class MessageConverter:
 
     Between channels of the same ROS and of equal definition every message is returned unchanged and unread.
 
+    Args:
+        is_strict: both definitions have the same fields; else those that one lacks get their default, or are dropped.
+
     Raises:
         DefinitionError: a definition is missing or cannot be read, or the two do not match field by field; the text
             names the first difference, such as ``pose.position.x: float64 there, float32 here``.
+
+    Attributes:
+        differences: the fields that one side lacks, as texts.
     """
 
-    __slots__ = ("_amend", "_read", "_write", "source", "target")
+    __slots__ = ("_amend", "_read", "_write", "differences", "source", "target")
 
-    def __init__(self, source: Channel, target: Channel) -> None:
+    def __init__(self, source: Channel, target: Channel, *, is_strict: bool = True) -> None:
+        self.differences: tuple[str, ...] = ()
         self.source = source
         self.target = target
         self._read: Codec | None = None
@@ -77,9 +84,11 @@ class MessageConverter:
         self._amend: Amend | None = None
         if _same_hash(source, target):
             return
-        pair = match(_side(source), _side(target))
+        sides = (_side(each, is_strict=is_strict) for each in (source, target))
+        pair = match(*sides, is_strict=is_strict)
+        self.differences = pair.differences
         self._amend = pair.amend
-        if source.ros == target.ros and pair.amend is None:
+        if source.ros == target.ros and pair.amend is None and not pair.differences:
             return
         self._read = Codec(pair.read, source.ros, _NATIVE, None)
         self._write = Codec(pair.write, target.ros, _NATIVE, None)
@@ -115,8 +124,10 @@ def _record(channel: Channel) -> Record:
     return parse(channel.type_name, channel.definition, channel.definition_format, channel.ros)
 
 
-def _side(channel: Channel) -> Side:
-    return Side(_record(channel), channel.ros, bounds_of(types_of(channel)) if channel.ros == 2 else {})
+def _side(channel: Channel, *, is_strict: bool) -> Side:
+    bounds = bounds_of(types_of(channel)) if channel.ros == 2 else {}
+    defaults = {} if is_strict else default_values(channel.type_name, channel.definition, channel.definition_format)
+    return Side(_record(channel), channel.ros, bounds, defaults)
 
 
 def _wide_in(kind: Type, path: str, seen: set[int]) -> str:

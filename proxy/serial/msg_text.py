@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Basename, Constdefs, Fielddefs, FieldDesc, NameDesc, Typesdict
 
-__all__ = ["STATEMENTS_MAX", "parse_msg"]
+__all__ = ["STATEMENTS_MAX", "Default", "defaults_of", "parse_msg"]
 
 STATEMENTS_MAX: Final = 2_048  # fields and constants of one text
 _NUMBER_DIGITS_MAX: Final = 10
@@ -61,6 +61,8 @@ _QUOTE_OR_ESCAPE: Final = re.compile(r"""['"\\]""")
 _COMMENT: Final = re.compile(r"[ \t]*(?:#.*)?$")
 
 _Item: TypeAlias = "BaseDesc | NameDesc"
+_Value: TypeAlias = "bool | float | int | str"
+Default: TypeAlias = "_Value | list[_Value]"
 
 
 def parse_msg(text: str, type_name: str) -> Typesdict:
@@ -76,8 +78,16 @@ def parse_msg(text: str, type_name: str) -> Typesdict:
     return _Parser(text).types(type_name)
 
 
+def defaults_of(text: str, type_name: str) -> dict[tuple[str, str], Default]:
+    """Return the default values that a text states, by type and field; arguments and errors as ``parse_msg``."""
+    parser = _Parser(text)
+    parser.types(type_name)
+    return {field: _default(value) for field, value in parser.defaults.items()}
+
+
 class _Parser:
     def __init__(self, text: str) -> None:
+        self.defaults: dict[tuple[str, str], str] = {}  # their texts
         self._text = text
         self._owner = ""
         self._statements = 0
@@ -148,6 +158,8 @@ class _Parser:
             return
         if at < len(line) and line[at] != "#" and at == name.end():
             raise ValueError(f"not the name of a field: {_short(line)}")
+        if at < len(line) and line[at] != "#":
+            self.defaults[self._owner, name[0]] = line[at:]
         fields.append((name[0], self._shape(kind, line)))
 
     def _shape(self, kind: re.Match[str], line: str) -> FieldDesc:
@@ -190,7 +202,15 @@ def _with_msg(name: str) -> str:
     return f"{package}/msg/{word}"
 
 
-def _value(text: str, line: str) -> bool | float | int | str:
+def _default(text: str) -> Default:
+    """Return a default value: one, or a list in brackets."""
+    if not text.startswith("["):
+        return _value(text, text)
+    inner = text.partition("]")[0][1:]
+    return [_value(each, text) for each in inner.split(",")] if inner.strip() else []
+
+
+def _value(text: str, line: str) -> _Value:
     """Return the value of a constant: a number or bool that ends the line, or the text itself."""
     text = text.lstrip(" \t")
     for pattern, read in ((_FLOAT, float), (_INTEGER, _integer), (_TRUTH, _is_true)):

@@ -17,7 +17,7 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from gdp.errors import LocalError
 from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.idl_text import parse_idl
-from proxy.serial.msg_text import parse_msg
+from proxy.serial.msg_text import Default, defaults_of, parse_msg
 
 __all__ = [
     "DEFINITION_MAX_BYTES",
@@ -29,6 +29,7 @@ __all__ = [
     "Text",
     "Type",
     "UnparsedError",
+    "default_values",
     "definition_bytes",
     "msg_name",
     "parse",
@@ -179,6 +180,21 @@ def parsed(type_name: str, definition: str, definition_format: str) -> Typesdict
         return parse_idl("".join(section.partition("\n")[2] for section in text.split(_RULE)[1:]))
     except ValueError as error:
         raise UnparsedError(f"{type_name}: the definition cannot be parsed: {_first_line(error)}") from error
+
+
+def default_values(type_name: str, definition: str, definition_format: str) -> dict[tuple[str, str], Default]:
+    """Return the default values that a parsed ``msg`` definition states, by type and field; IDL's are not read.
+
+    Raises:
+        UnparsedError: one cannot be read.
+    """
+    if definition_format != "msg":
+        return {}
+    text = _ODD_BLANKS.sub(" ", definition.replace("\r\n", "\n"))
+    try:
+        return defaults_of(text, msg_name(type_name, "msg"))
+    except ValueError as error:
+        raise UnparsedError(f"{type_name}: a default cannot be parsed: {_first_line(error)}") from error
 
 
 def definition_bytes(definition: str) -> int:

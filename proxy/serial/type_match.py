@@ -1,24 +1,27 @@
 """Type match: whether two types are equal field by field, and how one tree of values serves both.
 
 Sans-I/O. All differences between ROS 1 and ROS 2 without a difference in meaning are here: ``Header.seq``, the signs in
-times and durations, ``byte``, the dummy of an empty type, upper case in field names.
+times and durations, ``byte``, the dummy of an empty type, upper case in field names. Fields that one side lacks are
+allowed where a rule says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import zip_longest
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 from proxy.serial.channel import RosVersion
 from proxy.serial.dialect import MisfitError
+from proxy.serial.empty import Defaults, default_tree
 from proxy.serial.schema import Array, DefinitionError, Number, Record, Sequence, Text, Type
 from proxy.serial.type_translation import DUMMY, Bounds
 
 __all__ = ["Amend", "Pair", "Side", "match"]
 
 Amend: TypeAlias = "Callable[[object], None]"  # completes the tree of a value for the other side, or refuses it
+
+_Field: TypeAlias = "tuple[str, Type]"
 
 _WORDS: Final = {"?": "bool", "b": "int8", "B": "uint8", "h": "int16", "H": "uint16", "i": "int32", "I": "uint32"}
 _WORDS64: Final = {"q": "int64", "Q": "uint64", "f": "float32", "d": "float64"}
@@ -30,33 +33,44 @@ _ROS2_CLOCK: Final = (("sec", Number("i")), ("nanosec", Number("I")))
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """A type on one side, with its ROS version and its bounds."""
+    """A type on one side, with its ROS version, its bounds and its default values."""
 
     record: Record
     ros: RosVersion
     bounds: Bounds
+    defaults: Defaults = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Types to read a message and to write its tree, and the amendment of the tree in between (None: none)."""
+    """Types to read a message and to write its tree, and the amendment of the tree in between (None: none).
+
+    ``differences``: the fields that one side lacks, as texts.
+    """
 
     read: Record
     write: Record
     amend: Amend | None
+    differences: tuple[str, ...] = ()
 
 
-def match(source: Side, target: Side) -> Pair:
+def match(source: Side, target: Side, *, is_strict: bool = True) -> Pair:
     """Return how messages of one type become those of the other. Names of types are ignored.
+
+    Args:
+        is_strict: both have the same fields in the same order; else one may lack some, and the order does not count.
 
     Raises:
         DefinitionError: the types differ; the text names the first differing field, there (``source``) and here.
     """
-    return _Matcher(source, target).record(source.record, target.record, "")
+    matcher = _Matcher(source, target, is_strict=is_strict)
+    return replace(matcher.record(source.record, target.record, ""), differences=tuple(matcher.differences))
 
 
 class _Matcher:
-    def __init__(self, source: Side, target: Side) -> None:
+    def __init__(self, source: Side, target: Side, *, is_strict: bool) -> None:
+        self.differences: list[str] = []
+        self._is_strict = is_strict
         self._source = source
         self._target = target
         self._crossing = source.ros != target.ros
@@ -81,27 +95,51 @@ class _Matcher:
 
     def _fields(self, there: Record, here: Record, path: str) -> Pair:
         unpaired = {DUMMY, "seq"} if self._crossing and _headers(there, here) else {DUMMY}
-        read: list[tuple[str, Type]] = [field for field in there.fields if field[0] in unpaired]  # both are first
-        write: list[tuple[str, Type]] = [field for field in here.fields if field[0] in unpaired]
-        filled = tuple(name for name, _ in write if name not in dict(read))
+        read: list[tuple[str, Type]] = [each for each in there.fields if each[0] in unpaired]  # both are first
+        write: dict[str, Type] = {name: kind for name, kind in here.fields if name in unpaired}
+        filled: dict[str, object] = {name: 0 for name in write if name not in dict(read)}
         amends: list[tuple[str, Amend]] = []
-        theirs = [field for field in there.fields if field[0] not in unpaired]
-        ours = [field for field in here.fields if field[0] not in unpaired]
-        for one, other in zip_longest(theirs, ours):
-            if one is None or other is None:
-                name = (one or other)[0]
-                raise _difference(_join(path, name), one and one[1], other and other[1])
+        theirs = [each for each in there.fields if each[0] not in unpaired]
+        ours = [each for each in here.fields if each[0] not in unpaired]
+        partners = self._partners(theirs, ours, path)
+        for one, other in zip(theirs, partners, strict=True):
+            if other is None:
+                if self._is_strict:
+                    raise _difference(_join(path, one[0]), one[1], None)
+                read.append(one)
+                continue
             at = _join(path, other[0])
             if one[0].lower() != other[0].lower():
                 raise DefinitionError(f"{at}: called {one[0]} there")
             limits = self._limits((there.name, one[0]), (here.name, other[0]))
             reading, writing, amend = self._type(one[1], other[1], at, limits)
             read.append((other[0], reading))
-            write.append((other[0], writing))
+            write[other[0]] = writing
             if amend is not None:
                 amends.append((other[0], amend))
+        if missing := [each for each in ours if each[0] not in write]:
+            if self._is_strict:
+                raise _difference(_join(path, missing[0][0]), None, missing[0][1])
+            defaults = default_tree(here, self._target.ros, self._target.defaults)
+            filled |= {name: defaults[name] for name, _ in missing}
+            write |= dict(missing)
         amend = _amend_record(filled, tuple(amends)) if filled or amends else None
-        return Pair(Record(there.name, tuple(read)), Record(here.name, tuple(write)), amend)
+        fields = tuple((name, write[name]) for name, _ in here.fields)
+        return Pair(Record(there.name, tuple(read)), Record(here.name, fields), amend)
+
+    def _partners(self, theirs: list[_Field], ours: list[_Field], path: str) -> list[_Field | None]:
+        """Return the field here of each field there, by place or by name; None: there is none."""
+        if self._is_strict:
+            return [*ours[: len(theirs)], *[None] * (len(theirs) - len(ours))]
+        left = {each[0].lower(): each for each in ours}
+        partners = [left.pop(name.lower(), None) for name, _ in theirs]
+        missing = {name for name, _ in left.values()}
+        if [each for each in partners if each is not None] != [each for each in ours if each[0] not in missing]:
+            self.differences.append(f"{path or 'the type'}: its fields have another order there")
+        dropped = [name for (name, _), partner in zip(theirs, partners, strict=True) if partner is None]
+        self.differences += [f"{_join(path, name)}: not known here, dropped" for name in dropped]
+        self.differences += [f"{_join(path, name)}: not known there, has its default" for name, _ in left.values()]
+        return partners
 
     def _limits(self, there: tuple[str, str], here: tuple[str, str]) -> tuple[int, int]:
         """Return the bounds that are tighter here than there, zero for none."""
@@ -172,12 +210,11 @@ def _said(kind: Type | None) -> str:
     return f"{_said(kind.item)}[{kind.count if isinstance(kind, Array) else ''}]"
 
 
-def _amend_record(filled: tuple[str, ...], amends: tuple[tuple[str, Amend], ...]) -> Amend:
+def _amend_record(filled: Mapping[str, object], amends: tuple[tuple[str, Amend], ...]) -> Amend:
     def amend(tree: object) -> None:
         if not isinstance(tree, dict):
             raise MisfitError("a record is a map")
-        for name in filled:
-            tree[name] = 0
+        tree.update(filled)
         for name, finish in amends:
             finish(tree[name])
 

@@ -23,6 +23,7 @@ from gdp.switch.table import Table
 _STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
 _SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
+_UNLIMITED: Final = float("inf")
 _QUIET: Final = object()  # result of an event in which no core was called
 
 Tap = Callable[[float, str, str, bytes], None]
@@ -46,9 +47,9 @@ class SimLink:
     loss: float = 0.0
     mtu: int = 1_500
     is_up: bool = True
-    bytes_s: float = float("inf")
+    bytes_s: float = _UNLIMITED
     burst_frames: float = 1.0
-    fifo_s: float = float("inf")
+    fifo_s: float = _UNLIMITED
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
     in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
 
@@ -68,6 +69,8 @@ class SimLink:
 
     def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
         """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
+        if self.bytes_s == _UNLIMITED and to not in self.free_s:
+            return now_s
         self.free_s[to] = max(self.free_s.get(to, now_s), now_s) + size / self.bytes_s
         return self.free_s[to]
 
@@ -279,7 +282,7 @@ class SimNetwork:
             tap(self._now_s, own.node, far.node, frame)
         if not sim_link.is_up or len(frame) - ETHER_BYTES > sim_link.mtu:
             self.drops[DropReason.PORT_DOWN if not sim_link.is_up else DropReason.TOO_BIG] += 1
-        elif sim_link.is_full(far.mac, self._now_s) or (
+        elif (sim_link.free_s and sim_link.is_full(far.mac, self._now_s)) or (
             sim_link.loss and sim_link.loses(far.mac, self._random.random())
         ):
             self.lost += 1
@@ -307,7 +310,8 @@ class SimNetwork:
                 self.drops[decision.reason] += 1
                 return _QUIET
             if isinstance(decision, Forward):
-                self.drops.update(decision.lost)
+                if decision.lost:
+                    self.drops.update(decision.lost)
                 for port, macs in decision.hops:
                     self._send(node.ports[port], rewrite(frame, macs))
                 return _QUIET

@@ -57,6 +57,8 @@ _PRELOADED: Final = (
     "ring.cli",
     *(f"gdp.cli.{each}" for each in _LATE),
     *("proxy.cli.topic", "typer.rich_utils", "rich.markdown", "gdp.ports.kernel.plane", "networkx"),
+    *("numpy", "rosidl_generator_py", "rosbags.typesys.stores.ros2_jazzy", "rosbags.typesys.stores.ros1_noetic"),
+    *("fog.supervisor.process", "gdp_extensions.doors.node"),
 )
 # These start programs that a zygote forks.
 _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
@@ -291,12 +293,24 @@ def main() -> None:
     link = socket.socket(fileno=int(sys.argv[1]))
     sys.modules["lab.zygote"] = sys.modules["__main__"]  # so that a program keeps the zygote that it was given
     for module in json.loads(link.recv(_REQUEST_BYTES)):
-        importlib.import_module(module)
+        with contextlib.suppress(ModuleNotFoundError):  # an extra that is not installed
+            importlib.import_module(module)
+    _build_models()
     started = dict(entry.partition("=")[::2] for entry in Path("/proc/self/environ").read_text().split("\0") if entry)
     added = {name: value for name, value in os.environ.items() if name not in started}
     gc.collect()
     gc.freeze()
     _live(link, _Birth(path, added))
+
+
+def _build_models() -> None:
+    """Build the models of configurations, which a process defers until it reads the first: 40 ms of processor time."""
+    pydantic = sys.modules.get("pydantic")
+    models = list(pydantic.BaseModel.__subclasses__()) if pydantic else []
+    for model in models:
+        models += model.__subclasses__()
+        if model.model_config.get("defer_build"):
+            model.model_rebuild()
 
 
 def _live(link: socket.socket, birth: _Birth) -> NoReturn:

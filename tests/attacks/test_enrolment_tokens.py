@@ -614,7 +614,8 @@ def test_a52_a_misuse_is_an_alarm_alone_where_the_site_says_so(
     site: Site, journal: Journal, local: Desk, tmp_path: Path
 ) -> None:
     provider = Recorded()
-    lenient = replace(site, enrolment=site.enrolment.model_copy(update={"revoke_misused": False}))
+    lenient_enrolment = site.config.enrolment.model_copy(update={"revoke_misused": False})
+    lenient = replace(site, config=site.config.model_copy(update={"enrolment": lenient_enrolment}))
     with requested(lenient, journal, provider) as ours:
         joins(local, provider.machine("m1"), tmp_path / "home")
         work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)

@@ -18,7 +18,7 @@ from gdp.errors import LocalError
 from gdp.printable import escaped, printable
 from gdp.terminal import echo
 from proxy.cli.tool_options import print_json, print_text
-from proxy.serial.known_types import known_channel
+from proxy.serial.standard_types import known_channel
 from proxy.tools.message_text import MessageText, request_of
 
 HOSTILE = "a\x1b]0;title\x07\x9b2J\x7f\u202eb\u2066\u200b\U000e0041\ue000\r\x08é日本"

@@ -79,4 +79,4 @@ def test_the_file_of_aws_is_enough_for_a_dry_run(write: Write, monkeypatch: pyte
 
 
 def test_the_file_of_skypilot_is_a_site(write: Write) -> None:
-    assert open_site(write("skypilot/fog.yaml")).provider == "skypilot"
+    assert open_site(write("skypilot/fog.yaml")).config.provider == "skypilot"

@@ -83,7 +83,7 @@ def test_a_border_gives_its_site_domain_robot_revocations_and_watch(tmp_path: Pa
 @pytest.mark.parametrize("public", ["198.51.100.7:51820", "[2001:db8::7]:51820"])
 def test_rented_machines_fetch_their_software_at_the_border(tmp_path: Path, public: str) -> None:
     own = open_site(border(tmp_path, "provider: aws", INSTALLS, public=public))
-    assert own.software_address == f"{public.rpartition(':')[0]}:4781"
+    assert own.config.software_address == f"{public.rpartition(':')[0]}:4781"
     assert own.software_listens == ("", 4781)
 
 

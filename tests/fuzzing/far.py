@@ -185,10 +185,11 @@ def _serve(data: bytes) -> object:
     assert isinstance(description, bytes)
     interface = ActionInterface.of("service", "/t", "a/srv/S")
     endpoint = cast(RosEndpoint, _Endpoint(is_live=True))
-    server = RemoteServer.set_description(1, description, interface, endpoint, "json")
+    rule = Rule.model_construct(encoding="json", fields_differ="default")
+    server = RemoteServer.set_description(1, description, interface, endpoint, rule)
     assert server.ours is not None
     empty = [NoAnswer.of(each) for each in server.ours.services]
-    clients = RemoteClients(server.ours, 2)
+    clients = RemoteClients(server.ours, 2, is_strict=False)
     return (
         [each.to_raw("reason") for each in empty if each is not None],
         _outcome(lambda: clients.incoming(b"p" * 32, description, 0).decode(body)),

@@ -43,6 +43,8 @@ GOOD = [
     "name: /a, weight: 100, max_bits_s: 4000000",
     "name: /set, kind: service, weight: 5, max_bits_s: 1000",
     "name: /a, ros: 2, domain: 0",
+    "name: /a, frames: {add: robot1/, common: [map, earth]}",
+    "name: /a, frames: {remove: robot1/}",
     "name: /a, paths: 2",
     "name: /set, kind: service, paths: 2",
     "name: /set, kind: service, sign: session",
@@ -123,6 +125,7 @@ BAD = [
     ("name: /a, voxel_m: 0", "voxel_m: expected greater than 0"),
     ("name: /a, region: {x: [2, 1]}", "region.x: expected [low, high] with low below high"),
     ("name: /a, adapt: {min_hz: 5, max_hz: 2}", "adapt: max_hz is below min_hz"),
+    ("name: /a, frames: {common: [map]}", "frames: expected either add or remove"),
     ("name: /a, metadata: {name: /b}", "metadata: name: state it as a key of the rule itself"),
     ("name: /a, direction: out", "direction: unknown key; expected one of kind, name, type, remap"),
 ]
@@ -147,6 +150,7 @@ CLASHES = [
     ("expose", ["name: /a", "name: /a, owner: other.pub"], "expose[1].name: expose[0] is about /a of this machine"),
     ("expose", ["name: /*", "name: /*, owner: other.pub"], "expose[1].name: expose[0] is about /* of this machine"),
     ("import", ["name: /a", "name: /a, metadata: {by: x}"], "import[1].name: import[0] is about /a of this machine"),
+    ("import", ["name: /a, prefix: r", "name: /b, prefix: r, remap: /a"], "import[1].name: import[0] is about /a of"),
     ("import", ["name: /*", "name: /*"], "import[1].name: import[0] gives the same name: /*"),
 ]
 
@@ -164,6 +168,7 @@ def test_two_rules_about_one_thing_are_refused(place: Path, side: str, texts: li
         ("expose", ["name: /a, type: std_msgs/msg/String", "name: /a, type: std_msgs/msg/Int8"]),  # a recording may
         ("expose", ["name: /a", "name: /a, kind: service", "name: /a, kind: action"]),
         ("import", ["name: /*", "name: /*, owner: other.pub"]),
+        ("import", ["name: /tf, prefix: robot1", "name: /tf, prefix: robot2", "name: /tf"]),
         ("import", ["name: /a", "name: /a, metadata: {by: x}, remap: /b"]),
     ],
 )

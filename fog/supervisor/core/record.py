@@ -9,10 +9,9 @@ from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
 
 from fog.cluster import MachineRequest
-from fog.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["Outcome", "Record", "cost_usd", "stage", "update_record"]
+__all__ = ["IssuedCredentials", "Outcome", "Record", "cost_usd", "stage", "update_record"]
 
 
 class Outcome(Enum):
@@ -21,6 +20,19 @@ class Outcome(Enum):
     RELEASED = "released"  # the supervisor released it
     PREEMPTED = "preempted"  # the provider preempted it, or it failed
     FAILED = "failed"  # no capacity, or it never served
+
+
+@dataclass(frozen=True, slots=True)
+class IssuedCredentials:
+    """Credentials issued to a machine; before enrolment only the end of their validity is known.
+
+    Args:
+        proxy: overlay name of the machine's proxy, 64 hex digits; empty: not enrolled yet.
+        until_unix_s: end of validity of its certificates and delegations.
+    """
+
+    proxy: str
+    until_unix_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ Sans-I/O.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 from proxy.bridge.core.reduction import Restore
@@ -13,7 +14,7 @@ from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Encoding, Serializer
 
-__all__ = ["MessageDecoder"]
+__all__ = ["MessageDecoder", "differences_of"]
 
 
 class MessageDecoder:
@@ -21,36 +22,45 @@ class MessageDecoder:
 
     Args:
         source: description by the remote side.
-        twin: converter; None where both sides have the same wire form.
+        converter: None where both sides have the same wire form.
+
+    Attributes:
+        differences: the fields that one side lacks, as texts.
     """
 
-    __slots__ = ("_converter", "_serializer", "target")
+    __slots__ = ("_converter", "_serializer", "differences", "target")
 
     def __init__(
         self, source: Channel, encoding: Encoding, target: Channel, converter: MessageConverter | None
     ) -> None:
         self._serializer = Serializer(source, encoding)
         self._converter = converter
+        self.differences = () if converter is None else converter.differences
         self.target = target
 
     @classmethod
-    def ready(cls, source: Channel, encoding: Encoding, known: Channel | None, ros: RosVersion) -> MessageDecoder:
+    def ready(
+        cls, source: Channel, encoding: Encoding, known: Channel | None, ros: RosVersion, *, is_strict: bool = True
+    ) -> MessageDecoder:
         """Return the decoder that turns ``source`` into messages of this machine.
 
         Args:
             known: this machine's description of the type; None where it has none.
+            is_strict: as ``MessageConverter``.
 
         Raises:
             DefinitionError: the definitions differ, or this ROS has no such type.
         """
         if source.ros != ros:
             target = translated_channel(source, ros) if known is None else known
-            return cls(source, encoding, target, MessageConverter(source, target))
+            return cls(source, encoding, target, MessageConverter(source, target, is_strict=is_strict))
         if known is None:
             return cls(source, encoding, source, None)
         if source.hash and known.hash and source.hash != known.hash:
-            MessageConverter(source, known)  # names the first difference
-            if ros == 1:
+            converter = MessageConverter(source, known, is_strict=is_strict)  # or its error names the first difference
+            if converter.differences:
+                return cls(source, encoding, replace(known, qos=source.qos), converter)
+            if ros == 1 and is_strict:
                 raise DefinitionError(f"md5 {source.hash} there, {known.hash} here")
         return cls(source, encoding, replace(known, qos=source.qos), None)
 
@@ -67,3 +77,9 @@ class MessageDecoder:
         if restore is not None:
             raw = restore(raw)
         return raw if self._converter is None else self._converter.convert(raw)
+
+
+def differences_of(decoders: Iterable[MessageDecoder]) -> str:
+    """Return the fields that one side lacks as one text; empty if there are none."""
+    found = dict.fromkeys(each for decoder in decoders for each in decoder.differences)
+    return f"messages are converted: {'; '.join(found)}" if found else ""

@@ -6,10 +6,12 @@ Sans-I/O, except that it queries the local endpoint for known types.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gdp.errors import LocalError
 from proxy.bridge.core.action_interface import ActionInterface
 from proxy.bridge.core.decoder import MessageDecoder
+from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import RosEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.converter import translated_channel
@@ -39,7 +41,7 @@ class RemoteServer:
 
     @classmethod
     def set_description(
-        cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: RosEndpoint, encoding: Encoding
+        cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: RosEndpoint, rule: Rule
     ) -> RemoteServer:
         """Prepare the decoders of a server's responses.
 
@@ -51,7 +53,8 @@ class RemoteServer:
         types = [*(each.type_name for each in theirs.services), *(each.type_name for each in theirs.topics)]
         if types != [type_name for _, type_name in (*parts.services, *parts.topics)]:
             raise LocalError(f"the far side serves something else under this name: {', '.join(types)}")
-        ours = _ours(theirs, parts, endpoint, encoding)
+        ours = _ours(theirs, parts, endpoint, rule.encoding)
+        ready = partial(MessageDecoder.ready, is_strict=rule.is_strict)
         services = zip(theirs.services, ours.services, strict=True)
         topics = zip(theirs.topics, ours.topics, strict=True)
         server = cls(
@@ -59,11 +62,11 @@ class RemoteServer:
             description=description,
             exchange=theirs,
             ours=ours,
-            answers=tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
-            news=tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
+            answers=tuple(ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
+            news=tuple(ready(a, theirs.encoding, b, ros) for a, b in topics),
         )
         for our, their in zip(ours.services, theirs.services, strict=True):
-            MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason
+            ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason
         return server
 
     def described_again(self, description: bytes) -> RemoteServer | None:

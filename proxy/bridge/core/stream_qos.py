@@ -11,9 +11,10 @@ from enum import Enum
 from typing import Protocol
 
 from gdp.client.send_options import SendOptions
+from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity
-from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, is_depth_unknown, kept, request
+from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, is_depth_unknown, kept, request, shared_depth
 from proxy.serial.channel import QOS_MAX, Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
@@ -97,7 +98,7 @@ class LiveQos:
         if self._rule.wants_latched is False:
             return 0
         if self._rule.latched or self._is_latched:
-            shared = DEPTH_MAX if self._is_latched and self._publishers > 1 else 1
+            shared = shared_depth(self._publishers) if self._is_latched and self._publishers > 1 else 1
             return max(kept(self._offers, self._found_depth), shared)
         return kept(self._offers, self._found_depth)
 
@@ -141,7 +142,7 @@ class LiveQos:
         self._is_latched = channel.latched
         latched = bool(self.depth)
         offers = self._offers or channel.qos or ((default(latched=True),) if latched else ())
-        known = dict.fromkeys(replace(each, depth=min(self.depth, DEPTH_MAX) or each.depth) for each in offers)
+        known = dict.fromkeys(replace(each, depth=min(self.depth, OFFERED_DEPTH_MAX) or each.depth) for each in offers)
         return (replace(channel, topic=topic, latched=latched, qos=tuple(known)[:QOS_MAX]),)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
+from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from proxy.serial.channel import NEVER, Channel, Qos
 
 __all__ = [
@@ -22,13 +23,13 @@ __all__ = [
     "kept",
     "offer",
     "request",
+    "shared_depth",
     "unmatched",
 ]
 
-DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
+DEPTH_MAX: Final = 64  # messages kept for late joiners of one publisher
 INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
-_OFFERED_MAX: Final = 1_000  # of the proxy's own publishers, whatever a remote one states
 _READER_DEPTH: Final = 1_000  # of the proxy's own subscriptions: a burst waits here, not at its publisher
 
 
@@ -83,8 +84,8 @@ def joint(channel: Channel) -> Qos:
 def kept(offers: Sequence[Qos], found: int | None = None) -> int:
     """Return the number of messages for late joiners of these publishers' topic; 0: none.
 
-    With several publishers, whose messages come without their sender, the number is the maximum: one that publishes
-    often must not evict what another one latched.
+    With several publishers, whose messages come without their sender, the number is large: one that publishes often
+    must not evict what another one latched.
 
     Args:
         found: what a single publisher keeps that does not state it; None: unknown.
@@ -94,7 +95,12 @@ def kept(offers: Sequence[Qos], found: int | None = None) -> int:
         return 0
     if found is not None and is_depth_unknown(latched):
         return found
-    return DEPTH_MAX if len(latched) > 1 else min(depth_of(latched[0]), DEPTH_MAX)
+    return shared_depth(len(latched)) if len(latched) > 1 else min(depth_of(latched[0]), DEPTH_MAX)
+
+
+def shared_depth(messages: int) -> int:
+    """Return how many messages are kept of several latched publishers that together keep at least so many."""
+    return min(max(messages, DEPTH_MAX), OFFERED_DEPTH_MAX)
 
 
 def offer(
@@ -109,12 +115,14 @@ def offer(
     latched = [each for each in sources if each.durability == "transient_local"]
     insisting = [each for each in wants if each.durability == "transient_local"]
     is_latched = bool(latched) if is_latched is None else is_latched
-    depth = DEPTH_MAX if len(latched) > 1 else max(map(depth_of, sources or insisting), default=_DEPTH)
+    depth = max(map(depth_of, sources or insisting), default=_DEPTH)
+    if len(latched) > 1:
+        depth = shared_depth(sum(map(depth_of, latched)))
     is_reliable = any(each.reliability != "best_effort" for each in sources) if sources else is_reliable is not False
     return default(
         reliable=is_reliable or any(each.reliability == "reliable" for each in wants),
         latched=is_latched or bool(insisting),
-        depth=min(max(depth, 1), _OFFERED_MAX),
+        depth=min(max(depth, 1), OFFERED_DEPTH_MAX),
     )
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from fog.cluster import MachineRequest
-from fog.credentials import IssuedCredentials
 from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.supervisor.core.reconcile import Drain, Launch, Release, Timeouts, decide
-from fog.supervisor.core.record import Record, update_record
+from fog.supervisor.core.record import IssuedCredentials, Record, update_record
 from fog.supervisor.placement import place
 
 NOW_S = 1_000_000.0

@@ -264,7 +264,8 @@ def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, jo
 
 
 def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal) -> None:
-    near = replace(site, latency_ms={"east": 90.0, "west": 12.0, "south": 80.0})
+    latency_ms = {"east": 90.0, "west": 12.0, "south": 80.0}
+    near = replace(site, config=site.config.model_copy(update={"latency_ms": latency_ms}))
     ours = supervisor(near, journal, Memory())
     journal.put_cluster(replace(PLAN, machines=(SPOT,)), time.time())
     work(ours, lambda: len(serving(journal)) == 1)

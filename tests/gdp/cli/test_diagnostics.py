@@ -33,6 +33,7 @@ class Node:
         self.role = role
         self.places: list[dict[str, str]] = [{"node": ROBOT, "right": "publish"}, {"node": OTHER, "right": "read"}]
         self.is_silent = False
+        self.is_ping_lost = False
         self.asked: list[Mapping[str, object]] = []
         self.target_role = "proxy"
         self.pid = 0
@@ -62,17 +63,18 @@ class Node:
             respond(Response({**fields, "state": "answered", "role": self.role, "result": self.facts()}))
         elif arguments["ask"] == "resolve":
             respond(Response({**fields, "state": "answered", "result": {"places": self.places}}))
-        elif self.is_silent:
+        elif self.is_silent or (self.is_ping_lost and arguments["ask"] == "ping"):
             respond(Response({**fields, "state": "silent"}))
         else:
-            role = {} if arguments["ask"] == "trace" else {"role": self.target_role}
-            respond(Response({**fields, **answered(arguments), **role}))
+            reply = answered(arguments)
+            role = {"role": self.target_role} if reply["node"] == ROBOT else {}
+            respond(Response({**fields, **reply, **role}))
 
 
 def answered(arguments: Mapping[str, object]) -> dict[str, object]:
     """Return a reply: of the robot, two switches away; or of one of these."""
     hops = arguments.get("hops")
-    is_trace = arguments["ask"] == "trace"
+    is_trace = arguments["ask"] == "trace" and isinstance(hops, int) and hops <= 2
     result = {"in": {"port": "eth0", "to": OTHER}, "branches": [{"port": "eth1", "to": ROBOT, "role": "proxy"}]}
     return {
         "state": "answered",
@@ -170,6 +172,17 @@ def test_a_trace_to_a_switch_ends_with_that_switch(node: Node) -> None:
     node.places, node.target_role = [{"node": ROBOT, "right": "attach"}], "switch"
     assert gdp("trace", ROBOT) == 0
     assert [each["hops"] for each in node.asked if "hops" in each] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("role", "hops"), [("proxy", [1, 2]), ("switch", [1, 2, 3])])
+def test_a_trace_whose_ping_is_lost_ends_at_the_member_that_answers(
+    role: str, hops: list[int], node: Node, capsys: pytest.CaptureFixture[str]
+) -> None:
+    node.is_ping_lost, node.target_role = True, role
+    assert gdp("trace", "/scan", "--json") == 0
+    (path,) = json.loads(capsys.readouterr().out)["paths"]
+    assert (path["answered"], path["label"], path["role"], path["rtt_ms"]) == (True, "robot", role, 1.5)
+    assert [hop["hop"] for hop in path["hops"]] == hops
 
 
 def test_a_switch_that_withholds_its_name_has_none_in_the_output(

@@ -33,7 +33,7 @@ from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
 from gdp_extensions.doors.token import door_token
 from lab.process import until
 from proxy.endpoints.core.endpoint import Event
-from proxy.serial.known_types import known_channel
+from proxy.serial.standard_types import known_channel
 from tests.draws import draws
 from tests.gdp_extensions.doors import test_foxglove_door as foxglove
 from tests.gdp_extensions.doors.rights import Everything, goal_id

@@ -32,7 +32,7 @@ from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
-from proxy.serial.known_types import known_channel
+from proxy.serial.standard_types import known_channel
 from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp_extensions.doors.core import foxglove_protocol as protocol
-from proxy.serial.known_types import known_channel
+from proxy.serial.standard_types import known_channel
 from tests.proxy.bridge import known
 
 CHANNEL = known_channel("/chat", known.STRING)

@@ -21,8 +21,8 @@ from gdp_extensions.doors.core.throttle import Throttle
 from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
 from proxy.endpoints.core.qos import default
-from proxy.serial.known_types import known_channel
 from proxy.serial.rosbridge_json import RosbridgeCodec
+from proxy.serial.standard_types import known_channel
 from tests.gdp_extensions.doors.rights import Everything, goal_id
 from tests.proxy.bridge import known
 

@@ -18,6 +18,7 @@ __all__ = [
     "IMAGE",
     "SET_BOOL",
     "STRING",
+    "TRANSFORMS",
     "TRIGGER",
     "channel",
     "channels",
@@ -32,6 +33,7 @@ __all__ = [
 
 STRING: Final = "std_msgs/msg/String"
 IMAGE: Final = "sensor_msgs/msg/Image"
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 SET_BOOL: Final = "std_srvs/srv/SetBool"
 TRIGGER: Final = "std_srvs/srv/Trigger"
 FIBONACCI: Final = "test_msgs/action/Fibonacci"
@@ -79,7 +81,9 @@ def custom(type_name: str, text: str, ros: RosVersion = 2) -> Channel:
 def channels(ros: RosVersion = 2) -> dict[str, Channel]:
     """Return the types that a machine knows by default."""
     known = {name: channel(name, ros) for name in (STRING, IMAGE, "std_msgs/msg/Int32")}
-    return known if ros == 1 else known | {name: custom(name, text) for name, text in _TOPICS.items()}
+    if ros == 1:
+        return known
+    return known | {TRANSFORMS: channel(TRANSFORMS)} | {name: custom(name, text) for name, text in _TOPICS.items()}
 
 
 def service(type_name: str, request: str, response: str, ros: RosVersion = 2) -> Service:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gdp.client.participant import Topic
-from proxy.bridge.topic_counts import topic_counts
+from proxy.bridge.flow_rows import topic_counts
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Granted, Machine, Sites, named

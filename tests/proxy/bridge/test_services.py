@@ -163,6 +163,22 @@ def test_services_that_differ_are_reported_with_the_first_difference_and_there_i
     assert any(text.startswith("/echo: other-type: ") and "value: " in text for text in caplog.messages)
 
 
+def test_rules_of_both_sides_may_allow_fields_that_one_side_lacks(sites: Sites) -> None:
+    rule = f"kind: service, name: /echo, type: {ECHO}, fields: default"
+    server = sites.add(SERVER, expose=[rule], graph=_echoing("string text\nint8 more\n", "string text\n"))
+    client = sites.add(ROBOT, imports=[rule], graph=_echoing("string text\n", "string text\nint8 more\n"))
+    LocalServer(server.graph, "/echo", ECHO, lambda raw: raw[:-1])
+    caller = Client(client.graph, "/echo")
+    assert sites.run(3, caller.sees_server)
+    caller.call(known.string("hello"))
+    assert sites.run(1, lambda: caller.outcomes == [known.string("hello") + b"\0"])
+    assert client.faults == {"other-type": 1}
+
+
+def _echoing(request: str, response: str) -> FakeGraph:
+    return FakeGraph(2, known.channels(), {ECHO: known.service(ECHO, request, response)})
+
+
 def test_each_side_may_call_the_service_otherwise(sites: Sites) -> None:
     server, client = pair(sites, f"{SWITCH}, remap: /lamp/set", f"{SWITCH}, remap: /far/lamp")
     LocalServer(server.graph, "/lamp/set", answer=lambda _: switched("yes"))

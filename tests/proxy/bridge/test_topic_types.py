@@ -113,6 +113,25 @@ def test_definitions_that_differ_are_reported_once_with_the_first_difference_and
     assert [stats.refused for stats in server.bridge.stats if stats.topic == "/pose"] == [3]
 
 
+@pytest.mark.parametrize(("there", "here"), [(2, 2), (1, 2), (2, 1)])
+def test_a_rule_may_allow_fields_that_one_side_lacks_and_they_are_named_once(
+    sites: Sites, caplog: pytest.LogCaptureFixture, there: RosVersion, here: RosVersion
+) -> None:
+    robot = sites.add(ROBOT, expose=[POSE], graph=graph(there, "int32 x\nint32 old\n"))
+    server = sites.add(SERVER, imports=[f"{POSE}, fields: default"], graph=graph(here, "int32 x\nint32 new\n"))
+    ear, talker = Ear(server.graph, "/pose", CUSTOM), robot.graph.publish("/t", "/pose", CUSTOM)
+    assert sites.run(3, robot.is_read)
+    encapsulation = {1: b"", 2: b"\0\1\0\0"}
+    for number in range(3):
+        talker.publish(encapsulation[there] + bytes([number, 0, 0, 0, 9, 0, 0, 0]))
+    assert sites.run(1, lambda: len(ear.heard) == 3)
+    assert ear.heard == [encapsulation[here] + bytes([number, *bytes(7)]) for number in range(3)]
+    (reported,) = caplog.messages
+    assert reported == (
+        "/pose: other-type: messages are converted: old: not known here, dropped; new: not known there, has its default"
+    )
+
+
 def test_definitions_that_differ_between_ros_1_and_ros_2_are_reported(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:

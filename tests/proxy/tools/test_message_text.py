@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gdp.errors import LocalError, RemoteError
-from proxy.serial.known_types import known_channel
+from proxy.serial.standard_types import known_channel
 from proxy.tools.message_text import MessageText, request_of, request_tree
 
 
