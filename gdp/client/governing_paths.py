@@ -269,4 +269,4 @@ class GoverningPaths:
 
     def _begin(self, size: int) -> int:
         """Return the pace of a best-effort message of ``size`` bytes that begins to leave."""
-        return self.paces.begin(self._present(), size) if self.paces.stated else 0
+        return self.paces.pace_for(self._present(), size) if self.paces.stated else 0

@@ -135,7 +135,7 @@ class ReaderPaces:
         """Note that what began before is under way."""
         self._begun.clear()
 
-    def begin(self, names: Sequence[bytes], size: int) -> int:
+    def pace_for(self, names: Sequence[bytes], size: int) -> int:
         """Return the pace of a message of ``size`` bytes that begins to leave to these readers: 0: it is for all."""
         if not self.stated:
             return 0

@@ -65,25 +65,25 @@ def test_no_reader_is_slowed_down_once_all_that_is_published_leaves_in_time() ->
 
 def test_a_message_is_for_all_whose_paths_are_free_for_it() -> None:
     paths, paces, given = stated()
-    assert paces.begin(ALL, IMAGE_BYTES) == 0
+    assert paces.pace_for(ALL, IMAGE_BYTES) == 0
     paces.begin_turn()
     paths.path(THIN, 1.0).sent(IMAGE_BYTES, 1, 1.0)
-    assert paces.begin(ALL, IMAGE_BYTES) == given[MEDIUM]
+    assert paces.pace_for(ALL, IMAGE_BYTES) == given[MEDIUM]
     paths.path(MEDIUM, 1.0).sent(10 * IMAGE_BYTES, 1, 1.0)
-    assert paces.begin(ALL, IMAGE_BYTES) == PACE_MAX
+    assert paces.pace_for(ALL, IMAGE_BYTES) == PACE_MAX
     assert paces.withheld == 2
 
 
 def test_messages_that_begin_at_once_are_not_all_for_the_slow_reader() -> None:
     _, paces, given = stated()
-    assert [paces.begin(ALL, IMAGE_BYTES) for _ in range(2)] == [0, given[MEDIUM]]
+    assert [paces.pace_for(ALL, IMAGE_BYTES) for _ in range(2)] == [0, given[MEDIUM]]
 
 
 def test_a_silent_reader_holds_back_no_slower_one() -> None:
     paths, paces, _ = stated()
     paths.path(MEDIUM, 1.0).sent(10 * IMAGE_BYTES, 1, 1.0)
     paths.path(MEDIUM, 1.0).is_silent = True
-    assert paces.begin(ALL, IMAGE_BYTES) == 0
+    assert paces.pace_for(ALL, IMAGE_BYTES) == 0
 
 
 def test_without_the_fastest_reader_the_next_one_governs() -> None:
