@@ -25,7 +25,7 @@ BEFORE_DETECTION_MS = 180  # three missed keepalives take 210 ms; a busy machine
 def test_a_cut_of_either_uplink_delays_no_message_over_two_paths_and_loses_none(tmp_path: Path) -> None:
     record = tmp_path / "record.json"
     bench = ROOT / "scripts" / "bench" / "uplink_cut.py"
-    options = {"rounds": 2, "quiet-s": 3, "settle-s": 5, "limit-ms": BEFORE_DETECTION_MS, "json": record}
+    options = {"rounds": 2, "limit-ms": BEFORE_DETECTION_MS, "json": record}
     argv = [sys.executable, str(bench), "--allow-load", *(f"--{name}={value}" for name, value in options.items())]
     ran = subprocess.run(argv, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert ran.returncode == 0, ran.stderr

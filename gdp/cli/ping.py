@@ -8,12 +8,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import ceil
 from typing import Annotated, Final
 
 import typer
 
 from gdp.cli.local_nodes import Node, connect, find_name
-from gdp.cli.ping_statistics import PingStatistics
 from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
 from gdp.management.control_client import NodeConnection
@@ -21,7 +22,8 @@ from gdp.names import Name
 from gdp.ports.readiness import readable
 from gdp.terminal import echo
 
-__all__ = ["ping"]
+__all__ = ["PingStatistics", "ping", "quantile"]
+
 
 _NOTHING_CAME: Final = 1
 INTERVAL_MIN_S: Final = 0.05  # 20 requests a second; a node answers 32 of one member
@@ -158,3 +160,43 @@ class _Run:
 
 def _domain(result: Mapping[str, object]) -> str:
     return str(result.get("domain_label") or Name.from_text(str(result["domain"])).short)
+
+
+@dataclass(slots=True)
+class PingStatistics:
+    """Requests to one member, and their round-trip times in milliseconds."""
+
+    sent: int = 0
+    rtts_ms: list[float] = field(default_factory=list)
+
+    @property
+    def loss(self) -> float:
+        """Return the share of requests without a reply, 0 to 1."""
+        return 1 - len(self.rtts_ms) / self.sent if self.sent else 0.0
+
+    def to_fields(self) -> dict[str, object]:
+        """Return the JSON fields; round-trip times are None where nothing came back."""
+        times = sorted(self.rtts_ms)
+        return {
+            "sent": self.sent,
+            "received": len(times),
+            "loss": round(self.loss, 4),
+            "min_ms": times[0] if times else None,
+            "median_ms": quantile(times, 0.5),
+            "p99_ms": quantile(times, 0.99),
+            "max_ms": times[-1] if times else None,
+        }
+
+    def to_text(self) -> str:
+        """Return the summary for people."""
+        times = sorted(self.rtts_ms)
+        counts = f"{self.sent} sent, {len(times)} received, {100 * self.loss:.3g} % lost"
+        if not times:
+            return counts
+        median, p99 = quantile(times, 0.5), quantile(times, 0.99)
+        return f"{counts}, min/median/p99/max {times[0]:.2f}/{median:.2f}/{p99:.2f}/{times[-1]:.2f} ms"
+
+
+def quantile(times: list[float], share: float) -> float | None:
+    """Return the smallest value that at least this share of the sorted values does not exceed; None: there are none."""
+    return times[max(ceil(share * len(times)) - 1, 0)] if times else None

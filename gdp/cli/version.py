@@ -1,12 +1,15 @@
 """Options ``--version`` and ``-h`` of every command and sub-command, and the form of its help and of usage errors.
 
 I/O.
+Some versions of the command line's library build a model for each option, also for one that is not given, which takes a
+third of the time of a short command. So a word is coerced without that library where it is the value itself.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from enum import Enum
 from functools import partial
 from typing import Annotated, Any, Final
 
@@ -14,10 +17,10 @@ import typer
 from typer.main import get_command
 
 import gdp
-from gdp.cli.coercion import defer_coercion
 from gdp.terminal import echo
 
-__all__ = ["HELP", "Version", "versioned", "with_version"]
+__all__ = ["HELP", "Version", "defer_coercion", "versioned", "with_version"]
+
 
 _SHOULD_BE: Final = "Input should be "  # prefix of pydantic, which some versions of the library use
 _USAGE_ERROR: Final[Any] = typer.BadParameter.__mro__[2]  # ClickException, whose module differs among versions
@@ -99,3 +102,37 @@ def _all_of(command: Any) -> Iterator[Any]:
     commands = getattr(command, "commands", {})
     for each in getattr(commands, "loaded", commands).values():  # lazy ones get the option when they are loaded
         yield from _all_of(each)
+
+
+class _Coercion:
+    """What converts the value of one option; ``make`` returns that of the library, which also raises its errors."""
+
+    def __init__(self, make: Any) -> None:
+        self._make = make
+
+    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the value of an option."""
+        kind = param.type_descriptor.annotation
+        if value is None:
+            return () if param.multiple or param.nargs == -1 else None
+        if type(value) is kind or value == []:  # text, or a default
+            return value
+        if isinstance(kind, type) and issubclass(kind, Enum) and value in [each.value for each in kind]:
+            return kind(value)
+        return self._make().coerce(value, param=param, ctx=ctx)
+
+
+def defer_coercion(command: Any) -> None:
+    """Let the options of a command load the library when a value needs it; another version of it is left as it is."""
+    find_help = command.get_help_option
+    command.get_help_option = lambda ctx: _deferred(find_help(ctx))
+    for param in command.params:
+        _deferred(param)
+
+
+def _deferred(param: Any) -> Any:
+    kind, make = getattr(param, "type_descriptor", None), getattr(param, "get_runtime_param", None)
+    if kind is not None and kind.parameter_info.parser is None and "get_runtime_param" not in vars(param):
+        coercion = _Coercion(make)
+        param.get_runtime_param = lambda: coercion
+    return param

@@ -254,11 +254,9 @@ class Channels:
         if asked.offer is not None:
             return
         key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
-        identity = self._identity
         body = _Open(key.public, peer)
-        bare = body.to_wire(identity.name, identity.key, identity.membership)
-        body = replace(body, padding=bytes(max(_OFFER_BYTES - len(bare), 0)))
-        wire = body.to_wire(identity.name, identity.key, identity.membership)
+        bare = self._identity.signed(body)
+        wire = self._identity.signed(replace(body, padding=bytes(max(_OFFER_BYTES - len(bare), 0))))
         asked.offer = _Offer(key, wire, parse(wire).fingerprint)
         asked.reopened_s = now_s
         self._offers.start(peer, now_s)
@@ -311,9 +309,8 @@ class Channels:
         if self._verified(statement, now) not in _PEER_ROLES:
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         key = ExchangeKey.from_random(self._random_bytes(EXCHANGE_KEY_BYTES))
-        identity, id_ = self._identity, self._random_bytes(_ID_BYTES)
-        body = _Accept(fingerprint, id_, key.public, statement.signer)
-        accept = body.to_wire(identity.name, identity.key, identity.membership)
+        id_ = self._random_bytes(_ID_BYTES)
+        accept = self._identity.signed(_Accept(fingerprint, id_, key.public, statement.signer))
         if len(accept) > len(statement.wire):
             raise StatementError(DropReason.MALFORMED, "an offer that is shorter than its answer")
         keys = _keys(key, offered.key, fingerprint, parse(accept).fingerprint)

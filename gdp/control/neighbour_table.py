@@ -66,6 +66,18 @@ class NeighbourTable:
                 return found
         return None
 
+    def hop(self, port: int, mac: bytes) -> tuple[int, bytes]:
+        """Return the hop to an address on a port: the port, that address, and our own on it."""
+        return port, mac + self.ports[port].mac
+
+    def mtu_of(self, port: int) -> int:
+        """Return a port's MTU in bytes after the Ethernet header."""
+        return self.ports[port].mtu
+
+    def own_macs(self) -> dict[int, bytes]:
+        """Return our own address on each port that is up."""
+        return {index: port.mac for index, port in self.ports.items() if port.is_up}
+
     def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
         """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
         neighbour = self.get(port, name)

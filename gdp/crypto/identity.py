@@ -12,6 +12,7 @@ from gdp.crypto.ca import CertificateAuthority, request_membership
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.kem import KemPrivateKey
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.schema import Body
 from gdp.crypto.statements import StatementType, sign
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
@@ -132,6 +133,10 @@ class Identity:
     def label(self) -> str:
         """Return the node's name for people."""
         return self.member.label
+
+    def signed(self, body: Body) -> bytes:
+        """Return a statement of this node that carries its membership, so that who does not know it can verify it."""
+        return body.to_wire(self.name, self.key, self.membership)
 
     def sign(self, type_: StatementType, body: Mapping[str, object]) -> bytes:
         """Return a statement of this node. Raises ``LocalError``: the body cannot be written, or is too long."""

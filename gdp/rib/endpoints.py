@@ -251,5 +251,5 @@ class RibEndpoints:
         own = self._kept.get(to)
         line = b"" if own is None else line_of(to, own.record.sequence)
         response = SyncMessage(of=ENDPOINTS, items=items, lacking=((to, line),), refused=refused)
-        wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        wire = self._identity.signed(response)
         self._out.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire))

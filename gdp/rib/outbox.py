@@ -63,7 +63,7 @@ class RibOutbox:
             about: as of ``OutgoingStatement``.
         """
         if to:
-            wire = body.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+            wire = self._identity.signed(body)
             self._outgoing += [OutgoingStatement(name, kind, wire, about) for name in to]
 
     def poll_statements(self) -> list[OutgoingStatement]:

@@ -38,12 +38,11 @@ def is_cold(state: RibCoreState, now_s: float) -> bool:
 
 def poll_replication(state: RibCoreState) -> list[OutgoingStatement]:
     """Return, once, the statements to send to peers."""
-    identity = state.identity
     wires: dict[int, bytes] = {}  # a message that is pushed to all is signed once
     messages = state.exchange.poll_messages(state.now_s)
     for _, message in messages:
         if id(message) not in wires:
-            wires[id(message)] = message.to_wire(identity.name, identity.key, identity.membership)
+            wires[id(message)] = state.identity.signed(message)
     return [OutgoingStatement(peer, Kind.RIB_REQUEST, wires[id(message)]) for peer, message in messages]
 
 

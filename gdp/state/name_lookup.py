@@ -59,7 +59,7 @@ class SwitchLookups:
             self._switch.query_name(name, now_s)
             state = "asked"
         elif rib is not None and since_s is not None:
-            if resolver.queries.is_open(name) or now_s < since_s + _SETTLE_S:
+            if resolver.requests.is_open(name) or now_s < since_s + _SETTLE_S:
                 state = "asked"
             else:
                 del self._since_s[name]

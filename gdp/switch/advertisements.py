@@ -22,6 +22,7 @@ from gdp.limits import ADVERTISEMENTS_RATE, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
+from gdp.switch.dependents import AttachedAdvertisement
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
@@ -92,6 +93,7 @@ class AdvertisementHandler:
             raise
         self._check_fresh(neighbour, advertisement, now.mono_s)
         at = (neighbour.port, neighbour.mac)
+        holder = AttachedAdvertisement(advertisement.name, advertisement.node, at)
         newest = self._sequence_of(advertisement.name, neighbour)
         if advertisement.sequence < newest:
             self._acknowledge(neighbour, advertisement.name, DropReason.STALE, newest)
@@ -103,7 +105,7 @@ class AdvertisementHandler:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._state.dependents.record_advertisement(advertisement, at)
+            self._state.dependents.record(holder, advertisement)
             for location in cache.of(advertisement.name, now.mono_s):
                 self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         # no RIB sends an AdvertiseAck to a node that has moved
@@ -117,7 +119,7 @@ class AdvertisementHandler:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._state.dependents.record_advertisement(advertisement, at)
+            self._state.dependents.record(holder, advertisement)
             if known is None or (known.port, known.mac) != at:
                 self._state.policy.audit.record(
                     Action.ACCEPTED, "name", who=advertisement.node.to_text(), about=advertisement.name.to_text()
@@ -180,7 +182,7 @@ class AdvertisementHandler:
 
     def _acknowledge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
         ack = AdvertiseAck(name, neighbour.name, refused, sequence)
-        wire = self._state.signed_wire(ack)
+        wire = self._state.identity.signed(ack)
         self._state.outbox.send_to_neighbour(neighbour, Kind.ADVERTISE_ACK, wire)
 
     def receive_withdrawal(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:

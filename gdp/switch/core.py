@@ -42,6 +42,7 @@ from gdp.switch.join_handler import JoinHandler
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.lsdb import LinkStateDatabase
 from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_resolver import owner_of
 from gdp.switch.outbox import Outbox
 from gdp.switch.path_updates import PathUpdates
 from gdp.switch.paths import Paths
@@ -189,7 +190,7 @@ class SwitchCore:
         """Return what the control plane dropped, by reason."""
         own = self._drops + self._reassembler.drops + self.hello_protocol.drops + self._channels.drops
         own += self.diagnostics.drops
-        return own + self._flooding.drops + self.resolver.drops + self.multicast.drops + self.unicast.drops
+        return own + self._flooding.drops + self.resolver.pending.drops + self.multicast.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Add a port, or update the MTU or cost of one that is up."""
@@ -248,8 +249,7 @@ class SwitchCore:
         lost = self.hello_protocol.drop_silent(now_s)
         for change in lost:
             self._neighbour_changed(change, now_s)
-        for hello in self.hello_protocol.hellos_to_send(now_s):
-            self.state.outbox.put(hello)
+        self.state.outbox.waiting += self.hello_protocol.hellos_to_send(now_s)
         self.diagnostics.handle_timer(now)
         if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
             return  # most due timers are keepalives
@@ -296,7 +296,7 @@ class SwitchCore:
 
     def query_name(self, name: Name, now_s: float) -> None:
         """Query a name at the RIB at once, known or not, for a tool of this machine."""
-        self.resolver.queries.request(name, now_s)
+        self.resolver.request(name, now_s)
         self.rib_client.send_due(now_s)
         self._rest_due_s = None
 
@@ -376,11 +376,12 @@ class SwitchCore:
             raise FrameError(DropReason.NO_SECOND_PATH)  # nothing is asked for it: the first copy travels anyway
         else:
             frame = arrival.frame[: HEADER_BYTES + header.length]
-            sought = self.unicast.miss(header, frame, neighbour, now.mono_s)
+            destination, source = Name(header.destination), Name(header.source)
+            sought = self.unicast.forward(destination, source, frame, owner_of(neighbour), now.mono_s)
             if sought is not None and self.resolver.cache.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
             if header.destination in self.relocations.moved_names:
-                self.relocations.frame_came(Name(header.destination), neighbour, now.mono_s)
+                self.relocations.frame_came(destination, neighbour, now.mono_s)
         return True
 
     def _take_control(self, arrival: ReceivedFrame, kind: int, statement: Statement, now: Timestamps) -> None:
@@ -466,6 +467,5 @@ class SwitchCore:
             self.multicast.neighbour_lost((neighbour.port, neighbour.mac), now_s)
             for attachment in self.attached.of(neighbour.name):
                 if attachment.port == neighbour.port:
-                    self.relocations.departed(attachment.advertisement, now_s)
-                    self.attached.remove(attachment.advertisement.name, neighbour.name)
+                    self.attached.depart(attachment.advertisement.name, neighbour.name, now_s)
                     self.unicast.remove(attachment.advertisement.name)

@@ -11,9 +11,8 @@ from typing import NamedTuple
 from gdp.names import Name
 from gdp.switch.attached_readers import AttachedReaders
 from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.switch.name_cache import Location, NameCache
+from gdp.switch.name_cache import NameCache
 from gdp.switch.trees import Downstream, Trees
-from gdp.trust.advertisement import Advertisement
 from gdp.trust.evidence_index import Holdings
 
 __all__ = ["AttachedAdvertisement", "Dependents", "JoinedBranch", "KnownLocation"]
@@ -51,19 +50,6 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
         self._readers = readers
         self._trees = trees
         super().__init__(self._has)
-
-    def record_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
-        """Record the advertisement of an attached node."""
-        self.record(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
-
-    def note_place(self, location: Location) -> None:
-        """Record a location that a RIB or a switch proved."""
-        if location.proof is not None:
-            self.record(KnownLocation(location.name, location.advertiser), location.proof)
-
-    def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
-        """Record the reader's advertisement that a join from downstream carried."""
-        self.record(JoinedBranch(topic, publisher, at), evidence)
 
     def _has(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
         if isinstance(holder, AttachedAdvertisement):

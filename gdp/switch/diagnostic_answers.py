@@ -97,12 +97,12 @@ class DiagnosticAnswers:
         }
         if paths.is_switch(question.name) or paths.is_rib(question.name) or question.name == me:
             locations[question.name] = {"node": question.name, "right": Right.ATTACH.value}  # link states name it
-        found = self._state.resolver.find(question.name, now.mono_s)
+        found = self._state.resolver.resolve_any(question.name, now.mono_s)
         if found is None:
             self._wake()
             if not locations:
                 return None
-        for location in found or ():
+        for location in found if isinstance(found, list) else ():
             known = {
                 "node": location.advertiser,
                 "right": location.right.value,

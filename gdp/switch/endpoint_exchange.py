@@ -93,7 +93,7 @@ class EndpointExchange:
                 continue
             lines = {name: line_of(name, record.sequence) for name, (record, _) in self._known.items()}
             query = SyncMessage(of=ENDPOINTS, lacking=tuple((name, lines.get(name, b"")) for name in self._wanted))
-            wires.append(query.to_wire(self._identity.name, self._identity.key, self._identity.membership))
+            wires.append(self._identity.signed(query))
         return wires
 
     def get_timer(self) -> float | None:

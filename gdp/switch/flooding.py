@@ -256,7 +256,7 @@ class Flooding:
             said_unix_s=max(int(now_s + (now.unix_s - now.mono_s)), 0),
             is_leaf=self._is_leaf,
         ).fitted(self._state.identity.membership)
-        wire = self._state.signed_wire(state)
+        wire = self._state.identity.signed(state)
         self.link_states.put(state, wire, now_s)
         self._refresh_at_s[scope] = now_s + LINK_STATE.refresh_s
         self._flood(scope, wire)

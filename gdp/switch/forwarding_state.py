@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.crypto.identity import Identity
-from gdp.crypto.schema import Body
 from gdp.sansio import Timestamps
 from gdp.switch.attached_readers import AttachedReaders
 from gdp.switch.dependents import Dependents
-from gdp.switch.evidence import Evidence
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
@@ -43,12 +41,11 @@ class ForwardingState:
         trees: multicast trees that pass here.
         dependents: which certificates ``attached``, ``readers``, ``trees`` and known locations depend on.
         verifier: of advertisements; shared, so that a known one is cheap.
-        evidence: verifies locations.
         now: of the last call of the core.
     """
 
     __slots__ = (
-        "attached", "dependents", "evidence", "identity", "me", "neighbours", "now", "outbox", "paths", "policy",
+        "attached", "dependents", "identity", "me", "neighbours", "now", "outbox", "paths", "policy",
         "readers", "resolver", "table", "trees", "verifier",
     )  # fmt: skip
 
@@ -76,9 +73,4 @@ class ForwardingState:
         self.trees = Trees()
         self.dependents = Dependents(self.attached, self.resolver.cache, self.readers, self.trees)
         self.verifier = AdvertisementVerifier(policy)
-        self.evidence = Evidence(policy, self.verifier)
         self.now = Timestamps(0.0, 0.0)
-
-    def signed_wire(self, body: Body) -> bytes:
-        """Return a statement of this switch, with its membership."""
-        return body.to_wire(self.identity.name, self.identity.key, self.identity.membership)

@@ -1,6 +1,6 @@
 """Joins from downstream: a switch verifies each before its trees follow it.
 
-Sans-I/O. A join carries the advertisements of a reader and of the publisher (``evidence.py``). A refresh renews joins
+Sans-I/O. A join carries the advertisements of a reader and of the publisher (``reader_of``). A refresh renews joins
 by number, and its reply names the joins that the neighbour does not know (``joins.py``).
 """
 
@@ -17,12 +17,16 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import JOINS_RATE
 from gdp.sansio import Timestamps
+from gdp.switch.dependents import JoinedBranch
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.relocation import Relocations
 from gdp.token_bucket import TokenBuckets
+from gdp.trust.advertisement import Advertisement
+from gdp.trust.right import HEARS
+from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["JoinHandler"]
+__all__ = ["JoinHandler", "reader_of"]
 
 _REFRESH_TOKENS: Final = 4.0  # of joins: it renews up to 128 of them, and may cost a reply
 
@@ -48,11 +52,11 @@ class JoinHandler:
         self._check(neighbour, statement, now.mono_s, 1.0)
         self._state.neighbours.ports[neighbour.port].receive_join(join, neighbour)
         if join.lease_s > 0:
-            advertisement = self._state.evidence.of_join(join, now)
+            advertisement = reader_of(join, self._state.verifier, now)
             if neighbour.role is Role.LEAF and advertisement.switch != neighbour.name:
                 raise StatementError(DropReason.THROUGH_LEAF, "a leaf that joins for a node of another switch")
             at = (neighbour.port, neighbour.mac)
-            self._state.dependents.note_branch(join.topic, join.publisher, at, advertisement)
+            self._state.dependents.record(JoinedBranch(join.topic, join.publisher, at), advertisement)
         if self._multicast.join(join, neighbour, now.mono_s):
             self._relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
 
@@ -91,3 +95,21 @@ class JoinHandler:
         if not self._paces.spend(neighbour.name, now_s, tokens):
             raise StatementError(DropReason.QUOTA, "joins of one neighbour")
         statement.verify(neighbour.key)
+
+
+def reader_of(join: Join, verifier: AdvertisementVerifier, now: Timestamps) -> Advertisement:
+    """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads.
+
+    Raises:
+        StatementError: an advertisement is not valid, or is about something else.
+    """
+    reader = verifier.verify(join.evidence, now.unix_s)
+    if reader.right not in HEARS or reader.name != join.topic:
+        raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's advertisement")
+    publisher = verifier.verify(join.proof, now.unix_s)
+    proven = publisher.name, publisher.node, publisher.right, publisher.switch, publisher.sequence
+    if proven != (join.topic, join.publisher, HEARS[reader.right], join.switch, join.version):
+        raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's advertisement is not")
+    if (join.path == 2 or join.route) and min(reader.paths, publisher.paths) < 2:
+        raise StatementError(DropReason.NOT_DELEGATED, "two paths that reader and publisher do not both ask for")
+    return reader

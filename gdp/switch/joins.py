@@ -15,6 +15,7 @@ from gdp.frame.kinds import Kind
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
+from gdp.sansio import OutgoingFrames
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey
 
@@ -146,7 +147,7 @@ class JoinSender:
         while spaced and self._free_s.get(at, 0.0) <= now_s:
             each = spaced.popleft()
             if self._is_standing(each.tree, at, each.number):
-                self._state.outbox.frames(*at, [each.frame])
+                self._state.outbox.waiting.append(OutgoingFrames(*at, [each.frame]))
                 self._free_s[at] = now_s + each.pause_s
         if not spaced:
             del self._spaced[at]

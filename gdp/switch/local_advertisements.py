@@ -5,6 +5,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -23,6 +24,8 @@ __all__ = ["LocalAdvertisement", "LocalAdvertisements"]
 _RELAYS: Final = Backoff(0.4, 3.2)
 _ROUND_TRIPS: Final = 2.0
 RELAY_TRIES: Final = 20
+_DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
+_DEPARTED_MAX: Final = 4_096
 _Key: TypeAlias = tuple[Name, Name]  # name, advertiser
 
 
@@ -46,6 +49,7 @@ class LocalAdvertisements:
         self._shares = Shares(ATTACHED_MAX)
         self._relays = Requests[_Key]()
         self._ends = DueQueue[_Key]()
+        self._departed: OrderedDict[_Key, float] = OrderedDict()  # until when it is remembered
 
     def __len__(self) -> int:
         return len(self._shares)
@@ -98,6 +102,18 @@ class LocalAdvertisements:
         if not advertisements:
             self._by_name.pop(name, None)
         return gone
+
+    def depart(self, name: Name, advertiser: Name, now_s: float) -> None:
+        """Remove an advertisement of a node that is not attached here any more, and remember that it was."""
+        self.remove(name, advertiser)
+        self._departed[name, advertiser] = now_s + _DEPARTED_S
+        self._departed.move_to_end((name, advertiser))
+        if len(self._departed) > _DEPARTED_MAX:
+            self._departed.popitem(last=False)
+
+    def was_here(self, name: Name, advertiser: Name, now_s: float) -> bool:
+        """Return whether an advertiser of a name departed recently."""
+        return self._departed.get((name, advertiser), 0.0) > now_s
 
     def all(self) -> list[LocalAdvertisement]:
         """Return every advertisement."""

@@ -1,6 +1,8 @@
 """Location updates: verified statements come in; name cache, routes, trees and attached readers follow.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``evidence.py`` verifies every location.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Each location is verified first: a
+RIB's response and a switch's relay carry the node's own advertisement, which names its switch by an RtCert. Only the
+domain and its transit rest on the signer alone.
 """
 
 from __future__ import annotations
@@ -11,18 +13,21 @@ from typing import Final
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import relayed
-from gdp.crypto.statements import Statement, StatementType
+from gdp.control.relayed_statement import RelayedStatement, relayed
+from gdp.crypto.certificates import Role
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.switch.dependents import KnownLocation
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
 from gdp.switch.relocation import Relocations
 from gdp.switch.trees import Downstream
 from gdp.switch.unicast import Unicast
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import HEARS, Right
 
 __all__ = ["LocationUpdates"]
@@ -58,6 +63,45 @@ class LocationUpdates:
         )
         return location.sequence > newest
 
+    def verified(self, response: Response, now: Timestamps, source: tuple[Name, bytes] | None = None) -> Location:
+        """Return the location in a response whose signature was verified.
+
+        Args:
+            source: the RIB that sent it, and that RIB's session.
+
+        Raises:
+            StatementError: its advertisement is not valid, or is about something else.
+        """
+        advertisement = self._state.verifier.verify(response.advertisement, now.unix_s)
+        if advertisement.name != response.name or advertisement.node != response.advertiser:
+            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
+        transit = frozenset(response.transit)
+        return _location(advertisement, response.domain, transit, response.lease_s, now, source)
+
+    def _from_forwarded_answer(self, statement: Statement, now: Timestamps) -> Location:
+        """Return the location in a response that was forwarded; any RIB of a trusted domain may have issued it."""
+        fields = statement.expect(StatementType.ANSWER)
+        member = self._state.policy.verify_sender(statement, now.unix_s)
+        if not (member.role.is_switch or member.role is Role.RIB):
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
+        statement.verify(member.key)
+        response = Response.from_fields(fields)
+        if not response.advertisement:
+            raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
+        return self.verified(response, now)
+
+    def _from_relay(self, statement: Statement, now: Timestamps) -> Location:
+        """Return the location that a switch reports of a node that is attached to it."""
+        relay = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
+        member = self._state.policy.verify_sender(statement, now.unix_s)
+        if not member.role.is_switch:
+            raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
+        statement.verify(member.key)
+        advertisement = self._state.verifier.verify_statement(parse(relay.statement), now.unix_s)
+        if advertisement.switch != member.name:
+            raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
+        return _location(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
+
     def receive(self, location: Location, statement: bytes, now_s: float) -> None:
         """Store where an advertiser is, and update everything that depends on it.
 
@@ -66,17 +110,15 @@ class LocationUpdates:
         """
         is_ours = location.switch == self._state.me
         attachment = self._state.attached.get(location.name, location.advertiser)
-        was_here = self._relocations.was_here(location.name, location.advertiser, now_s)
         if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:
-            self._state.attached.remove(location.name, location.advertiser)  # it has moved to another switch
-            self._relocations.departed(attachment.advertisement, now_s)
+            self._state.attached.depart(location.name, location.advertiser, now_s)  # it has moved to another switch
             self._unicast.remove(location.name)
-            was_here = True
         before = self.get(location.name, location.advertiser)
         if before is not None and before.sequence > location.sequence:
             # the sender's information is older
             location = replace(before, expires_s=max(before.expires_s, location.expires_s))
-        self._state.dependents.note_place(location)
+        if location.proof is not None:
+            self._state.dependents.record(KnownLocation(location.name, location.advertiser), location.proof)
         self._state.resolver.receive_location(location, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
         has_readers = location.right in HEARS.values()
         names = dict.fromkeys((location.name, location.advertiser))
@@ -84,7 +126,7 @@ class LocationUpdates:
             self._unicast.remove(*names)
             if has_readers:
                 self._multicast.publisher_moved(location, now_s)
-            if was_here and not is_ours:
+            if not is_ours and self._state.attached.was_here(location.name, location.advertiser, now_s):
                 self._relocations.moved(location, statement, now_s)
         if has_readers:
             self._multicast.publisher_found(location, now_s)
@@ -100,7 +142,7 @@ class LocationUpdates:
         Raises:
             StatementError: it is not valid.
         """
-        location, now_s = self._state.evidence.from_relay(statement, now), now.mono_s
+        location, now_s = self._from_relay(statement, now), now.mono_s
         if location.right in HEARS:
             self._multicast.reader_moved(location)
         self.acknowledge_relocation(location, now_s)
@@ -114,8 +156,7 @@ class LocationUpdates:
             StatementError: it is not valid, or contains no location.
         """
         is_relay = statement.type is StatementType.RELAY
-        verify = self._state.evidence.from_relay if is_relay else self._state.evidence.from_forwarded_answer
-        location = verify(statement, now)
+        location = self._from_relay(statement, now) if is_relay else self._from_forwarded_answer(statement, now)
         if self.is_newer(location):
             is_known = self.get(location.name, location.advertiser) is not None
             has_moved = is_known or self._state.trees.get(location.name, location.advertiser) is not None
@@ -148,7 +189,7 @@ class LocationUpdates:
         self._state.resolver.receive_removal(response.name, response.advertiser, now_s)
         self._multicast.publisher_gone(response.name, response.advertiser)
         self._unicast.remove(response.name)
-        wire = self._state.signed_wire(response)
+        wire = self._state.identity.signed(response)
         for at in self._state.readers.of(response.name):
             self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
 
@@ -164,7 +205,7 @@ class LocationUpdates:
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
         """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""
-        statements = [self._state.signed_wire(AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence))]
+        statements = [self._state.identity.signed(AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence))]
         for location in self._state.resolver.cache.of(moved.name, now_s):
             if HEARS.get(moved.right) is location.right:
                 statements.append(self._as_answer(location, now_s))
@@ -191,4 +232,27 @@ class LocationUpdates:
             transit=tuple(sorted(location.transit)),
             lease_s=lease_s,
         )
-        return self._state.signed_wire(response)
+        return self._state.identity.signed(response)
+
+
+def _location(
+    advertisement: Advertisement,
+    domain: Name,
+    transit: frozenset[Name],
+    lease_s: float,
+    now: Timestamps,
+    source: tuple[Name, bytes] | None = None,
+) -> Location:
+    return Location(
+        name=advertisement.name,
+        advertiser=advertisement.node,
+        right=advertisement.right,
+        switch=advertisement.switch,
+        domain=domain,
+        transit=transit,
+        advertisement=advertisement.wire,
+        expires_s=now.mono_s + lease_s,
+        proof=advertisement,
+        stale_until_s=now.mono_s + advertisement.valid_until_unix_s - now.unix_s,
+        source=source,
+    )

@@ -81,7 +81,7 @@ class MulticastTrees:
         for location in locations:
             self.publisher_found(location, now_s)
         if is_first:
-            self._state.resolver.queries.watch(advertisement.name, now_s)
+            self._state.resolver.watch(advertisement.name, now_s)
 
     def remove_reader(self, topic: Name, at: Downstream) -> None:
         """Remove a reader; with the last one of a topic its watch ends."""
@@ -89,7 +89,7 @@ class MulticastTrees:
         for tree in self.trees.of_topic(topic):
             self._cut(tree, at)
         if is_last:
-            self._state.resolver.queries.unwatch(topic)
+            self._state.resolver.unwatch(topic)
 
     def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""
@@ -108,7 +108,7 @@ class MulticastTrees:
             before = tree.branches.get(at)
             branch = Branch(
                 expires_s=reader.expires_s,
-                mtu=self._state.outbox.mtu_of(at[0]),
+                mtu=self._state.neighbours.mtu_of(at[0]),
                 evidence=reader.advertisement.wire,
                 wants_pair=reader.advertisement.paths > 1 and location.proof is not None and location.proof.paths > 1,
                 pace=PACE_MAX if before is None else before.pace,
@@ -203,7 +203,7 @@ class MulticastTrees:
             proven_until_s=now_s + JOIN_PROOF.lease_s,
             pace=join.pace,
         )
-        branch.fit(self._state.outbox.mtu_of(neighbour.port))
+        branch.fit(self._state.neighbours.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
             branch.backup_for = join.backup_for
             branch.active_until_s = None if before is None else before.active_until_s
@@ -283,7 +283,7 @@ class MulticastTrees:
         for tree in self.trees.all():
             for (its, _), branch in tree.branches.items():
                 if its == port:
-                    branch.fit(self._state.outbox.mtu_of(port))
+                    branch.fit(self._state.neighbours.mtu_of(port))
             self.upstream.restate(tree)
 
     def invalidate_evidence(

@@ -56,7 +56,7 @@ class PresenceAnswers:
             if is_there is not None:
                 del self.open[question.presence.node]
                 answer = replace(question.presence, is_answer=True, is_there=is_there)
-                wire = self._state.signed_wire(answer)
+                wire = self._state.identity.signed(answer)
                 self._unicast.send_statement(Kind.RIB_REQUEST, wire, question.rib, now_s)
 
     def _is_there(self, question: _Question) -> bool | None:

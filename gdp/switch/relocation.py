@@ -37,7 +37,6 @@ from gdp.trust.advertisement import Advertisement
 __all__ = ["GRACE_S", "Relocations"]
 
 GRACE_S: Final = 4.0  # for which the former switch handles frames for a moved node, redirects senders, and responds
-_DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
 _REMEMBERED_MAX: Final = 4_096
 _NOTICES: Final = Backoff(0.1, 0.8)  # until the former switch answers; one datagram may be lost
 _NOTICE_TRIES: Final = 5
@@ -72,7 +71,6 @@ class Relocations:
         self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
         self._requests = Requests[_Key]()
         self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose responses are accepted, until when
-        self._departed: OrderedDict[_Key, float] = OrderedDict()
         self._moved: OrderedDict[_Key, _Moved] = OrderedDict()
         self.moved_names: dict[Name, float] = {}
         self._said: OrderedDict[tuple[Name, int, bytes], float] = OrderedDict()
@@ -94,14 +92,6 @@ class Relocations:
         notice = self._notices.get(key)
         if notice is not None and sequence >= notice.sequence:
             self._forget(key)
-
-    def departed(self, advertisement: Advertisement, now_s: float) -> None:
-        """Record that a node is not attached here any more."""
-        _remember(self._departed, (advertisement.name, advertisement.node), now_s + _DEPARTED_S)
-
-    def was_here(self, name: Name, advertiser: Name, now_s: float) -> bool:
-        """Return whether an advertiser of a name was attached here recently."""
-        return self._departed.get((name, advertiser), 0.0) > now_s
 
     def is_former(self, switch: Name, now_s: float) -> bool:
         """Return whether a switch was recently notified as a former one, so that its response counts."""
@@ -143,7 +133,7 @@ class Relocations:
         No RIB responds, and the neighbour must have had the location to send the frame.
         """
         if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
-            self._state.outbox.send_to_neighbour(neighbour, Kind.WHERE, self._state.signed_wire(Query(name, 0.0)))
+            self._state.outbox.send_to_neighbour(neighbour, Kind.WHERE, self._state.identity.signed(Query(name, 0.0)))
 
     def handle_timer(self, now_s: float) -> None:
         """Send the notices that are due."""

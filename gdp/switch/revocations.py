@@ -30,6 +30,7 @@ from gdp.switch.dependents import AttachedAdvertisement, JoinedBranch, KnownLoca
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.unicast import Unicast
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR
@@ -159,11 +160,11 @@ class RevocationHandler:
 
     def _close_advertisement(self, holder: AttachedAdvertisement, now: Timestamps) -> None:
         attachment = self._state.attached.get(holder.name, holder.node)
-        if attachment is not None and not self._state.evidence.still_holds(attachment.advertisement, now):
+        if attachment is not None and not self._still_holds(attachment.advertisement, now):
             self._state.attached.remove(holder.name, holder.node)
             self._unicast.remove(holder.name)
         advertisement = self._state.readers.advertisement_of(holder.name, holder.at)
-        if advertisement is None or self._state.evidence.still_holds(advertisement, now):
+        if advertisement is None or self._still_holds(advertisement, now):
             return
         self._multicast.remove_reader(holder.name, holder.at)
         for tree in self._state.trees.of_topic(holder.name):
@@ -173,7 +174,7 @@ class RevocationHandler:
         place = self._state.resolver.cache.get(holder.name, holder.advertiser)
         if place is None or place.proof is None:
             return
-        if not self._state.evidence.still_holds(place.proof, now):
+        if not self._still_holds(place.proof, now):
             self._state.resolver.receive_removal(place.name, place.advertiser, now.mono_s)
             self._multicast.publisher_gone(place.name, place.advertiser)
             self._unicast.remove(place.name)
@@ -183,6 +184,14 @@ class RevocationHandler:
         self._multicast.invalidate_evidence(
             branch.topic, branch.publisher, branch.at, proves, now.mono_s + GRACE_S, now.mono_s
         )
+
+    def _still_holds(self, advertisement: Advertisement, now: Timestamps) -> bool:
+        """Return whether the certificates of a verified advertisement are still valid."""
+        try:
+            self._state.verifier.recheck(advertisement, now.unix_s)
+        except StatementError:
+            return False
+        return True
 
     def _proves(self, evidence: bytes, now: Timestamps) -> bool:
         try:

@@ -8,7 +8,7 @@ location, or one of the advertiser's domain; else to the nearest, and to the nex
 same distance are ordered by a hash that differs for each switch, so that no name is preferred. A RIB that owes a
 response for ``SILENT_S`` is replaced by the next one.
 
-While no RIB responds, known locations are still served (``name_cache.py``). They are also kept where a RIB responds
+While no RIB responds, known locations are still served (``name_resolver.py``). They are also kept where a RIB responds
 that it does not know, or denies a name that it could not know. The name resolver decides which queries are due;
 ``location_updates.py`` applies the responses.
 """
@@ -16,7 +16,6 @@ that it does not know, or denies a name that it could not know. The name resolve
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
@@ -38,6 +37,7 @@ from gdp.sansio import Timestamps
 from gdp.switch.endpoint_exchange import EndpointExchange
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.location_updates import LocationUpdates
+from gdp.switch.name_resolver import NameQuery
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
@@ -112,13 +112,12 @@ class RibClient:
                 reached.append((is_avoided, rib.domain != own, distance, spread, rib))
         return [each[-1] for each in sorted(reached)]
 
-    def _rib_for(self, name: Name, now_s: float) -> Name | None:
-        """Return the RIB to query for a name."""
+    def _rib_for(self, query: NameQuery, now_s: float) -> Name | None:
+        """Return the RIB to send a query to."""
         if not self._others:
             return self.rib
-        passed_over = self._state.resolver.queries.passed_over(name)
-        left = [rib for rib in self._others if rib.name not in passed_over] or self._others
-        known = self._state.resolver.cache.of(name, now_s)
+        left = [rib for rib in self._others if rib.name not in query.passed_over] or self._others
+        known = self._state.resolver.cache.of(query.name, now_s)
         sources, domains = {place.source[0] for place in known if place.source}, {place.domain for place in known}
         avoided = {rib for rib, until_s in self._avoided.items() if until_s > now_s}
         return min(left, key=lambda rib: (rib.name in avoided, rib.name not in sources, rib.domain not in domains)).name
@@ -139,11 +138,14 @@ class RibClient:
                 self.relay(attachment.advertisement.wire, now_s)
         for statement in self.endpoints.statements_to_send(now_s):
             self._to_rib(statement, now_s)
-        for name, watch_s in self._state.resolver.queries_to_send(now_s):
-            is_heard = bool(self._state.readers.of(name))
-            query = Query(name, watch_s, self._state.policy.revoked.digest_about(name) if is_heard else None)
-            wire = self._state.signed_wire(query)
-            self._to_rib(wire, now_s, self._rib_for(name, now_s))
+        self.send_queries(now_s)
+
+    def send_queries(self, now_s: float) -> None:
+        """Send the queries for names that are due."""
+        for due in self._state.resolver.queries_to_send(now_s):
+            revoked = self._state.policy.revoked.digest_about(due.name) if due.is_watch else None
+            wire = self._state.identity.signed(Query(due.name, due.watch_s, revoked))
+            self._to_rib(wire, now_s, self._rib_for(due, now_s))
 
     def _trip_s(self, rib: Name) -> float:
         """Return the round trip of the link towards a RIB, in seconds; 0: not measured, or the RIB is here."""
@@ -262,12 +264,12 @@ class RibClient:
 
     def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
-            place = self._state.evidence.from_answer(response, now)
+            place = self._locations.verified(response, now, self._source(member.name))
         except StatementError:
             # it is of no use here, but still counts as a response
             self._receive_negative(response.name, member, now.mono_s)
             raise
-        self._locations.receive(replace(place, source=self._source(member.name)), wire, now.mono_s)
+        self._locations.receive(place, wire, now.mono_s)
 
     def _source(self, rib: Name) -> tuple[Name, bytes]:
         known = self._state.paths.ribs().get(rib)
@@ -296,7 +298,7 @@ class RibClient:
             self._relocations.acknowledged(ack.name, ack.advertiser, ack.sequence)
             return
         statement.expect(StatementType.ANSWER)
-        place = self._state.evidence.from_answer(Response.from_fields(statement.fields), now)
+        place = self._locations.verified(Response.from_fields(statement.fields), now)
         known = self._locations.get(place.name, place.advertiser)
         if known is None or known.sequence < place.sequence:
             self._locations.receive(place, statement.wire, now.mono_s)
@@ -313,7 +315,7 @@ class RibClient:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
-        of_names = earliest(self._state.attached.next_event(), self._state.resolver.queries.next_due(), self._review_s)
+        of_names = earliest(self._state.attached.next_event(), self._state.resolver.next_query(), self._review_s)
         owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
         due_s = earliest(of_names, owed_s, self.endpoints.get_timer(), self._channels.get_timer())
         return None if self.rib is None else due_s

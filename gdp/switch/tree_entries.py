@@ -28,7 +28,7 @@ class TreeEntries:
     def install(self, tree: Tree) -> None:
         """Install the entry of a tree that has branches, with its backups."""
         tree.protection = self._protection(tree)
-        hops = tree.hops(self._state.outbox.mac_of())
+        hops = tree.hops(self._state.neighbours.own_macs())
         if not self._state.table.install(tree.key, hops, tree.expires_s(), tree.sides, tree.paces(hops)):
             self.drops[DropReason.QUOTA] += 1
         if tree.path == 2:
@@ -59,7 +59,7 @@ class TreeEntries:
 
         Of several trees it is the one with the shortest route, so that these paths form no loop either.
         """
-        macs, key = self._state.outbox.mac_of(), second_path_key(publisher)
+        macs, key = self._state.neighbours.own_macs(), second_path_key(publisher)
         best: tuple[int, Name] | None = None
         for topic, tree in self._second.get(publisher, {}).items():
             if tree.upstream is not None and tree.upstream[0] in macs and tree.branches:

@@ -16,9 +16,10 @@ from typing import Final
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT
 from gdp.intervals import LINK_STATE, NEGATIVE_LEASE_S
 from gdp.names import Name
+from gdp.sansio import OutgoingFrames
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
 from gdp.switch.paths import Path
@@ -56,23 +57,37 @@ class Unicast:
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
         self.drops: Counter[DropReason] = Counter()
 
-    def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
-        """Handle a neighbour's frame without a table entry; return the name whose location it waits for, if any."""
-        destination, source = Name(header.destination), Name(header.source)
-        return self._find(destination, source, frame, self._state.resolver.owner_of(neighbour), now_s)
+    def forward(
+        self, destination: Name, source: Name, frame: bytes, owner: bytes, now_s: float, until_s: float | None = None
+    ) -> Name | None:
+        """Forward a frame without a table entry, or make it pending until the query for a name is answered.
+
+        Args:
+            owner: the neighbour that sent it, as ``owner_of``; empty: this switch.
+            until_s: when it has been pending for long enough; None: it comes now.
+
+        Returns:
+            The name whose location the frame waits for, if any.
+        """
+        waits_for = self._resolve(destination, source, owner, now_s)
+        if waits_for is not None:
+            self._state.resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
+            return waits_for
+        hop = self._hop(destination, source)
+        if frame[HOPS_AT] <= 1 and not isinstance(hop, DropReason):
+            hop = DropReason.HOPS_EXPIRED
+        self._send(hop, [frame[:HOPS_AT] + bytes([max(frame[HOPS_AT] - 1, 0)]) + frame[HOPS_AT + 1 :]])
+        return None
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the same path as forwarded frames."""
         if self._resolve(destination, source, b"", now_s) is None:
-            hop = self._hop(destination, source)
-            if hop is None:
-                self.drops[self._reason(destination, source)] += len(frames)
-            else:
-                self._state.outbox.frames(hop[0], hop[1][:6], frames)
+            self._send(self._hop(destination, source), frames)
 
     def send_statement(self, kind: int, statement: bytes, destination: Name, now_s: float) -> None:
         """Send a statement of our own to a node that may be beyond a neighbour."""
-        frames = self._state.outbox.remote_frames(kind, statement, destination)
+        mtu = min((port.mtu for port in self._state.neighbours.ports.values()), default=1_500)
+        frames = self._state.outbox.fragmenter.split(kind, statement, mtu, destination)
         self.send(frames, destination, self._state.me, now_s)
 
     def originate(self, frames: Iterable[bytes], destination: Name, source: Name, now_s: float) -> None:
@@ -83,13 +98,13 @@ class Unicast:
         """
         for frame in frames:
             leaving = frame[:HOPS_AT] + bytes([frame[HOPS_AT] + 1]) + frame[HOPS_AT + 1 :]
-            self._find(destination, source, leaving, b"", now_s)
+            self.forward(destination, source, leaving, b"", now_s)
 
     def release(self, name: Name, now_s: float) -> None:
         """Retry the frames that wait for a name."""
         for frame, until_s, owner in self._state.resolver.pending.release(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
-            self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
+            self.forward(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed path again after a link change; ``refresh_more`` does the rest of very many."""
@@ -140,35 +155,19 @@ class Unicast:
         self._installed[key] = why
         self._keys_of.setdefault(why.destination, set()).add(key)
 
-    def _find(
-        self, destination: Name, source: Name, frame: bytes, owner: bytes, now_s: float, until_s: float | None = None
-    ) -> Name | None:
-        """Forward a frame, or make it pending until its query is answered."""
-        waits_for = self._resolve(destination, source, owner, now_s)
-        if waits_for is None:
-            self._forward(destination, source, frame)
-        else:
-            self._state.resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
-        return waits_for
-
-    def _forward(self, destination: Name, source: Name, frame: bytes) -> None:
-        hop = self._hop(destination, source)
-        if hop is None:
-            self.drops[self._reason(destination, source)] += 1
-        elif frame[HOPS_AT] <= 1:
-            self.drops[DropReason.HOPS_EXPIRED] += 1
-        else:
-            on = frame[:HOPS_AT] + bytes([frame[HOPS_AT] - 1]) + frame[HOPS_AT + 1 :]
-            self._state.outbox.frames(hop[0], hop[1][:6], [on])
-
-    def _reason(self, destination: Name, source: Name) -> DropReason:
-        """Return why an entry leads nowhere."""
+    def _hop(self, destination: Name, source: Name) -> Hop | DropReason:
+        """Return the hop of the entry for such frames, or why it leads nowhere."""
+        entries = self._state.table.entries
+        if hops := entries.get(destination + source) or entries.get(destination):
+            return hops[0][:2]
         why = self._installed.get(destination + source)
         return DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere
 
-    def _hop(self, destination: Name, source: Name) -> Hop | None:
-        hops = self._state.table.entries.get(destination + source) or self._state.table.entries.get(destination)
-        return hops[0][:2] if hops else None
+    def _send(self, hop: Hop | DropReason, frames: list[bytes]) -> None:
+        if isinstance(hop, DropReason):
+            self.drops[hop] += len(frames)
+        else:
+            self._state.outbox.waiting.append(OutgoingFrames(hop[0], hop[1][:6], frames))
 
     def _resolve(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
         """Install an entry, perhaps a negative one; or return the name whose location must be queried first.
@@ -178,12 +177,13 @@ class Unicast:
         """
         at = self._state.attached.at(destination)
         if at is not None:
-            self._install(destination, b"", self._state.outbox.hop_at(at.port, at.mac), source, at.expires_s)
+            self._install(destination, b"", self._state.neighbours.hop(at.port, at.mac), source, at.expires_s)
             return None
         neighbour = self._state.neighbours.cheapest(destination)
         # a proxy is where its advertisement was accepted
         if neighbour is not None and neighbour.role is not Role.PROXY:
-            self._install(destination, b"", self._state.outbox.hop(neighbour), source, now_s + LINK_STATE.refresh_s)
+            hop = self._state.neighbours.hop(neighbour.port, neighbour.mac)
+            self._install(destination, b"", hop, source, now_s + LINK_STATE.refresh_s)
             return None
         if self._state.paths.is_switch(destination):
             domain = self._state.paths.domain_of(destination) or self._own_domain
@@ -201,27 +201,27 @@ class Unicast:
         found = self._state.resolver.resolve(destination, now_s, owner)
         if found is None:
             return destination
-        if found.reason is not None:
-            self._install_negative(destination, source, found.reason, now_s)
+        if isinstance(found, DropReason):
+            self._install_negative(destination, source, found, now_s)
             return None
-        places = found.locations
-        if all(place.domain == self._own_domain for place in places) and self._is_of_own_domain(source, now_s):
-            best = self._nearest(places, frozenset({self._own_domain}), now_s)
+        if all(place.domain == self._own_domain for place in found) and self._is_of_own_domain(source, now_s):
+            best = self._nearest(found, frozenset({self._own_domain}), now_s)
             if best is not None:
                 self._install_way(destination, b"", best[0], source, best[1], now_s)
                 return None
         transit = self._transit
-        if not self._is_known_here(source):
-            origin = self._state.resolver.resolve_source(source, now_s, owner)
+        paths = self._state.paths
+        if not (self._state.attached.at(source) or paths.is_switch(source) or paths.is_rib(source)):
+            origin = self._state.resolver.resolve_any(source, now_s, owner)
             if origin is None:
                 return source
-            if origin.reason is not None:
-                self._install_negative(destination, source, origin.reason, now_s)
+            if isinstance(origin, DropReason):
+                self._install_negative(destination, source, origin, now_s)
                 return None
-            transit = origin.locations[0].transit | {origin.locations[0].domain}
-        best = self._nearest(places, transit & self._transit, now_s)
+            transit = origin[0].transit | {origin[0].domain}
+        best = self._nearest(found, transit & self._transit, now_s)
         if best is None:
-            reasons = [self._why(place.switch, place.domain) for place in places]
+            reasons = [self._why(place.switch, place.domain) for place in found]
             self._install_negative(destination, source, max(reasons, default=DropReason.NO_ROUTE), now_s)
         else:
             self._install_way(destination, source, best[0], source, best[1], now_s)
@@ -230,11 +230,6 @@ class Unicast:
     def _why(self, switch: Name, domain: Name) -> DropReason:
         """Return the reason to report where there is no path to a switch."""
         return DropReason.THROUGH_LEAF if self._state.paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
-
-    def _is_known_here(self, source: Name) -> bool:
-        """Return whether a source needs no query: it is attached here, or link states name it."""
-        paths = self._state.paths
-        return self._state.attached.at(source) is not None or paths.is_switch(source) or paths.is_rib(source)
 
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
         if self._state.attached.at(source) is not None or self._state.paths.domain_of(source) == self._own_domain:
@@ -267,11 +262,21 @@ class Unicast:
     ) -> None:
         """Install a path; where there is none, a negative entry with the reason ``otherwise``."""
         neighbour = None if path is None else self._state.neighbours.cheapest(path.first)
-        if neighbour is None:
+        if path is None or neighbour is None:
             self._install_negative(destination, source, otherwise, now_s)
         else:
-            hop = self._state.outbox.protected_hop(neighbour, None if path is None else path.alternate)
-            self._install(destination, source_key, hop, source, expires_s)
+            self._install(destination, source_key, self._protected_hop(neighbour, path.alternate), source, expires_s)
+
+    def _protected_hop(self, neighbour: Neighbour, alternate: Name | None) -> Hop | ProtectedHop:
+        """Return the hop to a neighbour with an alternate: over a second link to it, or else through ``alternate``."""
+        neighbours = self._state.neighbours
+        hop = neighbours.hop(neighbour.port, neighbour.mac)
+        others = [port for port in neighbours.ports if port != neighbour.port]
+        for name in (neighbour.name, alternate or neighbour.name):
+            if found := [n for port in others if (n := neighbours.get(port, name)) is not None]:
+                second = min(found, key=lambda n: (n.cost, n.port))
+                return *hop, *neighbours.hop(second.port, second.mac)
+        return hop
 
     def _install(
         self, destination: Name, source_key: bytes, hop: Hop | ProtectedHop, source: Name, expires_s: float

@@ -190,7 +190,7 @@ class UpstreamJoins:
         evidence = self._evidence(tree)
         if other is not None and evidence:
             at, name = other
-            mtu = min(tree.mtu, self._state.outbox.mtu_of(at[0]))
+            mtu = min(tree.mtu, self._state.neighbours.mtu_of(at[0]))
             terms = self._joins.terms(tree, at, name, mtu, self._state.me)
             if not (renews and self._joins.add_renewal(tree, at, terms)):
                 self._joins.send_join(tree, at, name, terms, evidence)
@@ -224,7 +224,7 @@ class UpstreamJoins:
     def _mtu_over(self, tree: Tree, port: int) -> int:
         """Return the MTU for a join over a port; the publisher gets that of both trees, since it sends one size."""
         trees = self._state.trees.both(tree.topic, tree.publisher) if tree.switch == self._state.me else (tree,)
-        return min(self._state.outbox.mtu_of(port), *(each.mtu for each in trees if each.branches))
+        return min(self._state.neighbours.mtu_of(port), *(each.mtu for each in trees if each.branches))
 
     def _upstream_terms(self, tree: Tree) -> JoinTerms | None:
         """Return what a join upstream asks for now; None where none may be sent."""

@@ -7,7 +7,9 @@ Source: Prometheus text exposition format, version 0.0.4.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import accumulate
 from typing import Final, TypeVar
 
@@ -16,9 +18,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from gdp.errors import DropReason, LocalError
-from gdp.http_server import HttpServer
+from gdp.http_server import Answer, HttpServer
+from gdp.intervals import CONNECT_S, Rate
 from gdp.names import NAME_BYTES, Name
-from gdp.telemetry.scraping import scrape_server
+from gdp.telemetry.health import PROBES, Health, probe
 from gdp.telemetry.sources import (
     Counts,
     EntryCounts,
@@ -29,8 +32,16 @@ from gdp.telemetry.sources import (
     Sources,
     TopicCounts,
 )
+from gdp.token_bucket import TokenBucket
 
-__all__ = ["Metrics"]
+__all__ = ["Metrics", "scrape_server"]
+
+_CONNECTIONS_MAX: Final = 4
+_BACKLOG: Final = 128
+_ANSWERS_RATE: Final = Rate(20.0, burst=20.0)  # a few ms each; a scraper polls every few seconds
+_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+_JSON: Final = "application/json"
+
 
 _ANY: Final = "any"  # an entry for every source
 _DEVICE_COUNTS: Final = {
@@ -193,3 +204,31 @@ def _histogram(name: str, text: str, seen: Histogram) -> Metric:
     ends = [*map(repr, seen.bounds_s), "+Inf"]
     buckets = list(zip(ends, accumulate(seen.counts), strict=True))
     return HistogramMetricFamily(name, text, buckets=buckets, sum_value=seen.total_s)
+
+
+def scrape_server(port: int, text: Callable[[], bytes], health: Callable[[], Health] | None = None) -> HttpServer:
+    """Serve the present text; the paths of ``PROBES`` give the state of the node instead.
+
+    Args:
+        port: of 127.0.0.1; 0: the system chooses.
+        text: called in the server's thread, once for each response.
+        health: called for each probe; None: the node has no probes, and they get 404.
+
+    Raises:
+        OSError: the port is in use.
+    """
+    answers = TokenBucket(*_ANSWERS_RATE)
+
+    def answer(path: str) -> Answer:
+        """Return the response for a path."""
+        if not answers.spend(time.monotonic()):
+            return Answer("503 Service Unavailable")
+        if path not in PROBES:
+            return Answer("200 OK", text(), _TYPE)
+        if health is None:
+            return Answer("404 Not Found")
+        is_good, state = probe(path, health(), time.monotonic())
+        return Answer("200 OK" if is_good else "503 Service Unavailable", state, _JSON)
+
+    listener = socket.create_server(("127.0.0.1", port), backlog=_BACKLOG)
+    return HttpServer(listener, answer, name="metrics", connections=_CONNECTIONS_MAX, timeout_s=CONNECT_S)

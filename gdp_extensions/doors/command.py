@@ -5,22 +5,64 @@ I/O.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import typer
 
+from gdp.access_token import new_access_token
 from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json
+from gdp.cli.secret import Secret
+from gdp.errors import LocalError
 from gdp.links.uplink import wait_for_device
-from gdp_extensions.doors.token import NoToken, TokenFile, door_token
 from proxy.cli.node_options import Delegations, Iface
 
 if TYPE_CHECKING:
     from gdp_extensions.doors.endpoint import NewSession
 
-__all__ = ["DoorNode", "DoorOptions", "Listen", "Origins", "serve_door"]
+__all__ = ["DoorNode", "DoorOptions", "Listen", "NoToken", "Origins", "TokenFile", "door_token", "serve_door"]
+
+log = logging.getLogger(__name__)
+
+DOOR_TOKEN: Final = Secret("door token", "--token-file", "GDP_DOOR_TOKEN")
+_CHARACTERS_MIN: Final = 16
+
+TokenFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--token-file",
+        metavar="FILE",
+        help="a private file with the token of the door's URL, or GDP_DOOR_TOKEN. Default: a new one at each start",
+    ),
+]
+NoToken = Annotated[
+    bool, typer.Option("--no-token", help="Admit clients without a token: all who reach the door have its rights.")
+]
+
+
+def door_token(file: Path | None, *, no_token: bool) -> str:
+    """Return the token that a client must state; empty: none.
+
+    Raises:
+        LocalError: the file is not private, or the token has fewer than 16 characters.
+    """
+    if no_token:
+        if file is not None:
+            raise LocalError("--no-token and --token-file: leave one of them out")
+        log.warning("clients need no token: every user of this host, and all who reach the address, have its rights")
+        return ""
+    token = DOOR_TOKEN.read(file)
+    if token is None:
+        return new_access_token()
+    if len(token) < _CHARACTERS_MIN:
+        raise LocalError(
+            f"a door token has at least {_CHARACTERS_MIN} characters, such as 'openssl rand -hex 24' makes"
+        )
+    return token
+
 
 DoorNode = Annotated[
     Path,

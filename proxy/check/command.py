@@ -5,8 +5,12 @@ I/O.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
 
 from gdp.cli.console import console
 from gdp.cli.node import emit
@@ -14,17 +18,17 @@ from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
+from gdp.printable import escaped
 from gdp.trust.delegation import Delegation
 from proxy.check.core.explain import explain, unknown_qos
-from proxy.check.core.finding import Finding
+from proxy.check.core.finding import Finding, Match
 from proxy.check.graph_snapshot import read_graphs
-from proxy.check.table import table
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph
 from proxy.node.node import open_topics
 
-__all__ = ["check_proxy"]
+__all__ = ["check_proxy", "table"]
 
 
 def check_proxy(path: Path, settings: ProxyConfig, *, json: bool) -> int:
@@ -87,3 +91,45 @@ def _tell(label: str, findings: Sequence[Finding], *, json: bool) -> None:
     if label:
         shown.print(label, style="bold")
     shown.print(table(findings))
+
+
+def table(findings: Sequence[Finding]) -> Group:
+    """Return one row for each name under each rule, then one line for each fault and note."""
+    drawn = Table(title="rules", title_justify="left", title_style="bold")
+    for heading in ("rule", "here", "type", "nodes", "QoS"):
+        drawn.add_column(heading, overflow="fold")
+    for heading in ("name", "allowed"):
+        drawn.add_column(heading, overflow="fold")
+    for finding in findings:
+        rule = Text(f"{finding.direction} {finding.kind} {finding.name}")
+        if not finding.matches:
+            drawn.add_row(rule, "-", style="dim")
+        for match in finding.matches:
+            drawn.add_row(rule, *(Text(escaped(each)) for each in _cells(match)), style=_style(match))
+    return Group(drawn, *_lines(findings))
+
+
+def _cells(match: Match) -> tuple[str, ...]:
+    return (
+        match.local,
+        match.type_name or "?",
+        "\n".join(match.nodes) or "-",
+        "\n".join(match.qos) or "-",
+        match.overlay.short if match.overlay is not None else "-",
+        "yes" if match.is_held else "no",
+    )
+
+
+def _style(match: Match) -> str | None:
+    return "red" if match.faults else None if match.nodes else "dim"
+
+
+def _lines(findings: Sequence[Finding]) -> Iterator[Text]:
+    for finding in findings:
+        for match in finding.matches:
+            for text in match.faults:
+                yield Text(f"{finding.direction} {match.local}: {text}", style="red")
+            for text in match.notes:
+                yield Text(f"{finding.direction} {match.local}: {text}")
+        for text in finding.notes:
+            yield Text(f"{finding.direction} {finding.name}: {text}")

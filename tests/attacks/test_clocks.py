@@ -134,7 +134,7 @@ def buried(world: Simulation, label: str) -> list[bytes]:
 def play(world: Simulation, wires: list[bytes], to: str = "nuc1") -> None:
     """Let the compromised neighbour of a switch replay link states."""
     for wire in wires:
-        for frame in world.switches["nuc2"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
+        for frame in world.switches["nuc2"].state.outbox.fragmenter.split(Kind.LINK_STATE, wire, 1_500):
             world.network.inject(to, 0, frame, mac_of(world, to))
     world.network.run(1)
 

@@ -55,7 +55,7 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
         proof=shown,
     )
     before = counted(world)
-    frames = world.switches["nuc1"].state.outbox._fragmenter.split(
+    frames = world.switches["nuc1"].state.outbox.fragmenter.split(
         Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500
     )
     for frame in frames:
@@ -88,7 +88,7 @@ def test_x03_a_genuine_advertisement_of_the_publisher_says_where_it_is_only_unde
         sender_session=liar.nonce,
         proof=tree.proof,
     )
-    for frame in world.switches["nuc1"].state.outbox._fragmenter.split(
+    for frame in world.switches["nuc1"].state.outbox.fragmenter.split(
         Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500
     ):
         world.network.inject(label, liar.port, frame, liar.mac)

@@ -68,7 +68,7 @@ def first_to(world: Simulation, at: str, to: str) -> str | None:
 def say(world: Simulation, state: LinkState, liar: Identity, to: str, port: int) -> None:
     """Hand the liar's link state to a neighbour."""
     wire = state.to_wire(liar.name, liar.key, liar.membership)
-    for frame in world.switches["leaf"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"].state.outbox.fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject(to, port, frame, mac_of(world, to, port))
     world.network.run(1.0)
 
@@ -184,7 +184,7 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     )
     tap = Tap("left", "leaf")
     world.network.taps.append(tap)
-    for frame in world.switches["leaf"].state.outbox._fragmenter.split(
+    for frame in world.switches["leaf"].state.outbox.fragmenter.split(
         Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500
     ):
         world.network.inject("left", 1, frame, mac_of(world, "left", 1))
@@ -207,7 +207,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     )  # fmt: skip
     before = right.drops()[DropReason.THROUGH_LEAF]
     wire = border.to_wire(leaf.name, leaf.key, leaf.membership)
-    for frame in world.switches["leaf"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
+    for frame in world.switches["leaf"].state.outbox.fragmenter.split(Kind.LINK_STATE, wire, 1_500):
         world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour forwarded it
     assert right.drops()[DropReason.THROUGH_LEAF] > before
     assert not any(each.origin == leaf.name for each in right._flooding.link_states.states(Scope.BORDER))

@@ -13,7 +13,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from gdp.telemetry import scraping
+from gdp.telemetry import metrics as metrics_module
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Sources
 
@@ -56,7 +56,7 @@ def test_a50_silent_connections_take_neither_threads_nor_descriptors(port: int) 
 
 
 def test_a50_a_silent_connection_ends_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scraping, "CONNECT_S", 0.5)
+    monkeypatch.setattr(metrics_module, "CONNECT_S", 0.5)
     metrics = Metrics(Sources(frames=lambda: {"in": 3}))
     port = metrics.serve(0)
     with socket.create_connection(("127.0.0.1", port), 10) as peer:

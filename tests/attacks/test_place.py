@@ -29,7 +29,7 @@ def liar_of(world: Simulation, switch: str) -> LinkState:
 def say(world: Simulation, state: LinkState, liar: Identity) -> None:
     """Hand the liar's link state to nuc1 as its neighbour nuc2 would."""
     wire = state.to_wire(liar.name, liar.key, liar.membership)
-    frames = world.switches["nuc2"].state.outbox._fragmenter.split(Kind.LINK_STATE, wire, 1_500)
+    frames = world.switches["nuc2"].state.outbox.fragmenter.split(Kind.LINK_STATE, wire, 1_500)
     for frame in frames:
         world.network.inject("nuc1", 0, frame, mac_of(world, "nuc1"))
 

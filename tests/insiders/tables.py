@@ -11,8 +11,7 @@ from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
 from gdp.exchange.sync_set import FANOUT
 from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX
 from gdp.message.reassembly import Reassembler
-from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX, NameQueries
-from gdp.switch.pending_frames import PendingFrames
+from gdp.switch.name_resolver import QUERIES_MAX, USED_NAMES_MAX, NameResolver, PendingFrames
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
 
@@ -20,7 +19,7 @@ GENERAL_MAX: Final = 4_096  # tables of peers, sessions or old statements keep n
 LIMITS: Final[Mapping[str, int]] = {  # by class and attribute
     f"{of.__name__}.{attribute}": most
     for of, attribute, most in (
-        (NameQueries, "_queries", QUERIES_MAX + USED_NAMES_MAX),
+        (NameResolver, "_queries", QUERIES_MAX + USED_NAMES_MAX),
         (PendingFrames, "_by_name", PENDING_FRAMES_MAX),
         (ReaderProxies, "active", READERS_MAX),
         (UnicastStreams, "_streams", STREAMS_MAX),

@@ -18,7 +18,7 @@ from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
-from gdp.switch.pending_frames import PendingFrames
+from gdp.switch.name_resolver import PendingFrames
 from gdp.switch.unicast import Unicast
 from lab import simulation as worlds
 from lab.network import SimLink, SimNetwork
@@ -84,7 +84,7 @@ class Ledger(SimNetwork):
 def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
     """Return a growing count of the drops of switches' machines of other kinds than DATA."""
     others: Counter[DropReason] = Counter()
-    find, send = Unicast._find, Unicast.send
+    find, send = Unicast.forward, Unicast.send
 
     def noted_find(
         self: Unicast,
@@ -117,7 +117,7 @@ def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
         others[DropReason.PENDING_EXPIRED] += before - waiting()
 
     monkeypatch.setattr(PendingFrames, "expire", noted_expire)
-    monkeypatch.setattr(Unicast, "_find", noted_find)
+    monkeypatch.setattr(Unicast, "forward", noted_find)
     monkeypatch.setattr(Unicast, "send", noted_send)
     return others
 

@@ -22,7 +22,7 @@ from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame
 from gdp.switch.core import SwitchCore
-from gdp.switch.name_queries import QUERIES_MAX
+from gdp.switch.name_resolver import QUERIES_MAX
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
@@ -171,7 +171,7 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
     for number in range(2 * QUERIES_MAX):
         header = Header(Kind.DATA, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, number.to_bytes(32, "big"), b"e" * 32)
         world.network._nodes["nuc1"].machine.receive([ReceivedFrame(port, mac, encode(header))], world.network.now)
-    assert len(nuc1.resolver.queries) <= QUERIES_MAX + 8
+    assert len(nuc1.resolver.requests) <= QUERIES_MAX + 8
     assert nuc1.drops()[DropReason.PENDING_FULL] > 0
     world.network.send_pending("nuc1")
     world.network.run(6)

@@ -62,7 +62,7 @@ def neighbour(world: Simulation, at: str, label: str) -> tuple[Neighbour, Identi
 
 def inject(world: Simulation, at: str, sender: Neighbour, wire: bytes) -> None:
     """Let a neighbour say this to a switch."""
-    for frame in world.switches[at].state.outbox._fragmenter.split(Kind.JOIN_REFRESH, wire, 1_500):
+    for frame in world.switches[at].state.outbox.fragmenter.split(Kind.JOIN_REFRESH, wire, 1_500):
         world.network.inject(at, sender.port, frame, sender.mac)
 
 

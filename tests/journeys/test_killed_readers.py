@@ -120,7 +120,7 @@ def test_a_switch_stops_watching_the_topics_of_a_reader_that_died_unless_another
     world.add_member(OTHER, "s2")
     assert world.run_until_attached()
     flow = flowing(world, source=SOURCE, readers=readers)
-    queries = world.switches["s2"].resolver.queries
+    queries = world.switches["s2"].resolver.requests
     assert flow.topic.name in queries
     world.network.stop(READER)
     world.network.run(4 * ADVERTISEMENT.lease_s)

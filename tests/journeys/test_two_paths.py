@@ -19,6 +19,7 @@ from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
+from gdp.switch.join_handler import reader_of
 from gdp.switch.trees import Tree
 from gdp.trust.right import Right
 from lab.network import SimLink
@@ -302,7 +303,7 @@ def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
     now = at.world.network.now
     check: Callable[[], object] = partial(middle.multicast.join, join, neighbour, now.mono_s)
     if wrong == "one path asked":
-        check = partial(middle.state.evidence.of_join, join, now)
+        check = partial(reader_of, join, middle.state.verifier, now)
     with pytest.raises(StatementError):
         check()
 

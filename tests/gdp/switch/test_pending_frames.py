@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gdp.errors import DropReason
 from gdp.limits import PENDING_BYTES_MAX, PENDING_FRAMES_MAX, PENDING_S
-from gdp.switch.pending_frames import PendingFrames
+from gdp.switch.name_resolver import PendingFrames
 
 A, B = b"a" * 32, b"b" * 32
 

@@ -19,7 +19,7 @@ from tests.journeys.flows import ROBOT, SERVER, flowing, ring
 from tests.visited import visited
 
 ABSENT = Name(b"?" * 32)
-FILES_OF_A_MISS = 18  # all that run in the calls that carry it; it only falls
+FILES_OF_A_MISS = 9  # all that run in the calls that carry it; it only falls
 
 
 def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = Kind.ACKNACK) -> None:
@@ -109,7 +109,7 @@ def test_what_is_remembered_of_entries_goes_with_them() -> None:
 def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
     world = ring()
     nuc1, server, seen = world.switches["nuc1"], world.members[SERVER].name, set[str]()
-    receive, send_due = nuc1.receive, nuc1.rib_client.send_due
+    receive, send_queries = nuc1.receive, nuc1.rib_client.send_queries
 
     def received(arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         kinds = {decode(each.frame).kind for each in arrivals}
@@ -118,7 +118,9 @@ def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
 
     with (
         patch.object(nuc1, "receive", received),
-        patch.object(nuc1.rib_client, "send_due", lambda now_s: visited("switch", seen, lambda: send_due(now_s))),
+        patch.object(
+            nuc1.rib_client, "send_queries", lambda now_s: visited("switch", seen, lambda: send_queries(now_s))
+        ),
     ):
         send(world, server)
         world.network.run(0.0005)

@@ -23,6 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from gdp.errors import GdpError, LocalError
 from gdp.ports.socket_owners import SocketOwners
+from gdp_extensions.doors.command import door_token
 from gdp_extensions.doors.core.arrivals import Arrivals
 from gdp_extensions.doors.core.client_queue import ClientQueue
 from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
@@ -30,7 +31,6 @@ from gdp_extensions.doors.core.hub import Hub
 from gdp_extensions.doors.core.parameters import GET, LIST, SET
 from gdp_extensions.doors.core.rosbridge_session import IDS_MAX, RosbridgeSession
 from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
-from gdp_extensions.doors.token import door_token
 from lab.process import until
 from proxy.endpoints.core.endpoint import Event
 from proxy.serial.standard_types import known_channel

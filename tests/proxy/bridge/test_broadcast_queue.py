@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gdp.service.dispatch import Ask, Stop
 from gdp.service.frames import Stop as WireStop
-from proxy.bridge.broadcast_queue import BroadcastQueue, wire_of
+from proxy.bridge.request_sender import BroadcastQueue, wire_of
 
 FIRST, SECOND = Ask(1, b"first", None), Ask(2, b"second", None)
 

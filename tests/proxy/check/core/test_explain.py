@@ -17,9 +17,9 @@ from gdp.cli import gdp
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.right import Right
+from proxy.check.command import table
 from proxy.check.core.explain import explain, unknown_qos
 from proxy.check.core.finding import Finding, Match
-from proxy.check.table import table
 from proxy.endpoints.core.endpoint import GraphEntity, Role, proxy_node_name
 from proxy.serial.channel import Qos
 from tests.proxy.rule_files import OWNER, furnish, proxy, rules
