@@ -49,7 +49,7 @@ def world_of() -> Simulation:
     links = [Link("s0", "s1"), Link("s1", "s2"), Link("f1", "f2"), Link("t1", "t2"), Link("s2", "m1")]
     links += [Link(*ends) for ends in MBIT_S]
     ends = [Attachment("s1", "rib", "rib"), Attachment("s0", "proxy", "robot")]
-    ends += [Attachment(*label.split("/")[:1], "proxy", label.split("/")[1]) for label in (FAST, MEDIUM, THIN, LOSSY)]
+    ends += [Attachment(label[:2], "proxy", label[3:]) for label in (FAST, MEDIUM, THIN, LOSSY)]
     topology = Topology(tuple(links), (DomainPlan("home", SWITCHES),), tuple(ends))
     world = Simulation(topology=topology, lease_s=LEASE_S, keepalive_ms=None)
     assert world.run_until_attached()
