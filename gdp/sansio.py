@@ -7,9 +7,19 @@ frames and the time, and takes out frames to send and the time of the next call.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
-__all__ = ["BROADCAST", "OutgoingFrames", "ProtocolCore", "ReceivedFrame", "Timestamps", "new_tuple"]
+__all__ = [
+    "BROADCAST",
+    "KeepaliveOffer",
+    "KeepaliveRun",
+    "NodeCore",
+    "OutgoingFrames",
+    "ProtocolCore",
+    "ReceivedFrame",
+    "Timestamps",
+    "new_tuple",
+]
 
 BROADCAST: Final = b"\xff" * 6
 new_tuple: Final = tuple.__new__  # of a named tuple: one call, where its constructor is two and ``_make`` three
@@ -42,6 +52,95 @@ class OutgoingFrames(NamedTuple):
     port: int
     mac: bytes  # the receiver's, 6 bytes
     frames: Sequence[bytes]  # each from the header on
+
+
+class KeepaliveOffer(NamedTuple):
+    """A keepalive session that brings no news, as it is now; a data plane may run it.
+
+    The plane then sends and receives its keepalives alone, as a device does for BFD (RFC 5880), and hands the session
+    back with the first one that brings news, or when the neighbour is silent.
+
+    Attributes:
+        name: of the neighbour.
+        nonce: of the neighbour's session.
+        mac: of the neighbour, 6 bytes.
+        header: of our keepalives; the number is that of the last one.
+        head: payload of ours before the report.
+        expected: the same of the neighbour's, with 0 for the multiplier; others bring news.
+        loss: of the neighbour's keepalives, in 255ths.
+        sent: count of keepalives that were sent to the neighbour.
+        received: number of the last one that came.
+        echo: its count.
+        heard_s: when it came.
+        send_at_s: when ours is due.
+        suspect_s: silence after which the neighbour is polled.
+    """
+
+    port: int
+    name: bytes
+    nonce: bytes
+    mac: bytes
+    in_key: bytes
+    out_key: bytes
+    header: bytes
+    head: bytes
+    expected: bytes
+    loss: int
+    sequence: int
+    sent: int
+    received: int
+    echo: int
+    heard_s: float
+    send_at_s: float
+    out_interval_s: float
+    suspect_s: float
+
+
+class KeepaliveRun(NamedTuple):
+    """What happened in a session since the last report.
+
+    Attributes:
+        sent_s: when keepalives were sent.
+        sequence: number of the last one.
+        taken: how many of the neighbour's came.
+        received: number of the last one, here or before.
+        heard_s: when it came.
+        report: on the link, of the last one.
+        multiplier: of the last one; 0: none came since the session was handed over.
+        replays: how many others were refused.
+        send_at_s: when ours is due.
+        is_over: the data plane has handed the session back.
+    """
+
+    port: int
+    name: bytes
+    nonce: bytes
+    sent_s: tuple[float, ...] = ()
+    sequence: int = 0
+    taken: int = 0
+    received: int = 0
+    heard_s: float = 0.0
+    report: tuple[int, ...] = ()
+    multiplier: int = 0
+    replays: int = 0
+    send_at_s: float = 0.0
+    is_over: bool = False
+
+    @classmethod
+    def from_fields(cls, fields: Sequence[Any]) -> KeepaliveRun:
+        """Return the run that a journal has."""
+        run = cls(*fields)
+        return run._replace(sent_s=tuple(run.sent_s), report=tuple(run.report))
+
+
+class KeepaliveOffload(Protocol):
+    """Keepalive sessions of a protocol core, as far as a data plane may run them."""
+
+    def offers(self, now_s: float) -> list[KeepaliveOffer]:
+        """Return the sessions that a data plane may run; those that are not among them are the core's."""
+
+    def take_runs(self, runs: list[KeepaliveRun], late_s: float, now: Timestamps) -> None:
+        """Note what a data plane did in sessions; it was called so much later than it had requested."""
 
 
 class ProtocolCore(Protocol):
@@ -78,3 +177,11 @@ class ProtocolCore(Protocol):
 
     def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: preparing them took time."""
+
+
+class NodeCore(ProtocolCore, Protocol):
+    """A core on a data plane, which may take over keepalive sessions."""
+
+    @property
+    def offload(self) -> KeepaliveOffload:
+        """The keepalive sessions that a data plane may run."""

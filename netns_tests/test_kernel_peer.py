@@ -136,9 +136,9 @@ def test_a_question_that_is_refused_takes_the_plain_way_until_it_is_answered(
         assert is_straight(plane, WIDE)
         with monkeypatch.context() as patch:
             patch.setattr(NetlinkSocket, "_ask", refuse)
-            plane._next_upkeep_s = 0.0
+            plane._next_upkeep_s = plane._next_look_s = 0.0
             plane.poll(0)
             assert not is_straight(plane, WIDE)
-        plane._next_upkeep_s = 0.0
+        plane._next_upkeep_s = plane._next_look_s = 0.0
         plane.poll(0)
         assert is_straight(plane, WIDE)

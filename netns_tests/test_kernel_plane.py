@@ -163,7 +163,7 @@ def test_an_idle_poll_asks_no_device(make_kernel: MakeKernel, monkeypatch: pytes
     for _ in range(5):
         plane.poll(0)
     assert looks == []
-    plane._next_upkeep_s = 0.0
+    plane._next_upkeep_s = plane._next_look_s = 0.0
     plane.poll(0)
     assert len(looks) == 1
 

@@ -38,7 +38,7 @@ from gdp.rib.core import RibCore
 from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.runtime.runtime import Runtime
-from gdp.sansio import ProtocolCore
+from gdp.sansio import NodeCore
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.domain import Policy
@@ -163,7 +163,7 @@ class Lab:
         self._run(member, ifname)
         return member, identity
 
-    def _run(self, machine: ProtocolCore, *ifnames: str, table: Table | None = None) -> None:
+    def _run(self, machine: NodeCore, *ifnames: str, table: Table | None = None) -> None:
         self.planes.append(RawPlane(ifnames, table))
         self._runtimes.append(Runtime(machine, self.planes[-1]))
 

@@ -209,7 +209,7 @@ class Journal(TransactionFile):
 
     def _machine(self, cluster: str, name: str, record: str) -> Record:
         try:
-            return _RECORD.validate_json(record, strict=True)
+            return _RECORD.validate_json(record)
         except ValidationError as error:
             reason = first_fault(error)
             raise StoreError(f"{self.path}: machines: {cluster} {name}: not the record of one: {reason}") from error

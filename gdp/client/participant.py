@@ -149,6 +149,8 @@ class Participant:
         self.diagnostics.register("ping", self._answer_ping, for_foreign=True)
         self.diagnostics.evidence_of = self.attachment.evidence_of
         self._control = _Control(self.attachment, self.diagnostics)
+        self.offload = self.attachment.hello_protocol.offload
+        self.offload.on_runs = lambda _heard, _now: self._control.touch()
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped, by reason."""

@@ -40,6 +40,7 @@ class RibHost:
         self._now_s = 0.0  # of the last call
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=True)
         self.attachment = Attachment(identity, policy, settings)
+        self.offload = self.attachment.hello_protocol.offload
         self.rib = rib
         self.boundary = rib.boundary
         self.diagnostics = Diagnostics(

@@ -159,6 +159,12 @@ class HelloPort:
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
+    def note_ended(self, name: Name, nonce: bytes, received: int) -> None:
+        """Note the last keepalive of a session that has ended, if it is remembered."""
+        if (name, nonce) in self.ended:
+            sequence, before = self.ended[name, nonce]
+            self.ended[name, nonce] = sequence, max(before, received)
+
     def receive_join(self, join: Join | JoinRefresh | ReaderPace, neighbour: Neighbour) -> None:
         """Note a verified join, leave or refresh of a neighbour.
 

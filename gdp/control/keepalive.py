@@ -20,7 +20,6 @@ import hmac
 import math
 import struct
 from dataclasses import dataclass, field
-from enum import IntFlag
 from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES, MULTIPLIER_MAX, Timing
@@ -29,55 +28,64 @@ from gdp.control.link_quality import LinkQuality, LinkReport
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, FrameError
 from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.kinds import Flag, KeepaliveFlag, Kind
+from gdp.intervals import NEVER_S
 from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
+from gdp.sansio import KeepaliveRun
 
 __all__ = [
+    "HEAD_BYTES",
+    "JITTER",
     "PAYLOAD_BYTES",
     "QUEUED_S",
-    "KeepaliveFlag",
+    "REPORT",
+    "REPORT_AT",
+    "REPORT_BYTES",
+    "SUSPECT_AFTER",
+    "TAGGED_BYTES",
+    "TAG_BYTES",
     "KeepaliveSession",
     "Slowness",
+    "keepalive_header",
     "open_keepalive",
     "seal_keepalive",
 ]
 
-_TAG_BYTES: Final = 16
+TAG_BYTES: Final = 16
 _DIGEST_AT: Final = HEADER_BYTES + 2
-_REPORT: Final = struct.Struct(">QQIB")  # LinkReport
-_REPORT_AT: Final = _DIGEST_AT + DIGEST_BYTES
-_TAGGED_BYTES: Final = _REPORT_AT + _REPORT.size
-_FRAME_BYTES: Final = _TAGGED_BYTES + _TAG_BYTES
+REPORT: Final = struct.Struct(">QQIB")  # LinkReport
+REPORT_AT: Final = _DIGEST_AT + DIGEST_BYTES
+TAGGED_BYTES: Final = REPORT_AT + REPORT.size
+_FRAME_BYTES: Final = TAGGED_BYTES + TAG_BYTES
 PAYLOAD_BYTES: Final = _FRAME_BYTES - HEADER_BYTES
+REPORT_BYTES: Final = REPORT.size
+HEAD_BYTES: Final = 2 + DIGEST_BYTES  # flags, detect multiplier, digest: the payload before the report
 _NO_REPORT: Final = LinkReport()
 _DIGEST: Final = "sha256"
 _PURPOSE: Final = b"gdp-keepalive-1"
-_SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
+_SAME_MIN: Final = 2
+SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
 _POLLS_PER_INTERVAL: Final = 4
 QUEUED_S: Final = 3.0  # longest time in which a neighbour whose other frames come may be silent
 _FORGET_S: Final = 10.0
-_JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 requires up to 0.25
-
-
-class KeepaliveFlag(IntFlag):
-    """Flags of a keepalive."""
-
-    NONE = 0
-    POLL = 1  # requests an answer at once
-    FINAL = 2  # the answer to a poll
-    HEARD = 4  # the sender receives the receiver's keepalives
+JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 requires up to 0.25
 
 
 _POLL, _FINAL, _HEARD = (int(each) for each in (KeepaliveFlag.POLL, KeepaliveFlag.FINAL, KeepaliveFlag.HEARD))
+
+
+def keepalive_header(name: bytes, incarnation: int, sequence: int) -> Header:
+    """Return the header of a keepalive of a node."""
+    return Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, sequence, 0, 1, incarnation, ZERO, name)
 
 
 def seal_keepalive(
     key: bytes, header: Header, flags: int, multiplier: int, digest: bytes, report: LinkReport = _NO_REPORT
 ) -> bytes:
     """Return a keepalive frame; the header's length counts ``PAYLOAD_BYTES``."""
-    tagged = encode(header) + bytes((flags, multiplier)) + digest + _REPORT.pack(*report)
-    return tagged + hmac.digest(key, tagged, _DIGEST)[:_TAG_BYTES]
+    tagged = encode(header) + bytes((flags, multiplier)) + digest + REPORT.pack(*report)
+    return tagged + hmac.digest(key, tagged, _DIGEST)[:TAG_BYTES]
 
 
 def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes, LinkReport]:
@@ -88,11 +96,11 @@ def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes, LinkRepor
     """
     if len(frame) < _FRAME_BYTES:
         raise FrameError(DropReason.TRUNCATED, "keepalive")
-    tag = hmac.digest(key, frame[:_TAGGED_BYTES], _DIGEST)[:_TAG_BYTES]
-    if not hmac.compare_digest(tag, frame[_TAGGED_BYTES:_FRAME_BYTES]):
+    tag = hmac.digest(key, frame[:TAGGED_BYTES], _DIGEST)[:TAG_BYTES]
+    if not hmac.compare_digest(tag, frame[TAGGED_BYTES:_FRAME_BYTES]):
         raise FrameError(DropReason.BAD_TAG, "keepalive")
-    report = LinkReport(*_REPORT.unpack_from(frame, _REPORT_AT))
-    return frame[HEADER_BYTES], frame[HEADER_BYTES + 1], frame[_DIGEST_AT:_REPORT_AT], report
+    report = LinkReport(*REPORT.unpack_from(frame, REPORT_AT))
+    return frame[HEADER_BYTES], frame[HEADER_BYTES + 1], frame[_DIGEST_AT:REPORT_AT], report
 
 
 class Slowness:
@@ -140,6 +148,9 @@ class KeepaliveSession:
         arrived_s: when last counted, and there were more than the time before.
         quality: measurements of the link.
         has_new_cost: the keepalive opened last changed the cost that follows from them.
+        head: flags, 0 and digest of the neighbour's last one.
+        same: how many in a row requested nothing and had this head.
+        is_offloaded: a data plane runs the session (``KeepaliveOffer``).
     """
 
     out_key: bytes
@@ -159,6 +170,15 @@ class KeepaliveSession:
     arrived_s: float = float("-inf")
     quality: LinkQuality = field(default_factory=LinkQuality)
     has_new_cost: bool = False
+    head: bytes = b""
+    same: int = 0
+    is_offloaded: bool = False
+
+    @property
+    def is_steady(self) -> bool:
+        """Return whether keepalives pass both ways, and bring no news."""
+        is_quiet = self.probe is None and not self.is_final_due and not self.is_poll_due
+        return is_quiet and self.same >= _SAME_MIN
 
     @classmethod
     def begin(
@@ -218,9 +238,9 @@ class KeepaliveSession:
         flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
         self.is_final_due = self.is_poll_due = False
         name, incarnation = source
-        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, sequence, 0, 1, incarnation, ZERO, name)
+        header = keepalive_header(name, incarnation, sequence)
         frame = seal_keepalive(self.out_key, header, flags, multiplier, digest, self.quality.report_to_send(now_s))
-        self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * _JITTER)
+        self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * JITTER)
         is_queued = self.arrivals is not None and now_s - self.arrived_s < self.detect_s
         self.poll_at_s = now_s + self.in_interval_s / (1 if is_queued else _POLLS_PER_INTERVAL)
         return frame
@@ -241,11 +261,25 @@ class KeepaliveSession:
         self.detect_s = self.in_interval_s * max(multiplier, 1)
         self.received, self.is_alive, self.arrivals = header.number, True, None
         self.hears_us = bool(flags & _HEARD)
+        head = bytes((flags, 0)) + digest
+        self.same = self.same + 1 if flags == _HEARD and head == self.head else 0
+        self.head = head
         if self.probe is not None and self.probe.is_answered(self.quality.confirmed_s):
             self.probe = None
         if flags & _POLL:
             self.is_final_due, self.send_at_s = True, now_s
         return digest
+
+    def take_run(self, run: KeepaliveRun) -> None:
+        """Note what a data plane did in this session."""
+        self.quality.note_sent(run.sent_s)
+        self.received = max(self.received, run.received)
+        self.has_new_cost = bool(run.taken) and self.quality.receive(LinkReport(*run.report), run.heard_s, run.taken)
+        if run.multiplier:
+            self.detect_s = self.in_interval_s * run.multiplier
+        self.is_offloaded = not run.is_over
+        if run.is_over:
+            self.same, self.send_at_s, self.poll_at_s = 0, run.send_at_s, run.heard_s
 
     def begin_probe(self, now_s: float, *, is_restarted: bool) -> None:
         """Probe the link, because this node's address has changed.
@@ -274,16 +308,18 @@ class KeepaliveSession:
 
         While other frames come, its keepalives wait in a full queue or are dropped there: it has ``QUEUED_S`` more.
         """
+        if self.is_offloaded:
+            return NEVER_S
         return max(heard_s, min(self.arrived_s, heard_s + QUEUED_S)) + self.detect_s
 
     def is_silent(self, heard_s: float, now_s: float) -> bool:
         """Return whether a neighbour last heard at ``heard_s`` has left out a keepalive."""
-        return now_s >= heard_s + _SUSPECT_AFTER * self.in_interval_s
+        return now_s >= heard_s + SUSPECT_AFTER * self.in_interval_s
 
     def suspect_at_s(self, heard_s: float) -> float:
         """Return when a neighbour last heard at ``heard_s`` is polled next; never before its first keepalive."""
-        if not self.is_alive:
-            return float("inf")
+        if not self.is_alive or self.is_offloaded:
+            return NEVER_S
         if self.probe is not None:
             return self.poll_at_s
-        return max(heard_s + _SUSPECT_AFTER * self.in_interval_s, self.poll_at_s)
+        return max(heard_s + SUSPECT_AFTER * self.in_interval_s, self.poll_at_s)

@@ -11,6 +11,7 @@ all of them. Loss is counted from gaps in the counts. A frame that another one o
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from gdp.control.link_cost import DampedCost, link_cost
@@ -58,12 +59,16 @@ class RttEstimator:
         self._least_s = float("inf")
         self._block_ends_s: float | None = None
 
-    def add(self, sample_s: float, now_s: float) -> bool:
-        """Add a round-trip time in seconds; return whether the smoothed one is new."""
+    def add(self, sample_s: float, now_s: float, *, is_block: bool = False) -> bool:
+        """Add a round-trip time in seconds; return whether the smoothed one is new.
+
+        Args:
+            is_block: it stands for more than one keepalive.
+        """
         self._least_s = min(self._least_s, sample_s)
         if self._block_ends_s is None:
             self._block_ends_s = now_s + _BLOCK_S
-        if now_s < self._block_ends_s:
+        if now_s < self._block_ends_s and not is_block:
             return False
         least_s, self._least_s, self._block_ends_s = self._least_s, float("inf"), None
         if self.srtt_s is None:
@@ -88,12 +93,12 @@ class LossWindow:
         """Take the next count as the first one: those before it are of another session."""
         self._last = None
 
-    def record(self, count: int) -> None:
-        """Record the arrival of a keepalive with this count."""
+    def record(self, count: int, came: int = 1) -> None:
+        """Record the arrival of a keepalive with this count, the last one of ``came``."""
         is_next = self._last is not None and count > self._last
         passed = min(count - self._last, LOSS_WINDOW) if self._last is not None and is_next else 1
         self._last = count
-        self._arrived = ((self._arrived << passed) | 1) & _MASK
+        self._arrived = ((self._arrived << passed) | ((1 << min(came, passed)) - 1)) & _MASK
         self._seen = min(self._seen + passed, LOSS_WINDOW)
 
     @property
@@ -136,14 +141,34 @@ class LinkQuality:
         self._received = 0
         self._in.begin_session()
 
+    @property
+    def sent(self) -> int:
+        """Return the count of keepalives that were sent to this neighbour."""
+        return self._count
+
+    @property
+    def received(self) -> int:
+        """Return the count of the last keepalive that came; 0: none in this session."""
+        return self._received
+
+    @property
+    def loss_to_report(self) -> int:
+        """Return the share of the neighbour's keepalives that was lost, in 255ths."""
+        return round(_LOSS_UNIT * self.loss_in)
+
+    def note_sent(self, sent_s: Sequence[float]) -> None:
+        """Note when a data plane has sent keepalives."""
+        self._count += len(sent_s)
+        self._sent_s.extend(sent_s)
+
     def report_to_send(self, now_s: float) -> LinkReport:
         """Return the report of the keepalive that is sent now."""
         self._count += 1
         self._sent_s.append(now_s)
         held_us = min(max(int((now_s - self._heard_s) * 1e6), 0), _HELD_MAX_US) if self._received else 0
-        return LinkReport(self._count, self._received, held_us, round(_LOSS_UNIT * self.loss_in))
+        return LinkReport(self._count, self._received, held_us, self.loss_to_report)
 
-    def receive(self, report: LinkReport, heard_s: float) -> bool:
+    def receive(self, report: LinkReport, heard_s: float, came: int = 1) -> bool:
         """Process the report of an authenticated keepalive; return whether the damped cost is another one now.
 
         A neighbour can report a wrong time, as it can name a wrong cost for its own end. No other node can: reports are
@@ -151,15 +176,16 @@ class LinkQuality:
 
         Args:
             heard_s: when the keepalive arrived.
+            came: how many came since the last report, this one included.
         """
         self._received, self._heard_s = report.sent, heard_s
-        self._in.record(report.sent)
+        self._in.record(report.sent, came)
         self.loss_out = report.loss / _LOSS_UNIT
         age = self._count - report.echo
         if not report.echo or not 0 <= age < len(self._sent_s):
             return False
         self.confirmed_s = self._sent_s[-1 - age]
         rtt_s = heard_s - self.confirmed_s - report.held_us / 1e6
-        if rtt_s < 0 or not self.rtt.add(rtt_s, heard_s):
+        if rtt_s < 0 or not self.rtt.add(rtt_s, heard_s, is_block=came > 1):
             return False
         return self.cost.update(link_cost(self.rtt.srtt_s or 0.0, self.loss_in, self.loss_out), heard_s)

@@ -92,6 +92,12 @@ class LivenessMonitor:
             self._lateness_s += now_s - due_s
             self._slowness.late(now_s - due_s, now_s)
 
+    def note_late(self, late_s: float, now_s: float) -> None:
+        """Note that a data plane was called so much later than it had requested."""
+        if late_s:
+            self._lateness_s += late_s
+            self._slowness.late(late_s, now_s)
+
     def note_alive(self, neighbour: Neighbour, heard_s: float) -> None:
         """Note when a valid frame of a neighbour came."""
         neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
@@ -150,7 +156,7 @@ class LivenessMonitor:
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self.gone_at_s(neighbour)
                 self.is_probing = self.is_probing or (session is not None and session.probe is not None)
-                if session is not None and port.is_up:
+                if session is not None and port.is_up and not session.is_offloaded:
                     self.longest_s = max(self.longest_s, session.out_interval_s)
                     at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
                 due_s = min(due_s, at_s)

@@ -31,6 +31,7 @@ from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
 from gdp.control.keepalive import KeepaliveSession
+from gdp.control.keepalive_offload import SessionOffload
 from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourEvent, NeighbourState
 from gdp.control.neighbour_table import Change, NeighbourTable
@@ -67,6 +68,7 @@ class HelloProtocol:
         conflicts: nodes that share an identity with another one, at our ports; and notices that another has our own.
         liveness: which neighbours are silent.
         neighbours: those of all ports.
+        offload: of keepalive sessions to a data plane.
         preshared_keys: of tunnels to neighbours.
         reception: of hellos, whose frames it joins.
         together_s: keepalives leave so long before they are due, if this node is called for something else.
@@ -105,6 +107,14 @@ class HelloProtocol:
         self.reception = HelloReception(identity, policy, fragmenter, settings, self.ports)
         self.liveness = LivenessMonitor(self.neighbours, settings, is_only_way)
         self.preshared_keys = PresharedKeys(identity.name, settings.random_bytes)
+
+        def head_for(port: HelloPort) -> tuple[Timing, bytes]:
+            """Return the timing at a port, and the digest for its far end."""
+            return self._timings.get(port.index, self._timing), digest_for(port)
+
+        self.offload = SessionOffload(
+            (identity.name, settings.incarnation), self.neighbours, self.liveness, policy, head_for
+        )
 
     def set_timing(self, index: int, timing: Timing) -> None:
         """Request another keepalive timing on one port, from its next session on."""
@@ -166,7 +176,7 @@ class HelloProtocol:
     @property
     def drops(self) -> Counter[DropReason]:
         """Return the unfinished hellos and the messages about preshared keys that were given up, by reason."""
-        return self.reception.drops + self.preshared_keys.refused
+        return self.reception.drops + self.preshared_keys.refused + self.offload.refused
 
     def receive_cookie(self, arrival: ReceivedFrame, header: Header) -> None:
         """Process a cookie of a neighbour that was heard, at its address, in answer to a hello of this session.
@@ -431,7 +441,7 @@ class HelloProtocol:
                     out.append(OutgoingFrames(port.index, BROADCAST, answer))
             for neighbour in port.neighbours.values():
                 session = neighbour.keepalives
-                if session is None:
+                if session is None or session.is_offloaded:
                     continue
                 is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
                 if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
@@ -453,7 +463,8 @@ class HelloProtocol:
 
     def get_timer(self) -> float | None:
         """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
-        if self._next_s is None:
+        if self._next_s is None or self.offload.has_changed:
+            self.offload.has_changed = False
             self._next_s = self._find_next()
         reply_at_s = self.reception.reply_at_s
         self._due_s = reply_at_s if reply_at_s < self._next_s else self._next_s

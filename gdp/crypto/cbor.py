@@ -217,7 +217,7 @@ def _write(value: object, pieces: list[bytes], depth: int) -> None:
         pieces.append(_head(4, len(value)))
         for item in value:
             _write(item, pieces, depth + 1)
-    elif isinstance(value, Mapping):
+    elif isinstance(value, dict | Mapping):  # the usual kind first
         pieces.append(_head(5, len(value)))
         for key, item in sorted(((_key(key), item) for key, item in value.items()), key=_first):
             pieces.append(key)

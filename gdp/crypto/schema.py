@@ -63,7 +63,9 @@ _N = TypeVar("_N")
 _S = TypeVar("_S", bound="Body")
 _T = TypeVar("_T")
 _V = TypeVar("_V")
-_Marks: TypeAlias = "tuple[tuple[str, Keyed[Any] | Spread[Any], Any, Callable[[Any], Any]], ...]"
+_Marks: TypeAlias = (
+    "tuple[tuple[str, Keyed[Any] | Spread[Any], Any, Callable[[Any], Any], Callable[[Any], object] | None], ...]"
+)
 _U64_MAX: Final = (1 << 64) - 1
 _REQUIRED: Final = object()
 _NO_REASON: Final = 255
@@ -185,8 +187,11 @@ class FieldSet:
     def to_fields(self) -> dict[str, object]:
         """Return the fields as a map."""
         sent: dict[str, object] = {}
-        for attribute, mark, *_ in _marks(type(self)):
-            mark.write(getattr(self, attribute), sent)
+        for attribute, mark, key, _, write in _KNOWN.get(type(self)) or _marks(type(self)):
+            if write is not None:  # as ``Keyed.write``, without its cost
+                sent[key] = write(getattr(self, attribute))
+            else:
+                mark.write(getattr(self, attribute), sent)
         return sent
 
     @classmethod
@@ -200,7 +205,7 @@ class FieldSet:
 
     @classmethod
     def _made(cls: type[_B], received: Mapping[str, Value], given: dict[str, object]) -> _B:
-        for attribute, mark, key, read in _KNOWN.get(cls) or _marks(cls):
+        for attribute, mark, key, read, _ in _KNOWN.get(cls) or _marks(cls):
             if key in received:  # as ``Keyed.read``, without its cost
                 try:
                     given[attribute] = read(received[key])
@@ -271,7 +276,9 @@ def _marks(kind: type[FieldSet]) -> _Marks:
         names = [each.name for each in fields(cast("Any", kind)) if hasattr(hints[each.name], "__metadata__")]
         marks = [(name, mark) for name in names for mark in hints[name].__metadata__]
         known = _KNOWN[kind] = tuple(
-            (name, mark, mark.key, mark.form.read) if isinstance(mark, Keyed) else (name, mark, None, mark.read)
+            (name, mark, mark.key, mark.form.read, None if mark.is_omitted else mark.form.write)
+            if isinstance(mark, Keyed)
+            else (name, mark, None, mark.read, None)
             for name, mark in marks
         )
     return known

@@ -13,7 +13,7 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StoreError
@@ -62,8 +62,8 @@ CREATE INDEX IF NOT EXISTS mailboxes ON mail (recipient, id);
 _MAILBOX: Final = "SELECT count(*), coalesce(sum(length(wire)), 0) FROM mail WHERE recipient = ?"
 _SAME_MACHINE: Final = "(SELECT name FROM nodes WHERE machine = (SELECT machine FROM nodes WHERE name = ?))"
 _MACHINE: Final = (
-    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double, p.until_unix_s"
-    " FROM machines m LEFT JOIN plans p ON p.machine = m.id"
+    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double,"
+    " p.until_unix_s AS end_unix_s FROM machines m LEFT JOIN plans p ON p.machine = m.id"
 )
 
 
@@ -202,22 +202,11 @@ class Registry(TransactionFile):
             " misuse FROM tokens t LEFT JOIN plans p ON p.token = t.id WHERE t.id = ?"
         )
         with self.reading() as file:
-            row = file.execute(query, (identifier,)).fetchone()
-        if row is None:
+            found = _find(file, query, identifier)
+        if found is None:
             return None
-        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer, *planned = row
-        return TokenRow(
-            id=id_,
-            mac=mac,
-            role=role,
-            label=label,
-            expires_unix_s=expires_unix_s,
-            keys=keys,
-            used_unix_s=used_unix_s,
-            machine=machine,
-            answer=answer,
-            plan=None if planned[0] is None else _plan(*planned),
-        )
+        grants, until_unix_s, misuse = (found.pop(each) for each in ("grants", "until_unix_s", "misuse"))
+        return TokenRow(**found, plan=None if grants is None else _plan(grants, until_unix_s, misuse))
 
     def use_token(self, identifier: bytes, keys: bytes, label: str, unix_s: float) -> int:
         """Mark a token as used by these keys and reserve the label; return the machine's id.
@@ -421,10 +410,9 @@ class Registry(TransactionFile):
             return None if row is None else self._row(file, row[0])
 
     def _row(self, file: sqlite3.Connection, machine: int) -> MachineRow:
-        found = file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
+        found = _find(file, f"{_MACHINE} WHERE m.id = ?", machine)
         if found is None:
             raise StoreError(f"{self.path}: a node of no machine")
-        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double, end_unix_s = found
         rows = file.execute(
             "SELECT name, role, certificate, until_unix_s, card FROM nodes WHERE machine = ? ORDER BY rowid", (machine,)
         ).fetchall()
@@ -432,17 +420,15 @@ class Registry(TransactionFile):
             NodeRow(name=Name(name), role=each, certificate=certificate, until_unix_s=until, card=card)
             for name, each, certificate, until, card in rows
         )
-        return MachineRow(
-            id=id_,
-            label=label,
-            role=role,
-            joined_unix_s=joined_unix_s,
-            seen_unix_s=seen_unix_s,
-            removed_unix_s=removed_unix_s,
-            has_double=bool(has_double),
-            end_unix_s=end_unix_s,
-            nodes=nodes,
-        )
+        return MachineRow(**{**found, "has_double": bool(found["has_double"])}, nodes=nodes)
+
+
+def _find(file: sqlite3.Connection, query: str, key: object) -> dict[str, Any] | None:
+    """Return the first row of a query by its columns."""
+    cursor = file.cursor()
+    cursor.row_factory = sqlite3.Row
+    row = cursor.execute(query, (key,)).fetchone()
+    return None if row is None else dict(row)
 
 
 def _plan(grants: str, until_unix_s: float, misuse: str | None) -> Plan:

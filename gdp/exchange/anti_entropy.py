@@ -227,6 +227,8 @@ class AntiEntropy(Generic[P]):
 
     def poll_messages(self, now_s: float) -> list[tuple[P, SyncMessage]]:
         """Return, once, the messages to send, each with its peer."""
+        if not (self._news or self._out):
+            return []
         for of in dict.fromkeys(of for of, _ in self._news):
             items = (self._item_of(of, key, now_s) for its, key in self._news if its == of)
             for page in pages(item for item in items if item is not None):

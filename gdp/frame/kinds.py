@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import Final
 
-__all__ = ["CONTROL_FROM", "ETHERTYPE", "VERSION", "Flag", "Kind"]
+__all__ = ["CONTROL_FROM", "ETHERTYPE", "VERSION", "Flag", "KeepaliveFlag", "Kind"]
 
 ETHERTYPE: Final = 0x88B5  # IEEE 802 local experimental EtherType 1; IEEE 802-2014, clause 9.2.4
 VERSION: Final = 1
@@ -60,3 +60,12 @@ class Flag(IntFlag):
     LATCHED = 0x10  # late joiners get it too
     URGENT = 0x20  # goes before frames without the flag, wherever frames queue
     PARITY = 0x40  # parity frames may follow the message's frames
+
+
+class KeepaliveFlag(IntFlag):
+    """Flags of a keepalive, its first byte after the header."""
+
+    NONE = 0
+    POLL = 1  # requests an answer at once
+    FINAL = 2  # the answer to a poll
+    HEARD = 4  # the sender receives the receiver's keepalives

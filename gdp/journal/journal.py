@@ -39,7 +39,7 @@ from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.rib.state import RibSettings
-from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.sansio import KeepaliveRun, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
 __all__ = ["CALLS", "LENGTH", "Journal", "JournalKey"]
@@ -63,6 +63,7 @@ CALLS: Final[Mapping[str, tuple[Callable[[Any], Any], ...]]] = {  # each argumen
     "add_port": (int, _octets, int, int, _moment),
     "port_changed": (int, bool, _moment),
     "receive": (_arrivals, _moment),
+    "offload.take_runs": (lambda value: [KeepaliveRun.from_fields(each) for each in value], float, _moment),
     "handle_timer": (_moment,),
     "revoke": (_octets, _moment),
     "query_name": (Name, float),
@@ -216,7 +217,7 @@ class Journal:
             return function(*arguments, **named)
         if self._was_asked:
             self._add(["timer"])
-        if path in ("receive", "rib.load"):
+        if path in ("receive", "rib.load", "offload.take_runs"):
             arguments = (list(arguments[0]), *arguments[1:])
         self._add([path, *arguments, *([named] if named else [])])
         self._is_within, self._was_asked = True, False

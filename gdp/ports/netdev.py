@@ -26,7 +26,7 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES
 from gdp.intervals import PACE_S, TICK_S
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
-from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, LinkCallback, Port, ReceivedFrame
+from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, Keepalives, LinkCallback, Port, ReceivedFrame
 from gdp.ports.rtnetlink import Link, LinkMonitor
 from gdp.switch.table import Hops, Paces, Table
 
@@ -66,6 +66,7 @@ class NetdevPlane(ABC):
         self._counters = Counters()
         self._came: Counter[int] = Counter()  # frames, by port
         self._polls = 0
+        self._is_idle = True  # the last poll met no event
         self._audited_at = 0  # frames that had come by the last audit
         self._audit_s = 0.0
         self._next_index = 0
@@ -121,11 +122,17 @@ class NetdevPlane(ABC):
         """Return the live counts, as ``Plane.counters``."""
         return self._counters
 
+    @property
+    def keepalives(self) -> Keepalives | None:
+        """Return None: the node runs its keepalive sessions itself."""
+        return None
+
     def poll(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for events and serve them, the lowest rank first; return the punted frames, as ``Plane.poll``."""
         if self._unopened:
             timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
+        self._is_idle = not events
         self._polls += 1
         has_come = self._counters.frames_in >= self._audited_at + _AUDIT_FRAMES
         is_due = not events and (has_come or (timeout_s != 0 and time.monotonic() >= self._audit_s))

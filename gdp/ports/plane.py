@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from gdp.errors import DROP_COUNTERS
-from gdp.sansio import BROADCAST, ReceivedFrame
+from gdp.sansio import BROADCAST, KeepaliveOffer, KeepaliveRun, ReceivedFrame
 
 __all__ = ["BROADCAST", "MAC_BYTES", "Counters", "HasFileno", "LinkCallback", "Plane", "Port", "ReceivedFrame"]
 
@@ -67,12 +67,34 @@ class HasFileno(Protocol):
 LinkCallback = Callable[[int, bool], None]
 
 
+class Keepalives(Protocol):
+    """Keepalive sessions that a data plane runs.
+
+    Attributes:
+        due_s: monotonic second at which the plane works next; infinity: it runs no session.
+        has_news: ``poll`` has something to return that cannot wait.
+    """
+
+    due_s: float
+    has_news: bool
+
+    def follow(self, offers: Sequence[KeepaliveOffer], ports: Mapping[int, Port]) -> list[KeepaliveRun]:
+        """Run the sessions of these offers and no others; return the begin and the end of each where that is new."""
+
+    def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
+        """Return what happened in the sessions, and how late the plane was called, in seconds."""
+
+
 class Plane(Protocol):
     """A data plane. One thread uses it; nothing here blocks except ``poll``."""
 
     @property
     def ports(self) -> Mapping[int, Port]:
         """The ports by index, up or not."""
+
+    @property
+    def keepalives(self) -> Keepalives | None:
+        """The keepalive sessions that the plane runs; None: the node runs all."""
 
     @property
     def counters(self) -> Counters:

@@ -6,8 +6,8 @@ Sans-I/O; it takes statements and returns statements to send, each for a name. T
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
@@ -41,6 +41,7 @@ class RibCore:
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self.state = RibCoreState(identity, policy, store, settings)
         self.boundary = ErrorBoundary()
+        self._counting_refusals = _CountingRefusals(self.state.refusals)
 
     @property
     def names(self) -> int:
@@ -58,7 +59,7 @@ class RibCore:
         """Handle a statement from ``sender`` (from the frame header; unproven). Each invalid statement is counted."""
         self.state.now_s = now.mono_s
         try:
-            with self._counting_refusals():
+            with self._counting_refusals:
                 statement = parse(wire)
                 if statement.signer != sender:
                     raise StatementError(DropReason.UNKNOWN_SENDER, "signed by another than its sender")
@@ -72,7 +73,7 @@ class RibCore:
     def revoke(self, wire: bytes, origin: Name, now: Timestamps) -> None:
         """Handle a revocation that came over a neighbour, ``origin``; an invalid one is counted."""
         self.state.now_s = now.mono_s
-        with self._counting_refusals():
+        with self._counting_refusals:
             receive_revocation(self.state, parse(wire), origin, now)
 
     def changed(self, names: Iterable[tuple[Name, list[Route]]], now: Timestamps) -> None:
@@ -87,7 +88,7 @@ class RibCore:
         ]
         state.store.prefetch([name for name, _ in concerned], now)
         for name, before in concerned:
-            with self._counting_refusals():
+            with self._counting_refusals:
                 routes = {route.advertiser: route for route in state.store.routes(name)}
                 known = {route.advertiser: route for route in before}
                 for advertiser, route in routes.items():
@@ -99,7 +100,7 @@ class RibCore:
         """Load entries of a snapshot, each verified; return how many are live. Each invalid entry is counted."""
         before = self.names
         for entry in entries:
-            with self._counting_refusals():
+            with self._counting_refusals:
                 receive_entry(self.state, entry, now)
         return self.names - before
 
@@ -145,15 +146,23 @@ class RibCore:
         upstream = self.state.upstream
         return [Wait(WaitReason.NO_UPPER_RIB, name=upstream.rib)] if upstream.is_silent(now_s) else []
 
-    @contextmanager
-    def _counting_refusals(self) -> Iterator[None]:
-        """Count a statement that is refused, or that a shared store could not serve: its sender will try again."""
-        try:
-            yield
-        except RemoteError as error:
-            self.state.refusals[error.reason] += 1
-        except StoreError:
-            self.state.refusals[DropReason.UNAVAILABLE] += 1
+
+class _CountingRefusals:
+    """Context that counts a statement that is refused, or that a shared store could not serve: it will come again."""
+
+    def __init__(self, refusals: Counter[DropReason]) -> None:
+        self._refusals = refusals
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> bool:
+        if isinstance(error, RemoteError):
+            self._refusals[error.reason] += 1
+        elif isinstance(error, StoreError):
+            self._refusals[DropReason.UNAVAILABLE] += 1
+        else:
+            return False
+        return True
 
 
 def _receive_relay(state: RibCoreState, statement: Statement, now: Timestamps) -> None:

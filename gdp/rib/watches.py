@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 from gdp.crypto.certificates import Membership, Role
 from gdp.due_queue import DueQueue
 from gdp.errors import DropReason, StatementError
+from gdp.intervals import NEVER_S
 from gdp.limits import RIB_WATCHES_MAX
 from gdp.message.shares import Shares
 from gdp.names import Name
@@ -50,8 +51,9 @@ class Watches:
     def add(self, name: Name, asker: Asker, until_s: float) -> None:
         """Add or renew a watch. Raises ``StatementError``: QUOTA."""
         watch = name, asker
-        if watch in self._ends:
-            self._ends.put(watch, max(until_s, self._ends.due_s(watch)))
+        known_s = self._ends.due_s(watch)
+        if known_s < NEVER_S:
+            self._ends.put(watch, max(until_s, known_s))
             return
         if not self._shares.reserve(asker.name, asker.domain):
             raise StatementError(DropReason.QUOTA, "watches")

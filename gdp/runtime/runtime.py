@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gdp.due_queue import earliest
-from gdp.intervals import LOOK_S
+from gdp.intervals import LOOK_S, NEVER_S
 from gdp.limits import COST_DEFAULT
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
 from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.signals import handled_signals
-from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps
+from gdp.sansio import KeepaliveRun, NodeCore, ReceivedFrame, Timestamps
 
 __all__ = ["DRAIN_MAX_S", "Periodic", "Runtime", "now"]
 
@@ -65,7 +65,7 @@ class Runtime:
     """
 
     def __init__(
-        self, machine: ProtocolCore, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
+        self, machine: NodeCore, plane: Plane, costs: Mapping[str, int] | None = None, *, spin_s: float = 0.0
     ) -> None:
         self._machine = machine
         self._plane = plane
@@ -77,6 +77,7 @@ class Runtime:
         self._deadline_s: float | None = None
         self._periodic: list[Periodic] = []
         self._after_receive: list[Callable[[], None]] = []
+        self._keepalives = plane.keepalives
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
         self.has_drained = False
@@ -198,15 +199,30 @@ class Runtime:
             arrivals = self._wait(None if first_s is None else max(first_s - time.monotonic(), 0.0))
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
+        keepalives, has_news = self._keepalives, False
+        if keepalives is not None and keepalives.has_news:
+            has_news = True
+            self._take_runs(*keepalives.poll(moment.mono_s), moment)
         if arrivals:
             self._machine.receive(arrivals, moment)
             for follow in self._after_receive:
                 follow()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.handle_timer(moment)
+            has_news = True
             self._deadline_s = self._machine.get_timer()
+        if keepalives is not None and has_news:
+            offers = self._machine.offload.offers(moment.mono_s)
+            self._take_runs(keepalives.follow(offers, self._plane.ports), 0.0, moment)
         for each in self._periodic:
             each.handle(moment)
+
+    def _take_runs(self, runs: list[KeepaliveRun], late_s: float, moment: Timestamps) -> None:
+        """Tell the core what the plane did in keepalive sessions; of one that is over, timers may be due now."""
+        if runs or late_s:
+            self._machine.offload.take_runs(runs, late_s, moment)
+        if any(each.is_over for each in runs):
+            self._deadline_s = moment.mono_s
 
     def _end_when_drained(self) -> None:
         if self._drain_until_s is None:
@@ -217,7 +233,9 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        return earliest(self._machine.get_timer(), *(each.next_s for each in self._periodic))
+        keepalives = self._keepalives
+        tick_s = None if keepalives is None or keepalives.due_s == NEVER_S else keepalives.due_s
+        return earliest(self._machine.get_timer(), tick_s, *(each.next_s for each in self._periodic))
 
     def _wait(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""

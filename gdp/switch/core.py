@@ -82,6 +82,8 @@ class SwitchCore:
             incarnation_elsewhere=self.paths.incarnation_elsewhere,
             is_only_way=self.paths.is_only_way,
         )
+        self.offload = self.hello_protocol.offload
+        self.offload.on_runs = self._follow_runs
         neighbours = self.hello_protocol.neighbours
         state = ForwardingState(
             identity,
@@ -218,7 +220,7 @@ class SwitchCore:
             try:
                 header = decode(arrival.frame)
                 if header.kind == Kind.KEEPALIVE:
-                    self._take_keepalive(arrival, header, now)
+                    self._heard([self.hello_protocol.receive_keepalive(arrival, header, now)], now)
                 elif header.kind >= CONTROL_FROM:
                     has_control |= self._receive_control(arrival, header, now)
                 else:
@@ -338,12 +340,17 @@ class SwitchCore:
 
     # -- frames
 
-    def _take_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
-        neighbour = self.hello_protocol.receive_keepalive(arrival, header, now)
-        if neighbour.name in self.rib_client.presence.open:
-            self.rib_client.presence.answer(now.mono_s)
-        if neighbour.role.is_switch:
-            self._flooding.compare(neighbour, now.mono_s)
+    def _follow_runs(self, heard: list[Neighbour], now: Timestamps) -> None:
+        """Follow what a data plane reports on keepalive sessions."""
+        self._heard(heard, now)
+        self.receive((), now)
+
+    def _heard(self, neighbours: list[Neighbour], now: Timestamps) -> None:
+        for neighbour in neighbours:
+            if neighbour.name in self.rib_client.presence.open:
+                self.rib_client.presence.answer(now.mono_s)
+            if neighbour.role.is_switch:
+                self._flooding.compare(neighbour, now.mono_s)
 
     def _receive_control(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> bool:
         """Handle a neighbour's control frame; return False if it is a fragment whose statement is not complete."""

@@ -50,14 +50,10 @@ class LocationUpdates:
         self._unicast = unicast
         self._relocations = relocations
 
-    def get(self, name: Name, advertiser: Name) -> Location | None:
-        """Return the known location of one advertiser of a name, or None."""
-        return self._state.resolver.cache.get(name, advertiser)
-
     def is_newer(self, location: Location) -> bool:
         """Return whether a location is newer than what is known of its advertiser, here or elsewhere."""
         attachment = self._state.attached.get(location.name, location.advertiser)
-        known = self.get(location.name, location.advertiser)
+        known = self._state.resolver.cache.get(location.name, location.advertiser)
         newest = max(
             -1 if attachment is None else attachment.advertisement.sequence, -1 if known is None else known.sequence
         )
@@ -113,7 +109,7 @@ class LocationUpdates:
         if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:
             self._state.attached.depart(location.name, location.advertiser, now_s)  # it has moved to another switch
             self._unicast.remove(location.name)
-        before = self.get(location.name, location.advertiser)
+        before = self._state.resolver.cache.get(location.name, location.advertiser)
         if before is not None and before.sequence > location.sequence:
             # the sender's information is older
             location = replace(before, expires_s=max(before.expires_s, location.expires_s))
@@ -158,7 +154,7 @@ class LocationUpdates:
         is_relay = statement.type is StatementType.RELAY
         location = self._from_relay(statement, now) if is_relay else self._from_forwarded_answer(statement, now)
         if self.is_newer(location):
-            is_known = self.get(location.name, location.advertiser) is not None
+            is_known = self._state.resolver.cache.get(location.name, location.advertiser) is not None
             has_moved = is_known or self._state.trees.get(location.name, location.advertiser) is not None
             self.receive(location, statement.wire, now.mono_s)
             if has_moved:
@@ -183,7 +179,7 @@ class LocationUpdates:
         Raises:
             StatementError: STALE, the known advertisement is newer.
         """
-        known = self.get(response.name, response.advertiser)
+        known = self._state.resolver.cache.get(response.name, response.advertiser)
         if known is not None and known.sequence > response.sequence:
             raise StatementError(DropReason.STALE, "a removal of an earlier advertisement")
         self._state.resolver.receive_removal(response.name, response.advertiser, now_s)

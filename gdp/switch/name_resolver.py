@@ -4,9 +4,9 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). It works like the neig
 and 7.2.2: a miss makes one query and keeps the frame; the response releases the frame, or its end drops it::
 
     frame without an entry (core.py)
-      -> Unicast.miss -> resolve: a location, or a negative entry -> table entry, and the frame goes on
-                      `-> resolve: unknown                        -> a query is open: buffer_frame
-    timer of the core -> RibClient.send_due -> queries_to_send       -> query to the RIB, repeated until a response
+      -> Unicast.forward -> resolve: a location, or why none -> table entry, and the frame goes on
+                         `-> resolve: unknown                -> a query is open: buffer_frame
+    timer of the core -> RibClient.send_queries -> queries_to_send    -> query to the RIB, repeated until a response
     response of a RIB -> RibClient.receive -> LocationUpdates.receive -> receive_location -> Unicast.release: the frame
                                            |-> receive_negative      -> the frame is dropped, counted
                                            `-> receive_unknown       -> known locations stay; the next RIB is queried

@@ -299,7 +299,7 @@ class RibClient:
             return
         statement.expect(StatementType.ANSWER)
         place = self._locations.verified(Response.from_fields(statement.fields), now)
-        known = self._locations.get(place.name, place.advertiser)
+        known = self._state.resolver.cache.get(place.name, place.advertiser)
         if known is None or known.sequence < place.sequence:
             self._locations.receive(place, statement.wire, now.mono_s)
 

@@ -1,8 +1,8 @@
 """Idle bench: what commands take, and what nodes take to start and at rest: processor time and memory.
 
-Three switches in a row, their RIB and a recorder with default settings, in namespaces. A start is the processor time
-until a node is ready. At rest neighbours exchange keepalives alone. Memory is PSS, in which processes share what they
-have in common.
+Three switches in a row, their RIB and a recorder with default settings, in namespaces; then a switch with twenty
+neighbours. A start is the processor time until a node is ready. At rest neighbours exchange keepalives alone. Memory is
+PSS, in which processes share what they have in common.
 
     sudo .venv/bin/python scripts/bench/idle.py --allow-load --no-save
 """
@@ -24,14 +24,16 @@ from lab.credentials import Carried
 from lab.machine import PROGRAMS
 from lab.machines import BenchNodes, Lab
 from lab.process import new_run
-from lab.topology import chain
+from lab.topology import Attachment, DomainPlan, Link, Topology, chain
 
 COMMANDS: Final = (
     "gdp --version", "gdp --help", "gdp name --kind topic --name /a", "gdp show links", "gdp topic -h",
     "gdp-switch -h", "gdp-proxy -h",
 )  # fmt: skip
 WALL, CPU, START, IDLE, PSS = "wall, s", "CPU, s", "start CPU, s", "at rest, % of a core", "PSS, MB"
+HUB: Final = "switch with 20 neighbours"
 LIMITS: Final = {WALL: 0.15, START: 0.5, IDLE: 0.5, PSS: 45.0}
+HUB_LIMIT: Final = 1.0
 WHO: Final = "ours"
 _REPEATS: Final = 5
 _SETTLE_S: Final = 8.0  # until hellos come rarely
@@ -74,16 +76,37 @@ def nodes(lab: Lab, seconds: float) -> Figures:
         return {name: {START: starts[name], IDLE: rest[name], PSS: pss_mb(pid)} for name, pid in pids.items()}
 
 
+def hub(lab: Lab, seconds: float) -> Figures:
+    """Return the figure at rest of a switch with nineteen switches and a RIB."""
+    with BenchNodes(lab, lab.topology.nodes, plane="auto") as running:
+        pid = running.running["switch", "hub"].pid
+        time.sleep(_SETTLE_S)
+        before = processor_s(pid)
+        time.sleep(seconds)
+        return {HUB: {IDLE: 100 * (processor_s(pid) - before) / seconds}}
+
+
+def star() -> Topology:
+    """Return a switch with nineteen others and its RIB."""
+    others = tuple(f"s{number}" for number in range(19))
+    links = tuple(Link("hub", each) for each in others)
+    return Topology(links, (DomainPlan("star", ("hub", *others)),), (Attachment("hub", "rib", "rib"),))
+
+
 def measure(options: Options) -> Outcome:
     """Measure the commands, then the nodes, in each round."""
     over = Rounds()
     for _ in range(options.rounds):
         with new_run() as run:
             figures: Figures = {text: command(text) for text in COMMANDS} | nodes(Lab(run, chain(3)), options.seconds)
+        with new_run() as run:
+            figures |= hub(Lab(run, star()), options.seconds)
         for case, columns in figures.items():
             for column, value in columns.items():
                 over.add(WHO, case, column, value)
-    asked = [(case, column, limit) for case in over.cases() for column, limit in LIMITS.items()]
+    asked = [
+        (case, column, HUB_LIMIT if case == HUB else limit) for case in over.cases() for column, limit in LIMITS.items()
+    ]
     found = [each for each in asked if over.spread(WHO, *each[:2]) is not None]
     targets = [
         over.target(f"{case}: {column}", WHO, case, column, limit, at_most=True) for case, column, limit in found

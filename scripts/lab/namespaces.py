@@ -189,10 +189,9 @@ class Space(Namespace):
 
     def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
         """Create a pair of joined devices; return when both are up."""
-        ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
-        self.ip("link", "add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
-        for name in (one, other):
-            self.ip("link", "set", name, "up")
+        end, peer = (f"mtu {mtu} address {mac.hex(':')}" for mac in (one_mac, other_mac))
+        up = (f"link set {name} up" for name in (one, other))
+        self.configure((f"link add {one} {end} type veth peer name {other} {peer}", *up))
         self.wait_for_carrier(one, other)
 
     def connect(self, other: Space, device: str, far: str = "") -> None:

@@ -4,7 +4,8 @@ A signature is BLAKE2b over SHA-256 of the data, keyed by the public key. It is 
 the harness can make one. A verifier decides as with ECDSA, except for malleated signatures and invalid curve points.
 Certificates (X.509) keep their real signatures and their real verification.
 
-All nodes of a simulation are in one process, so the bytes of a statement are decoded once for all of its receivers.
+All nodes of a simulation are in one process, so the bytes of a statement or a certificate are decoded once for all of
+its receivers.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from functools import lru_cache
 from typing import Final
 from unittest import mock
 
-from gdp.crypto import cbor, statements
+from gdp.crypto import cbor, certificates, statements, x509_profile
 from gdp.crypto.keys import SIGNATURE_BYTES, PublicKey, SigningKey, SoftwareKey
 from gdp.errors import DropReason, StatementError
 
@@ -51,9 +52,13 @@ def _decode_once(payload: bytes) -> cbor.Value:
     return cbor.decode(payload)
 
 
+_read_once: Final = lru_cache(_DECODED_MAX)(x509_profile.read)
+
+
 def forget_decoded() -> None:
-    """Forget the statements that were decoded, for tests that count objects."""
+    """Forget what was decoded, for tests that count objects."""
     _decode_once.cache_clear()
+    _read_once.cache_clear()
 
 
 def _decode(payload: bytes) -> cbor.Value:
@@ -66,6 +71,7 @@ def signing_oracle() -> Iterator[None]:
     """Replace ECDSA of statements and messages, in this process, for the duration of the context."""
     with (
         mock.patch.object(statements, "decode", _decode),
+        mock.patch.object(certificates, "read", _read_once),
         mock.patch.object(SoftwareKey, "sign", _sign),
         mock.patch.object(SoftwareKey, "sign_digest", _sign_digest),
         mock.patch.object(PublicKey, "verify", _verify),

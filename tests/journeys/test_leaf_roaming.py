@@ -25,7 +25,7 @@ def corridor() -> Simulation:
             Attachment("lift", "proxy", "screen"), Attachment("leaf", "proxy", "robot"),
         ),
     )  # fmt: skip
-    world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("leaf",), keepalive_ms=None)
+    world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("leaf",))
     assert world.run_until_attached()
     return world
 

@@ -26,7 +26,7 @@ def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
 
 @pytest.mark.parametrize("to", ["nuc5", *nightly("nuc2", "nuc3", "nuc4")])
 def test_a_publisher_that_moves_keeps_its_readers_and_loses_nothing(to: str) -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     flow.stream(200, 0.02, size=100)
     flow.world.network.call(1.0, lambda: flow.world.roam(ROBOT, to))
     assert flow.world.network.run(20, lambda: flow.has(SERVER, 200))
@@ -36,7 +36,7 @@ def test_a_publisher_that_moves_keeps_its_readers_and_loses_nothing(to: str) -> 
 
 @pytest.mark.parametrize("to", ["nuc3", *nightly("nuc2", "nuc5")])
 def test_a_publisher_that_moved_is_known_there_in_every_tier(to: str) -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     world = flow.world
     world.roam(ROBOT, to)
     world.network.run(2)
@@ -48,7 +48,7 @@ def test_a_publisher_that_moved_is_known_there_in_every_tier(to: str) -> None:
 
 @pytest.mark.parametrize("to", ["nuc4", *nightly("nuc1", "nuc2", "nuc3")])
 def test_a_reader_that_moves_reads_on_and_loses_nothing(to: str) -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     flow.stream(200, 0.02, size=100)
     flow.world.network.call(1.0, lambda: flow.world.roam(SERVER, to))
     assert flow.world.network.run(20, lambda: flow.has(SERVER, 200))
@@ -57,7 +57,7 @@ def test_a_reader_that_moves_reads_on_and_loses_nothing(to: str) -> None:
 
 
 def test_moving_there_and_back_again_ends_where_it_began() -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     network = flow.world.network
     flow.stream(400, 0.02, size=100)
     for at_s, to in enumerate(("nuc2", "nuc5", "nuc1"), start=1):
@@ -69,7 +69,7 @@ def test_moving_there_and_back_again_ends_where_it_began() -> None:
 
 
 def test_a_watcher_is_informed_at_once() -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     world = flow.world
     world.roam(ROBOT, "nuc2")
     assert world.network.run(3, lambda: world.members[ROBOT].attachment.is_attached)
@@ -81,7 +81,7 @@ def test_a_watcher_is_informed_at_once() -> None:
 
 
 def test_the_old_branch_is_left_at_once() -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     world = flow.world
     world.roam(ROBOT, "nuc5")
     world.network.run(1)
@@ -96,7 +96,7 @@ def test_the_old_branch_is_left_at_once() -> None:
 
 
 def test_a_new_incarnation_of_a_publisher_is_read_from_its_start() -> None:
-    flow = flowing(ring(keepalive_ms=None))
+    flow = flowing(ring())
     world = flow.world
     flow.publish(b"first life")
     assert world.network.run(1, lambda: flow.has(SERVER, 1))

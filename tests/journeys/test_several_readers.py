@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import pytest
 
+from gdp.intervals import SCAPY_KEEPALIVE_MS
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import advertise, outlive_together
@@ -20,14 +21,14 @@ FULL_S, SETTLED_S = 15.0, 2.0
 LEASE_S = 8.0  # a shorter one may end before a renewal has passed a full link
 
 
-def world_of() -> Simulation:
+def world_of(keepalive_ms: int | None = None) -> Simulation:
     links = (Link("s0", "s1"), Link("s1", "s2"), Link("s2", "s3"), Link("s1", "s4"))
     ends = [Attachment("s1", "rib", "rib"), Attachment("s0", "proxy", "robot")]
     ends += [Attachment(each[:2], "proxy", each[3:]) for each in READERS]
     world = Simulation(
         topology=Topology(links, (DomainPlan("home", SWITCHES),), tuple(ends)),
         lease_s=LEASE_S,
-        keepalive_ms=None,
+        keepalive_ms=keepalive_ms,
     )
     assert world.run_until_attached()
     return world
@@ -82,7 +83,7 @@ MAP_BYTES, MAP_RATE = 1_000_000, 4e6 / 8
 
 
 def test_a_reader_that_begins_while_a_large_message_leaves_does_not_delay_it() -> None:
-    world = world_of()
+    world = world_of(SCAPY_KEEPALIVE_MS)
     flow = advertise(world, "/map", "s0/robot")
     flow.read_by(READERS[0])
     assert world.network.run(5, lambda: flow.is_read_by(1))
@@ -134,7 +135,7 @@ def test_topics_reach_a_reader_that_restarts_and_the_others_at_once() -> None:
 
 
 def test_the_slowest_reader_of_a_reliable_topic_is_known_to_govern_it() -> None:
-    world = world_of()
+    world = world_of(SCAPY_KEEPALIVE_MS)
     flow = advertise(world, "/map", "s0/robot")
     for label in READERS:
         flow.read_by(label)

@@ -75,7 +75,7 @@ def site(links: list[tuple[str, str, int]], readers: tuple[str, ...], source: st
         (DomainPlan("home", tuple(nodes)),),
         (Attachment(nodes[0], "rib", "rib"), *members),
     )
-    world = Simulation(topology=topology, keepalive_ms=None, **more)  # type: ignore[arg-type]
+    world = Simulation(topology=topology, **more)  # type: ignore[arg-type]
     cables: Cables = []
     for link in links:
         if first[frozenset(link[:2])] is link:
@@ -262,7 +262,7 @@ def test_a_path_of_each_tree_crosses_to_another_domain_at_its_own_border() -> No
             Attachment("s0", "proxy", "robot"), Attachment("s5", "proxy", "rs5"),
         ),
     )  # fmt: skip
-    world = Simulation(topology=topology, keepalive_ms=None)
+    world = Simulation(topology=topology)
     at = Site(world, [(a, b, world.cables[frozenset((a, b))]) for a, b, _ in links])
     world.network.taps.append(at.tap)
     assert world.run_until_attached(20.0)

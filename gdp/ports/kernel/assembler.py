@@ -38,11 +38,13 @@ class Reg(IntEnum):
 
 _SIZES: Final = {1: 0x10, 2: 0x08, 4: 0x00, 8: 0x18}
 _LOAD, _STORE_VALUE, _STORE, _IN_MEMORY = 0x01, 0x02, 0x03, 0x60
-_ALU64, _JUMP, _FROM_REGISTER = 0x07, 0x05, 0x08
-_ADD, _SUBTRACT, _AND, _SHIFT_LEFT, _EXCLUSIVE_OR, _MOVE = 0x00, 0x10, 0x50, 0x60, 0xA0, 0xB0
+_ALU32, _ALU64, _JUMP, _FROM_REGISTER = 0x04, 0x07, 0x05, 0x08
+_ADD, _SUBTRACT, _DIVIDE, _OR, _AND = 0x00, 0x10, 0x30, 0x40, 0x50
+_SHIFT_LEFT, _SHIFT_RIGHT, _EXCLUSIVE_OR, _MOVE = 0x60, 0x70, 0xA0, 0xB0
 _CONDITIONS: Final = {"==": 0x10, ">": 0x20, ">=": 0x30, "&": 0x40, "!=": 0x50, "<": 0xA0, "<=": 0xB0}
 _CALL, _EXIT, _WIDE, _BIG_ENDIAN = 0x85, 0x95, 0x18, 0xDC
 _MAP: Final = 1  # BPF_PSEUDO_MAP_FD
+_SUBPROGRAM: Final = 1  # BPF_PSEUDO_CALL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,17 +82,41 @@ class Assembler:
         """Subtract a value from ``to``, modulo 2**64."""
         self._compute(_SUBTRACT, to, value)
 
-    def mask(self, to: Reg, bits: int) -> None:
+    def divide(self, to: Reg, value: int) -> None:
+        """Divide ``to`` by a value."""
+        self._compute(_DIVIDE, to, value)
+
+    def mask(self, to: Reg, bits: Reg | int) -> None:
         """Clear all bits of ``to`` but these."""
         self._compute(_AND, to, bits)
 
-    def invert(self, to: Reg, bits: int) -> None:
+    def include(self, to: Reg, bits: Reg | int) -> None:
+        """Set these bits of ``to``."""
+        self._compute(_OR, to, bits)
+
+    def exclusive_or(self, to: Reg, bits: Reg | int) -> None:
         """Invert these bits of ``to``."""
         self._compute(_EXCLUSIVE_OR, to, bits)
 
     def shift_left(self, to: Reg, bits: int) -> None:
         """Shift ``to`` left by ``bits``."""
         self._compute(_SHIFT_LEFT, to, bits)
+
+    def shift_right(self, to: Reg, bits: int) -> None:
+        """Shift ``to`` right by ``bits``."""
+        self._compute(_SHIFT_RIGHT, to, bits)
+
+    def add_word(self, to: Reg, value: Reg | int) -> None:
+        """Add a value to ``to``, modulo 2**32."""
+        self._compute(_ADD, to, value, _ALU32)
+
+    def move_word(self, to: Reg, value: Reg | int) -> None:
+        """Set ``to`` to the low 32 bits of a value."""
+        self._compute(_MOVE, to, value, _ALU32)
+
+    def shift_word_right(self, to: Reg, bits: int) -> None:
+        """Shift the low 32 bits of ``to`` right by ``bits``; the others are lost."""
+        self._compute(_SHIFT_RIGHT, to, bits, _ALU32)
 
     def from_big_endian(self, to: Reg, bits: int) -> None:
         """Convert a big-endian value that was loaded from a frame into a number."""
@@ -137,6 +163,10 @@ class Assembler:
         """Call a helper of the kernel; R1 to R5 are lost."""
         self._steps.append(_Step(opcode=_CALL, value=helper))
 
+    def call_label(self, label: str) -> None:
+        """Call a subprogram, which has a stack of its own; R1 to R5 are lost."""
+        self._steps.append(_Step(opcode=_CALL, source=_SUBPROGRAM, label=label))
+
     def leave(self, result: int | None = None) -> None:
         """End the program with a result, or with the value of R0."""
         if result is not None:
@@ -151,21 +181,22 @@ class Assembler:
         """
         return b"".join(self._encoded(at, step) for at, step in enumerate(self._steps))
 
-    def _compute(self, operation: int, to: Reg, value: Reg | int) -> None:
+    def _compute(self, operation: int, to: Reg, value: Reg | int, width: int = _ALU64) -> None:
         if isinstance(value, Reg):
-            self._steps.append(_Step(opcode=_ALU64 | operation | _FROM_REGISTER, destination=to, source=value))
+            self._steps.append(_Step(opcode=width | operation | _FROM_REGISTER, destination=to, source=value))
         else:
-            self._steps.append(_Step(opcode=_ALU64 | operation, destination=to, value=value))
+            self._steps.append(_Step(opcode=width | operation, destination=to, value=value))
 
     def _encoded(self, at: int, step: _Step) -> bytes:
-        offset = step.offset
+        offset, value = step.offset, step.value
         if step.label:
             if step.label not in self._labels:
                 raise LocalError(f"no label {step.label}")
-            offset = self._labels[step.label] - at - 1
+            distance = self._labels[step.label] - at - 1
+            offset, value = (offset, distance) if step.opcode == _CALL else (distance, value)
         little = sys.byteorder == "little"
         registers = step.destination | step.source << 4 if little else step.destination << 4 | step.source
         try:
-            return struct.pack("=BBhi", step.opcode, registers, offset, step.value)
+            return struct.pack("=BBhi", step.opcode, registers, offset, value)
         except struct.error as error:
             raise LocalError(f"instruction {at}: {error}") from error

@@ -2,7 +2,7 @@
 
 I/O. Each device has one attachment and one live switch; a second one is refused, attached by link or by filter.
 Programs of other owners at the same hook stay there.
-Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``); tc-bpf(8).
+Source: Linux, include/uapi/linux/bpf.h (``BPFTCX_INGRESS``); tc-bpf(8).
 
 A TCX link is a descriptor: it ends with its process, however that ends. A filter outlives its process, so its name
 carries the process that it belongs to. The next run on that device removes the filter of a dead process. Until then the
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from gdp.errors import LocalError
 from gdp.ports.kernel.loaded_program import PROGRAM
-from gdp.ports.kernel.syscall import BpfError, attached, create_link, name_of
+from gdp.ports.kernel.syscall import TCX_INGRESS, BpfError, attached, create_link, name_of
 from gdp.ports.netlink import CLSACT_EGRESS, CLSACT_INGRESS, NetlinkSocket
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Attachment", "FilterAttachment", "LinkAttachment", "has_links"]
 
-_TCX_INGRESS: Final = 46
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _NAME: Final = re.compile(rf"{PROGRAM}:(?P<pid>\d+):(?P<started>\d+)", re.ASCII)
 _START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted after the command
@@ -40,7 +39,7 @@ _START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted after the comma
 def has_links() -> bool:
     """Return whether this kernel has TCX links. Raises ``BpfError``: the process may not query the kernel."""
     try:
-        attached(_LOOPBACK, _TCX_INGRESS)
+        attached(_LOOPBACK, TCX_INGRESS)
     except BpfError as error:
         if error.number == errno.EINVAL:
             return False
@@ -65,7 +64,7 @@ class LinkAttachment:
 
     def __init__(self, program: int, ifindex: int, ask: NetlinkSocket) -> None:
         _refuse_second(ask, ifindex)
-        self._link = create_link(program, ifindex, _TCX_INGRESS)
+        self._link = create_link(program, ifindex, TCX_INGRESS)
 
     def close(self) -> None:
         """Close the link, which detaches the program."""
@@ -152,7 +151,7 @@ def _refuse_second(ask: NetlinkSocket, ifindex: int) -> None:
 def _linked(ifindex: int) -> list[str | None]:
     """Return the names of the programs at the hook of links, as far as this process may read them."""
     try:
-        return [name_of(program) for program in attached(ifindex, _TCX_INGRESS)]
+        return [name_of(program) for program in attached(ifindex, TCX_INGRESS)]
     except BpfError as error:
         if error.number in (errno.EINVAL, errno.EPERM):  # no links before Linux 6.6; no right to open the program
             return []

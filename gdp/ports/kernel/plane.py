@@ -17,10 +17,11 @@ from contextlib import ExitStack, closing
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.intervals import SoftState
+from gdp.intervals import RETRY_S, SoftState
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
 from gdp.ports.kernel.device import TxDrops, peer_is_bare
+from gdp.ports.kernel.keepalives import open_sessions
 from gdp.ports.kernel.loaded_program import LoadedProgram
 from gdp.ports.kernel.map_sync import EntryCounts, MapSync
 from gdp.ports.netlink import TRAFFIC_GROUP, NetlinkSocket, Notifications
@@ -60,7 +61,8 @@ class KernelPlane(RawPlane):
         self._peer = peer
         self._attachments: dict[int, Attachment] = {}
         self._table = table
-        self._next_upkeep_s = 0.0
+        self._next_upkeep_s = self._next_look_s = 0.0
+        self._forwarded = 0  # frames at the last look at the devices
         self._refusals = TxDrops()
         self._unread = 0  # punted frames that the kernel dropped at a full socket
         with ExitStack() as opened:
@@ -68,7 +70,8 @@ class KernelPlane(RawPlane):
             self._questions = opened.enter_context(closing(NetlinkSocket()))
             self._queues = opened.enter_context(closing(Notifications(TRAFFIC_GROUP)))
             self._mirror = MapSync(table, *self._loaded.of_entries)
-            super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
+            sessions = None if self._loaded.is_leased else open_sessions()
+            super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc, keepalives=sessions)
             opened.pop_all()  # from now on ``close`` closes them
         self.watch(self._queues, self._review_queues)
         if table is not None:
@@ -190,9 +193,13 @@ class KernelPlane(RawPlane):
     def _keep_up(self) -> None:
         """Do what no notification triggers: renew the lease, check each port's egress, and read refusals."""
         self._loaded.renew(_FILTER.lease_s)
+        now_s, forwarded = time.monotonic(), self._loaded.counters().forwarded
+        self._next_upkeep_s = now_s + _FILTER.refresh_s / 2
+        if forwarded == self._forwarded and now_s < self._next_look_s:
+            return  # no device had to send
+        self._forwarded, self._next_look_s = forwarded, now_s + RETRY_S
         self._review_queues()
         self._look_at_devices()
-        self._next_upkeep_s = time.monotonic() + _FILTER.refresh_s / 2
 
 
 def _ifindex(ifname: str) -> int:

@@ -200,7 +200,7 @@ class ForwarderProgram(Assembler):
             self.store(Reg.R10, _KEY + at, Reg.R2, 8)
         last = NAME_BYTES - 1
         self.load(Reg.R2, _FRAME, self._at["destination"] + last, 1)
-        self.invert(Reg.R2, 1)
+        self.exclusive_or(Reg.R2, 1)
         self.store(Reg.R10, _KEY + last, Reg.R2, 1)
         self._find_entry()
         self.jump_if(Reg.R0, "!=", 0, "known")

@@ -9,7 +9,7 @@ import pytest
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
-from gdp.control.keepalive import QUEUED_S, KeepaliveFlag, Slowness, open_keepalive
+from gdp.control.keepalive import QUEUED_S, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbour import NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
@@ -20,7 +20,7 @@ from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.kinds import KeepaliveFlag, Kind
 from gdp.intervals import HELLO_IDLE, NEIGHBOUR
 from gdp.limits import CLOCK_SKEW_S, COST_AUTO
 from gdp.sansio import ReceivedFrame

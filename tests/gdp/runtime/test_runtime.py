@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import Runtime
-from gdp.sansio import ProtocolCore, ReceivedFrame
+from gdp.sansio import NodeCore, ReceivedFrame
 
 
 class Core:
@@ -41,11 +41,12 @@ def loop(frames: int) -> tuple[Runtime, list[bytes]]:
     plane = SimpleNamespace(
         ports={},
         frames_from=lambda _: 0,
+        keepalives=None,
         on_link=lambda _: None,
         poll=poll,
         transmit=lambda port, mac, out: sent.extend(out),
     )
-    return Runtime(cast(ProtocolCore, Core(frames)), cast(Plane, plane)), sent
+    return Runtime(cast(NodeCore, Core(frames)), cast(Plane, plane)), sent
 
 
 def test_a_stopped_loop_still_sends_its_goodbye() -> None:

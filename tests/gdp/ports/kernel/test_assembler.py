@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(sys.byteorder == "big", reason="the vectors are 
         (lambda a: a.subtract(R2, 1), "1702000001000000"),
         (lambda a: a.shift_left(R2, 4), "6702000004000000"),
         (lambda a: a.mask(R2, 0x7F), "570200007f000000"),
-        (lambda a: a.invert(R2, 1), "a702000001000000"),
+        (lambda a: a.exclusive_or(R2, 1), "a702000001000000"),
         (lambda a: a.from_big_endian(R2, 16), "dc02000010000000"),
         (lambda a: a.load(R2, R1, 76, 4), "61124c0000000000"),
         (lambda a: a.load(R2, R1, 17, 1), "7112110000000000"),

@@ -1,0 +1,276 @@
+"""Keepalive sessions that the kernel runs: arming, the tick that sends, and what happened since.
+
+I/O. Needs TCX links (Linux 6.6): these end with the process, so a killed node is silent at once. Only this process
+sends, so a frozen one is silent, too. One tick sends the keepalives of all sessions that are due, and learns who is
+silent. It costs some microseconds for each, and calls nothing of the node.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from gdp.control.keepalive import JITTER, REPORT
+from gdp.errors import LocalError
+from gdp.frame.codec import ethernet
+from gdp.intervals import NEVER_S, SCHEDULED_S, UPKEEP_S
+from gdp.ports.kernel.keepalive_program import (
+    END_BYTES,
+    FRAME_BYTES,
+    SESSION_BYTES,
+    STATE_BYTES_OF_SESSION,
+    KeepaliveMaps,
+    SessionAt,
+    receiver,
+    sender,
+)
+from gdp.ports.kernel.maps import KernelMap, MapKind
+from gdp.ports.kernel.program import LICENCE
+from gdp.ports.kernel.sha256 import BLOCK_BYTES
+from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load_program
+from gdp.ports.plane import Port
+from gdp.sansio import KeepaliveOffer, KeepaliveRun
+
+__all__ = ["KeepaliveSessions", "open_sessions"]
+
+log = logging.getLogger(__name__)
+
+_SESSIONS_MAX: Final = 64
+_STATE: Final = struct.Struct(f"=7Q{REPORT.size}sB2x")
+_NUMBER: Final = struct.Struct("=I")
+_INNER, _OUTER = bytes(each ^ 0x36 for each in range(256)), bytes(each ^ 0x5C for each in range(256))
+
+
+def _keys(key: bytes) -> bytes:
+    """Return the two blocks of HMAC (RFC 2104) for a key."""
+    block = key.ljust(BLOCK_BYTES, b"\0")
+    return block.translate(_INNER) + block.translate(_OUTER)
+
+
+def _kept(offer: KeepaliveOffer) -> tuple[bytes, bytes]:
+    """Return what stays while a session runs."""
+    return offer.in_key, offer.mac
+
+
+def _changing(offer: KeepaliveOffer) -> dict[str, Any]:
+    """Return what may change while a session runs."""
+    return {"head": offer.head, "expected": offer.expected, "loss": offer.loss}
+
+
+@dataclass(slots=True)
+class _Session:
+    offer: KeepaliveOffer
+    slot: int
+    run: PreparedRun
+    end: bytes
+    send_at_s: float
+    heard_s: float
+    taken: int = 0
+    replays: int = 0
+    sent_s: list[float] = field(default_factory=list)
+
+
+class KeepaliveSessions:
+    """Sessions that the kernel runs on the ports of a plane.
+
+    Attributes:
+        due_s: monotonic second of the next tick; infinity: there are no sessions.
+        has_news: a session may have come to its end, or reports are due.
+
+    Raises:
+        LocalError: the process lacks the right, or the kernel is too old.
+    """
+
+    def __init__(self) -> None:
+        self._programs: list[int] = []
+        self._maps: list[KernelMap] = []
+        self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
+        self._sessions: dict[tuple[int, bytes], _Session] = {}
+        self._free = list(range(_SESSIONS_MAX))
+        self._report_at_s = NEVER_S
+        self._late_s = 0.0
+        self._send_at_s, self._together_s = NEVER_S, 0.0
+        self.due_s = NEVER_S
+        self.has_news = False
+        try:
+            self._configured = self._make(MapKind.ARRAY, 4, SESSION_BYTES, "gdp_sessions")
+            self._states = self._make(MapKind.ARRAY, 4, STATE_BYTES_OF_SESSION, "gdp_states")
+            self._ends = self._make(MapKind.HASH, END_BYTES, 4, "gdp_ends")
+            maps = KeepaliveMaps(sessions=self._configured.fd, states=self._states.fd, ends=self._ends.fd)
+            for code in receiver(maps), sender(maps):
+                self._programs.append(load_program(code, "gdp_keepalive", LICENCE))
+        except LocalError:
+            self.close()
+            raise
+
+    def _make(self, kind: MapKind, key_bytes: int, value_bytes: int, name: str) -> KernelMap:
+        made = KernelMap(kind, key_bytes, value_bytes, _SESSIONS_MAX, name)
+        self._maps.append(made)
+        return made
+
+    def close(self) -> None:
+        """Detach the program and close everything."""
+        for port in list(self._links):
+            self.detach(port)
+        for opened in self._programs:
+            os.close(opened)
+        for each in self._maps:
+            each.close()
+        self._programs, self._maps = [], []
+
+    def attach(self, port: int, ifname: str) -> None:
+        """Receive keepalives at a device; the node runs the sessions of one that is gone, or not allowed."""
+        try:
+            ifindex = socket.if_nametoindex(ifname)
+            self._links[port] = create_link(self._programs[0], ifindex, TCX_INGRESS), ifindex
+        except (OSError, LocalError) as refused:
+            log.debug("keepalives not in the kernel port=%s reason=%s", ifname, refused)
+
+    def detach(self, port: int) -> None:
+        """Receive no keepalives at a port; its sessions end with the next report."""
+        link, _ = self._links.pop(port, (-1, 0))
+        if link >= 0:
+            os.close(link)
+        self.has_news = self.has_news or any(each[0] == port for each in self._sessions)
+
+    # sessions
+
+    def follow(self, offers: Sequence[KeepaliveOffer], ports: Mapping[int, Port]) -> list[KeepaliveRun]:
+        """Run the sessions of these offers and no others; return the begin and the end of each where that is new."""
+        runs = []
+        wanted = {(each.port, each.name): each for each in offers}
+        for key, session in list(self._sessions.items()):
+            offer = wanted.get(key)
+            if offer is None or offer.port not in self._links or _kept(offer) != _kept(session.offer):
+                runs.append(self._end(key))
+            elif _changing(offer) != _changing(session.offer):
+                session.offer = session.offer._replace(**_changing(offer))
+                self._configure(session, ports[offer.port].mac)
+        for key, offer in wanted.items():
+            if key not in self._sessions and offer.port in self._links and self._free:
+                runs.append(self._begin(key, offer, ports[offer.port].mac))
+        return runs
+
+    def _begin(self, key: tuple[int, bytes], offer: KeepaliveOffer, mac: bytes) -> KeepaliveRun:
+        slot, ifindex = self._free.pop(), self._links[offer.port][1]
+        run = PreparedRun(self._programs[1], _NUMBER.pack(slot).ljust(FRAME_BYTES, b"\0"))
+        end = offer.name + _NUMBER.pack(ifindex)
+        session = _Session(offer, slot, run, end, offer.send_at_s, offer.heard_s)
+        report = REPORT.pack(offer.echo, 0, 0, 0)
+        heard_ns = int(offer.heard_s * 1e9)
+        state = _STATE.pack(offer.sequence, offer.sent, offer.received, heard_ns, 0, 0, 0, report, 0)
+        self._states.put(_NUMBER.pack(slot), state)
+        self._configure(session, mac)
+        self._ends.put(end, _NUMBER.pack(slot))
+        self._sessions[key] = session
+        now_s = time.monotonic()
+        self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
+        self._plan(now_s)
+        return KeepaliveRun(offer.port, offer.name, offer.nonce, received=offer.received, heard_s=offer.heard_s)
+
+    def _configure(self, session: _Session, mac: bytes) -> None:
+        offer = session.offer
+        report = REPORT.pack(0, 0, 0, offer.loss)
+        frame = ethernet(offer.mac, mac) + offer.header + offer.head + report
+        value = _keys(offer.in_key) + _keys(offer.out_key) + frame.ljust(SessionAt.EXPECTED - SessionAt.FRAME, b"\0")
+        value += offer.expected.ljust(SessionAt.IFINDEX - SessionAt.EXPECTED, b"\0")
+        self._configured.put(_NUMBER.pack(session.slot), value + struct.pack("=II", self._links[offer.port][1], 0))
+
+    def _end(self, key: tuple[int, bytes]) -> KeepaliveRun:
+        session = self._sessions.pop(key)
+        self._ends.remove(session.end)
+        run = self._report(session, self._read()[session.slot])._replace(is_over=True)
+        self._free.append(session.slot)
+        self._plan(time.monotonic())
+        return run
+
+    def _read(self) -> list[tuple[Any, ...]]:
+        return list(_STATE.iter_unpack(self._states.read_array(_SESSIONS_MAX)))
+
+    def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
+        sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
+        offer = session.offer
+        session.heard_s = heard_ns * 1e-9
+        sent_s, session.sent_s = tuple(session.sent_s), []
+        came, session.taken = taken - session.taken, taken
+        refused, session.replays = replays - session.replays, replays
+        return KeepaliveRun(
+            offer.port, offer.name, offer.nonce, sent_s, sequence, came, received, session.heard_s,
+            REPORT.unpack(report), multiplier, refused, session.send_at_s,
+        )  # fmt: skip
+
+    # the tick
+
+    def tick(self, now_s: float) -> None:
+        """Send the keepalives that are due, or look who is silent; the node must be called if there is news."""
+        if self.due_s < now_s - SCHEDULED_S:
+            self._late_s = max(self._late_s, now_s - self.due_s)
+            self.has_news = True
+        sessions = self._sessions.values()
+        if self._send_at_s <= now_s:
+            until_s = now_s + self._together_s
+            for session in sessions:
+                if session.send_at_s <= until_s:
+                    self._send(session, now_s)
+        else:
+            states = self._read()
+            for session in sessions:
+                session.heard_s = states[session.slot][3] * 1e-9
+        self.has_news = self.has_news or now_s >= self._report_at_s
+        self._plan(now_s)
+
+    @staticmethod
+    def _send(session: _Session, now_s: float) -> None:
+        try:
+            found = session.run()
+        except LocalError as refused:  # without memory; the next one is sent in time
+            log.debug("keepalive not sent reason=%s", refused)
+            session.send_at_s = now_s + session.offer.out_interval_s
+            return
+        session.sent_s.append(now_s)
+        session.heard_s = now_s - (found & 0xFFFFFF) * 1e-6
+        session.send_at_s = now_s + session.offer.out_interval_s * (1 - (found >> 24) * JITTER)
+
+    def _plan(self, now_s: float) -> None:
+        """Set when the next tick is due; keepalives due within half an interval leave together from then on."""
+        send_at_s = silent_at_s = interval_s = NEVER_S
+        for session in self._sessions.values():
+            offer = session.offer
+            send_at_s = min(send_at_s, session.send_at_s)
+            silent_at_s = min(silent_at_s, session.heard_s + offer.suspect_s)
+            interval_s = min(interval_s, offer.out_interval_s)
+        if silent_at_s <= now_s:
+            self.has_news = True
+        self._send_at_s, self._together_s = send_at_s, interval_s / 2
+        self.due_s = min(send_at_s, max(silent_at_s, now_s + self._together_s))
+
+    def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
+        """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""
+        self.has_news, late_s, self._late_s = False, self._late_s, 0.0
+        is_due, runs = now_s >= self._report_at_s, list[KeepaliveRun]()
+        if is_due or not self._sessions:
+            self._report_at_s = now_s + UPKEEP_S if self._sessions else NEVER_S
+        states = self._read() if self._sessions else []
+        for key, session in list(self._sessions.items()):
+            state = states[session.slot]
+            has_come = state[5] or session.offer.port not in self._links
+            if has_come or state[3] * 1e-9 + session.offer.suspect_s <= now_s:
+                runs.append(self._end(key))
+            elif is_due:
+                runs.append(self._report(session, state))
+        return runs, late_s
+
+
+def open_sessions() -> KeepaliveSessions | None:
+    """Return sessions that the kernel runs; None: it refuses, and the node runs them itself."""
+    try:
+        return KeepaliveSessions()
+    except LocalError as refused:
+        log.info("keepalives not in the kernel reason=%s", str(refused).partition("\n")[0])
+        return None
