@@ -86,6 +86,7 @@ class DropReason(IntEnum):
     LIFESPAN = 48  # a best-effort message that could not leave in time, before a frame of it was sealed
     UNUSED_PARITY = 49  # a parity frame whose block lost nothing, or was filled before
     UNPROVEN = 50  # a reader's count of frames that its receipts do not prove; more count as lost
+    THINNED = 51  # a copy of a message that is for faster branches than this one
 
     @property
     def label(self) -> str:

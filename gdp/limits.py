@@ -24,6 +24,7 @@ MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; its f
 SEQUENCE_BYTES: Final = 8  # before each message, under its seal: its sequence number
 NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a successor
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
+PACE_MAX: Final = 255  # of a branch that gets every message
 JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, as long as no other one needs its fair share
 JOIN_TOTAL_BYTES: Final = 96 << 20  # reassembly memory of a node; a third of it holds the largest message
 RECOVERY_BYTES: Final = 8 << 20  # ... of it frames of one stream that are kept to restore lost ones from parity

@@ -41,6 +41,7 @@ from tests.fixtures_forwarding import (
     NARROW,
     NARROW_MAC,
     ONE,
+    PACES,
     PEER_MACS,
     WIDE,
     WIDE_MAC,
@@ -116,7 +117,7 @@ def switch(make: MakePlane) -> Plane:
     """Plane that forwards by the fixtures' table."""
     table = Table()
     for key, hops in ENTRIES.items():
-        table.install(key, hops, float("inf"))
+        table.install(key, hops, float("inf"), paces=PACES.get(key, ()))
     return make(["p0", "p1", "p2"], table)
 
 

@@ -20,7 +20,7 @@ PEER_MACS = {port: bytes([2, 0, 0, 0, port, 2]) for port in (IN, WIDE, NARROW)}
 
 SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
 ONE, BOTH, SPLIT, GONE, HALF, UNKNOWN, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
-RESCUED, READY, CUT_OFF, TREE = (bytes([0xE0 + n]) * 32 for n in range(4))
+RESCUED, READY, CUT_OFF, TREE, PACED, SLOW = (bytes([0xE0 + n]) * 32 for n in range(6))
 NO_SOURCE = bytes(32)
 SECOND = 0x80
 NO_SECOND = (DropReason.NO_SECOND_PATH,)
@@ -53,14 +53,17 @@ ENTRIES: dict[bytes, Hops] = {
     READY: ((*TO_WIDE, *TO_NARROW),),
     CUT_OFF: ((*TO_ABSENT, *TO_ABSENT),),
     TREE: ((*TO_ABSENT, *TO_NARROW), (*TO_WIDE, *TO_ABSENT)),
+    PACED + SOURCE: (TO_WIDE, TO_NARROW),
+    SLOW + SOURCE: (TO_WIDE,),
 }
+PACES = {PACED + SOURCE: (200, 100), SLOW + SOURCE: (100,)}
 
 
 def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
     """Return a table with entries that stay."""
     table = Table()
     for key, hops in entries.items():
-        table.install(key, hops, float("inf"))
+        table.install(key, hops, float("inf"), paces=PACES.get(key, ()))
     return table
 
 
@@ -85,10 +88,12 @@ def frame(
     hops_left: int = 64,
     length: int | None = None,
     padding: bytes = b"",
+    pace: int = 0,
 ) -> bytes:
     """Return a frame as it comes in on port 0."""
     size = len(payload) if length is None else length
-    header = Header(kind, flags, hops_left, 7, size, 0x0102030405060708, 3, 9, 0xAABBCCDDEEFF0011, destination, source)
+    numbers = 7, size, 0x0102030405060708, 3, 9, 0xAABBCCDDEEFF0011
+    header = Header(kind, flags, hops_left, *numbers, destination, source, pace)
     ether = IN_MAC + PEER_MACS[IN] + ETHERTYPE.to_bytes(2, "big")
     return ether + encode(header) + payload + padding
 
@@ -146,6 +151,13 @@ CASES = [
     _forwarded("no alternate while the port is up", frame(READY), WIDE),
     _forwarded("the alternate of a branch", frame(TREE), WIDE, NARROW),
     _forwarded("an alternate too narrow for a branch", frame(TREE, bytes(701 - 96)), WIDE, drops=(DropReason.TOO_BIG,)),
+    _forwarded("a message for every branch", frame(PACED), WIDE, NARROW),
+    _forwarded("a message at the pace of the slowest branch", frame(PACED, pace=100), WIDE, NARROW),
+    _forwarded("a message for faster branches", frame(PACED, pace=101), WIDE, drops=(DropReason.THINNED,)),
+    Case("a message for faster branches than here", frame(PACED, pace=255), drops=(DropReason.THINNED,) * 2),
+    _forwarded("a pace without branches of its own", frame(ONE, pace=255), WIDE),
+    _forwarded("a message at the pace of the only branch", frame(SLOW, pace=100), WIDE),
+    Case("a message that is thinned before the only branch", frame(SLOW, pace=101), drops=(DropReason.THINNED,)),
     Case("an alternate that is too narrow", frame(RESCUED, bytes(701 - 96)), drops=(DropReason.TOO_BIG,)),
     Case("an alternate that is down too", frame(CUT_OFF), drops=(DropReason.PORT_DOWN,)),
     Case("an alternate goes round no more often", frame(RESCUED, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),

@@ -27,7 +27,7 @@ from gdp.burst.slots import received, runs, samples
 
 __all__ = ["CIPHER", "DIGEST", "PLAINTEXT", "SYSTEM_CALLS", "VARIANT", "received", "runs", "samples"]
 
-_INTERFACE: Final = 4  # as in ``core.c``
+_INTERFACE: Final = 5  # as in ``core.c``
 
 
 def _compiled() -> Any:

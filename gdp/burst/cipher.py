@@ -19,7 +19,18 @@ from typing import Final
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, HOPS_AT, LENGTH_AT, NUMBER_AT, PART_AT, PARTS_AT, authenticated
+from gdp.frame.codec import (
+    FLAGS_AT,
+    HEADER_BYTES,
+    HOPS_AT,
+    INCARNATION_AT,
+    LENGTH_AT,
+    NUMBER_AT,
+    PACE_AT,
+    PART_AT,
+    PARTS_AT,
+    authenticated,
+)
 from gdp.frame.kinds import Flag
 from gdp.sansio import ReceivedFrame
 
@@ -73,7 +84,7 @@ class MessageCipher:
         frames: list[bytes] = []
         payloads: list[bytes] = []
         header, additional, size = bytearray(head), bytearray(), -1
-        encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT : PARTS_AT + 4], "big") - 1
+        encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT:INCARNATION_AT], "big") - 1
         for part, at in zip(range(first, end), count(first * capacity - len(prefix), capacity), strict=False):
             plain = message[at : at + capacity] if part else (prefix + message[:capacity])[:capacity]
             _PART.pack_into(header, PART_AT, part)
@@ -85,7 +96,7 @@ class MessageCipher:
                 additional = header[:HOPS_AT] + header[HOPS_AT + 1 : HEADER_BYTES]
             else:
                 _PART.pack_into(additional, PART_AT - 1, part)
-            payload = encrypt(header[NUMBER_AT:PARTS_AT], plain, additional)
+            payload = encrypt(header[NUMBER_AT:PACE_AT], plain, additional)
             payloads.append(payload)
             frames.append(bytes(header) + payload)
         if running is not None:
@@ -96,7 +107,7 @@ class MessageCipher:
         """Return plaintext, and ciphertext with tag, of a part whose tag ends at ``end``; None: it was altered."""
         payload = frame[BODY_AT:end]
         try:
-            return self._aead.decrypt(frame[NUMBER_AT:PARTS_AT], payload, authenticated(frame)), payload
+            return self._aead.decrypt(frame[NUMBER_AT:PACE_AT], payload, authenticated(frame)), payload
         except InvalidTag:
             return None
 
@@ -115,8 +126,8 @@ class MessageCipher:
         plains: list[bytes] = []
         payloads: list[bytes] = []
         decrypt, end, nonce = self._aead.decrypt, HEADER_BYTES + length, head[NUMBER_AT:PART_AT]
-        before, behind = head[:LENGTH_AT] + _LENGTH.pack(length) + head[NUMBER_AT:PART_AT], head[PARTS_AT:]
-        additional_behind = head[PARTS_AT:HEADER_BYTES]
+        before, behind = head[:LENGTH_AT] + _LENGTH.pack(length) + head[NUMBER_AT:PART_AT], head[PACE_AT:]
+        additional_behind = head[PACE_AT:HEADER_BYTES]
         additional = before[:HOPS_AT] + before[HOPS_AT + 1 :]
         for part, arrival in zip(range(first, first + parts), islice(arrivals, at, None), strict=False):
             frame, number = arrival.frame, part.to_bytes(4, "big")

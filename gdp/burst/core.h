@@ -1,7 +1,7 @@
 /* Burst core: layout of a frame (frame/spec.md), and what its source files share.
  *
- *     0 version  1 kind  2 flags  3 hops left  4 epoch (2)  6 payload length (2)  8 number (8)  16 part (4)  20 parts (4)
- *     24 incarnation (8)  32 destination (32)  64 source (32)  96 salt (8)  104 ciphertext, tag (16), signature
+ *     0 version  1 kind  2 flags  3 hops left  4 epoch (2)  6 payload length (2)  8 number (8)  16 part (4)  20 pace
+ *     21 parts (3)  24 incarnation (8)  32 destination (32)  64 source (32)  96 salt (8)  104 ciphertext, tag (16), signature
  */
 #pragma once
 #define _GNU_SOURCE /* recvmmsg, sendmmsg */
@@ -16,7 +16,7 @@ enum {
     LENGTH_AT = 6,
     NUMBER_AT = 8,
     PART_AT = 16,
-    PARTS_AT = 20,
+    PACE_AT = 20,
     DESTINATION_AT = 32,
     DESTINATION = 32,
     ENDS = 64, /* destination and source */

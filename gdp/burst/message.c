@@ -302,7 +302,7 @@ static PyObject *cipher_seal(MessageCipher *self, PyObject *args)
         return refusal("a header with its salt, and a capacity that frames have");
     out.head = (const uint8_t *)head, out.prefix = (const uint8_t *)prefix, out.message = (const uint8_t *)message;
     out.size += out.prefix_size;
-    out.parts = number_at(out.head + PARTS_AT);
+    out.parts = number_at(out.head + PACE_AT) & 0xffffff; /* without the pace */
     if (first < 0 || end < first || end > (Py_ssize_t)out.parts)
         return refusal("parts of the message");
     EVP_MD_CTX *hash = hash_of(running);

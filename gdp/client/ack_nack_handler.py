@@ -114,8 +114,13 @@ class AckNackHandler:
         if is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
 
-    def poll_heartbeat(self, now_s: float, trip_s: float) -> bytes:
-        """Return the wire form of the Heartbeat that is due; ``trip_s``: how long a reader's answer may take."""
+    def poll_heartbeat(self, now_s: float, trip_s: float, paces: tuple[tuple[bytes, int], ...] = ()) -> bytes:
+        """Return the wire form of the Heartbeat that is due.
+
+        Args:
+            trip_s: how long a reader's answer may take.
+            paces: that readers are to state.
+        """
         queue, oldest = self._queue, self._window.cache.oldest
         (sent_number, sent_part), sent_sequence = queue.sent, queue.sent_sequence
         state = Heartbeat(
@@ -128,6 +133,7 @@ class AckNackHandler:
             oldest_sequence=sent_sequence if oldest is None else queue.ledger.begin_of(oldest, sent_sequence),
             sent_sequence=sent_sequence,
             gone=tuple(queue.ledger.gone),
+            paces=paces,
         )
         return self._heartbeats.poll_heartbeat(state, now_s, trip_s)
 

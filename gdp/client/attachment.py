@@ -23,6 +23,7 @@ from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.pace import ReaderPace
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
@@ -130,7 +131,11 @@ class Attachment:
         self._former = ZERO  # the one before
         self._moved_s = float("-inf")
         self._sync = RevocationSync(
-            identity, policy.revoked, self.hello_protocol.neighbours, self._say_revoked, settings.first_sequence
+            identity,
+            policy.revoked,
+            self.hello_protocol.neighbours,
+            lambda to, wire: self.say(Kind.REVOKED, wire) if to is self.switch else None,
+            settings.first_sequence,
         )
         self.outgoing: list[OutgoingFrames] = []
         self._in_use_s = 0.0  # since when another node with this identity is accepted instead
@@ -317,6 +322,16 @@ class Attachment:
             self.say(Kind.JOIN_REFRESH, reply.to_wire(self._identity.name, self._identity.key))
         return [known[number] for number in refresh.numbers if number in known]
 
+    def state_pace(self, topic: Name, publisher: Name, pace: int) -> None:
+        """State to the switch which messages of a publisher it is to send here."""
+        if (switch := self.switch) is not None:
+            nonce = self.hello_protocol.ports[switch.port].nonce
+            body = ReaderPace(
+                topic=topic, publisher=publisher, pace=pace, session=switch.echo, sender_session=nonce,
+                sequence=self._next_sequence(),
+            )  # fmt: skip
+            self.say(Kind.PACE, body.to_wire(self._identity.name, self._identity.key))
+
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Update the state of a port's link."""
         self.hello_protocol.port_changed(port, up, now.mono_s)
@@ -483,10 +498,6 @@ class Attachment:
             each.refused = ack.refused
             pause_s = renew_after_s(self._lease_s)  # it may be accepted later; frequent repetition does not help
         self._requests.start(each.key, now_s + pause_s)
-
-    def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
-        if neighbour is self.switch:
-            self.say(Kind.REVOKED, wire)
 
     def say(self, kind: Kind, wire: bytes, to: Name = ZERO) -> None:
         """Send a statement to the switch, or through it to another node."""

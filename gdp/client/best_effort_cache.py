@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gdp.client.send_options import SendOptions
-from gdp.frame.codec import NUMBER_AT
+from gdp.frame.codec import NUMBER_AT, PARTS_MASK
 from gdp.intervals import NEVER_S
 from gdp.limits import REPAIR_S, REPAIRS_ABOVE_PARTS
 from gdp.message.acknack import MissingRange
@@ -71,6 +71,7 @@ class BestEffortCache(HistoryCache):
         at, end = 0, len(frames) if self._is_enabled else 0
         while at < end:
             number, part, parts = _NUMBER_PART_PARTS.unpack_from(frames[at], NUMBER_AT)
+            parts &= PARTS_MASK
             count = min(parts - part, end - at)
             if parts > REPAIRS_ABOVE_PARTS:
                 self._add(number, part, frames[at : at + count], now_s)

@@ -10,6 +10,7 @@ Its frames are sealed when they are taken, so a dropped message costs no sealing
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from gdp.crypto.envelope import Sealed
@@ -90,11 +91,17 @@ class BestEffortQueue:
         self._held_bytes = self._part = 0
         return gone
 
-    def poll_frames(self, limit: int) -> list[bytes]:
-        """Return at most ``limit`` frames, in order, sealed as they are taken."""
+    def poll_frames(self, limit: int, pace_of: Callable[[int], int] = lambda _size: 0) -> list[bytes]:
+        """Return at most ``limit`` frames, in order, sealed as they are taken.
+
+        Args:
+            pace_of: returns the pace of a message of so many bytes.
+        """
         frames: list[bytes] = []
         while self.waiting and limit > 0:
             oldest, first = self.waiting[0][0], self._part
+            if not first and (pace := pace_of(oldest.size_bytes)):
+                oldest.set_pace(pace)
             taken = oldest[first : first + limit]
             frames += taken
             count = len(taken)

@@ -43,19 +43,22 @@ class BlockingReaders:
 
     Args:
         lag_s: how long a reader may hold back the others.
+        most: how many may do so at once, without being an obstacle each.
+        progress_bytes: a path that carried as much meanwhile is no obstacle.
 
     Attributes:
         blocks: of the readers that are measured.
     """
 
-    def __init__(self, lag_s: float) -> None:
-        self._lag_s = lag_s
+    def __init__(self, lag_s: float, *, most: int = 1, progress_bytes: float = PROGRESS_BYTES) -> None:
+        self._lag_s, self._most, self._progress_bytes = lag_s, most, progress_bytes
         self.blocks: dict[bytes, _Block] = {}
 
     def record(self, paths: Sequence[PathState], now_s: float) -> None:
         """Note the paths that govern, while something waits for them or begins to leave."""
         free = sum(each.allowance > 0 for each in paths)
-        blocking = {each.reader for each in paths if each.allowance <= 0 < free == len(paths) - 1}
+        is_one_obstacle = free > 0 and len(paths) - free <= self._most
+        blocking = {each.reader for each in paths if each.allowance <= 0 and is_one_obstacle}
         sent_bytes = {each.reader: each.sent_bytes for each in paths}
         for name, block in self.blocks.items():
             if block.is_blocking:
@@ -74,7 +77,7 @@ class BlockingReaders:
             del self.blocks[name]
             blocked_s = block.blocked_s + (now_s - block.checked_s if block.is_blocking else 0.0)
             is_obstacle = blocked_s >= _BLOCKED_SHARE * (now_s - block.since_s)
-            if is_obstacle and block.sent_bytes - block.first_bytes < PROGRESS_BYTES:
+            if is_obstacle and block.sent_bytes - block.first_bytes < self._progress_bytes:
                 slow.append(name)
         return slow
 

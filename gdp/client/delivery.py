@@ -84,6 +84,7 @@ class Delivery:
 
     Attributes:
         is_live: it has begun.
+        is_thinned: not every message is for this reader; of those it gets some frame.
         is_reliable: messages between two delivered ones were given up by the writer; else they are gaps. None: the
             writer has not said so far.
         expected: number of the message that is delivered next.
@@ -112,7 +113,8 @@ class Delivery:
         self._recovery = recovery
         self._late = late
         self._lag_s = lag_s
-        self.is_live = False
+        self.is_live = self.is_thinned = False
+        self._abandoned = 0  # messages of which some frames came, and that count as lost
         self.is_reliable: bool | None = None
         self.expected = self.sequence = self.known = 0
         self.losses = Losses()
@@ -340,5 +342,16 @@ class Delivery:
         """Count what lies before a sequence number as lost, with reason ``otherwise`` if the writer gives none."""
         if self.sequence < sequence:
             for lost in explain(self.sequence, sequence - 1, self._gone, otherwise):
-                self.losses.add(lost)
+                for each in self._thinned(lost) if self.is_thinned else (lost,):
+                    self.losses.add(each)
             self.sequence = sequence
+
+    def _thinned(self, lost: LostRange) -> list[LostRange]:
+        """Return a range as its parts that were thinned, of which nothing came, and that have a gap."""
+        if lost.reason is not LossReason.GAP:
+            return [lost]
+        abandoned = min(self._data.drops[DropReason.ABANDONED] - self._abandoned, lost.messages)
+        self._abandoned += abandoned
+        middle = lost.last - abandoned
+        parts = LostRange(lost.first, middle, LossReason.THINNED), LostRange(middle + 1, lost.last, lost.reason)
+        return [part for part in parts if part.messages]

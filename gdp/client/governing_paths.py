@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable, Sequence
 from typing import Final
 
 from gdp.client.blocking_readers import BlockingReaders, PathState
+from gdp.client.reader_paces import ReaderPaces
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.send_options import PublisherSettings, SendOptions
@@ -38,6 +39,7 @@ class GoverningPaths:
 
     Attributes:
         blocking: readers that hold back the others.
+        paces: of the readers of a best-effort topic, each of which has its own.
         share: of what the path carries, 0 to 1; the other topics that wait have the rest.
         seen_s: when ``allowance`` was last asked.
         second_until_s: monotonic second until which there is a second path, as far as known here.
@@ -60,6 +62,9 @@ class GoverningPaths:
         self._count, self._is_urgent = settings.paths, settings.urgent
         self._fastest_governs = settings.patience.fastest_governs
         self.blocking = BlockingReaders(settings.patience.lag_s)
+        self.paces = ReaderPaces(paths)
+        self._may_pace = settings.paths == 1 and not settings.urgent and not settings.patience.fastest_governs
+        queue.pace_of = self._begin
         self.seen_s = 0.0
         self.share = 1.0
         self.second_until_s = float("-inf")
@@ -97,14 +102,18 @@ class GoverningPaths:
         if self._count > 1 and self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._governing()
-        if paths and not paths[1:] and not self.blocking.blocks:
+        may_slow = self._may_pace and not self._queue.is_acknowledged
+        if paths and not paths[1:] and not self.blocking.blocks and not (may_slow and self.paces.stated):
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
         if self._fastest_governs:
             return max(allowances, default=_ALL)
         if self.blocking.blocks or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
-        return min(allowances, default=_ALL)
+        allowance = min(allowances, default=_ALL)
+        if may_slow and (self.paces.slowing.blocks or (allowance <= 0 and len(self._readers.active) > 1)):
+            self.paces.record(self.names(), now_s)
+        return allowance
 
     def allowance_of_all(self, now_s: float) -> int:
         """Return how many bytes of frames may leave on each of the paths; 0: none."""
@@ -162,7 +171,7 @@ class GoverningPaths:
     @property
     def loss(self) -> float:
         """Return the share of frames that were lost lately on the worst path, 0 to 1; 0 also if nothing is measured."""
-        return max([path.controller.model.loss for path in self._measured()], default=0.0)
+        return max([path.controller.model.loss for path in (*self._measured(), *self.paces.paced())], default=0.0)
 
     @property
     def rtt_s(self) -> float | None:
@@ -215,7 +224,8 @@ class GoverningPaths:
             keeping_up = [each for each in names if each in window.readers.active]
             return [each for each in keeping_up if not window.readers.is_ahead(each, following)] or keeping_up or names
         readers, paths = self._readers.active, self._paths
-        return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
+        names = [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
+        return self.paces.governing(names)
 
     def confirming(self, frames: Sequence[bytes], again: int) -> list[bytes]:
         """Return the readers that confirm these frames, the first ``again`` of which are repairs.
@@ -256,3 +266,7 @@ class GoverningPaths:
         paths = ((name, self._paths.path(name, now_s)) for name in self.names())
         present = [(name, path) for name, path in paths if path.governs_others]
         self.blocking.record([PathState(name, path.allowance(now_s), path.sent_bytes) for name, path in present], now_s)
+
+    def _begin(self, size: int) -> int:
+        """Return the pace of a best-effort message of ``size`` bytes that begins to leave."""
+        return self.paces.pace_for(self._present(), size) if self.paces.stated else 0

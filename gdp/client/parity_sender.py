@@ -22,13 +22,13 @@ from typing import Final
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.redundancy import CopyBudget
 from gdp.crypto.envelope import SIGNATURE_BYTES, TAG_BYTES, fragment_capacity
-from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT
+from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT, PACE_AT, PARTS_MASK
 from gdp.frame.kinds import Flag
 from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
 from gdp.message.parity import OVERHEAD_BYTES, SHARD_OVERHEAD_BYTES, Parity, blocks_of, shard_of, span_of
 
-__all__ = ["PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
+__all__ = ["LOSS_MIN", "PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
 
 PARITY_BYTES: Final = OVERHEAD_BYTES + TAG_BYTES  # so much smaller are the frames of a message with parity
 LOSS_MIN, LOSS_MAX = 0.001, 0.2  # less needs no parity, and more is no loss that parity can fill
@@ -109,6 +109,7 @@ class ParitySender:
         self.is_enabled = is_enabled
         self.sent = 0
         self.margin = 0.0
+        self._least_pace = 0
         self._number, self._part = -1, 0  # the message under way, and the part that is sent next
         self._frames: list[bytes] = []  # of its present span
         self._made = 0  # parity frames of this message
@@ -126,20 +127,23 @@ class ParitySender:
         return self.is_enabled and is_useful(loss, rtt_s, deadline_s) and self.is_available
 
     def handle_sent(
-        self, frames: Sequence[bytes], loss: float | None, path_bytes_s: float | None, now_s: float
+        self, frames: Sequence[bytes], loss: float | None, path_bytes_s: float | None, now_s: float, pace: int = 0
     ) -> None:
         """Note DATA frames that leave now, and queue the parity of the spans that they complete.
 
         Args:
             loss: measured share of lost frames, 0 to 1; None: unknown.
             path_bytes_s: what the path carries; None: unknown.
+            pace: the lowest of the readers that lose frames; others need no parity.
         """
+        self._least_pace = pace
         if not self.is_enabled or loss is None:
             return
         for frame in frames:
             if not frame[FLAGS_AT] & _PARITY:
                 continue
             number, part, parts = _NUMBER_PART_PARTS.unpack_from(frame, NUMBER_AT)
+            parts &= PARTS_MASK
             if part == 0 and number > self._number:
                 self._number, self._part, self._frames, self._made = number, 0, [], 0
             if number != self._number or part != self._part:
@@ -193,12 +197,12 @@ class ParitySender:
             erasure.encode([shard_of(frames[part - span.start], size) for part in block.parts], count)
             for block, count in zip(blocks, counts, strict=True)
         ]
-        flags, seal = frames[0][FLAGS_AT], self._keys.parity.seal
+        flags, pace, seal = frames[0][FLAGS_AT], max(frames[0][PACE_AT], self._least_pace), self._keys.parity.seal
         for index in range(most):
             for block, count, of_block in zip(blocks, counts, shards, strict=True):
                 if index < count:
                     body = Parity(block.first, index, count, of_block[index]).to_wire()
-                    self.waiting.append(seal(self._number, self._made, parts, flags, body))
+                    self.waiting.append(seal(self._number, self._made, parts, flags, body, pace))
                     self._made += 1
         self._at_once = min(self._at_once + len(self.waiting), _AT_ONCE)
         self._remember(self._number)

@@ -140,7 +140,7 @@ class Participant:
         self._drops: Counter[DropReason] = Counter()
         self._source = source
         self.attachment = Attachment(identity, policy, settings, control_keys.public)
-        self._reception = Reception(self.subscriptions, self.attachment.send)
+        self._reception = Reception(self.subscriptions, self.attachment.send, self.attachment.state_pace)
         self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
         self.diagnostics = Diagnostics(
             identity, policy, self.attachment.fragmenter, settings.first_sequence,

@@ -25,7 +25,7 @@ from gdp.client.best_effort_cache import BestEffortCache
 from gdp.client.governing_paths import GoverningPaths
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs
-from gdp.client.parity_sender import RTT_MIN_S, ParitySender
+from gdp.client.parity_sender import LOSS_MIN, RTT_MIN_S, ParitySender
 from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.redundancy import Redundancy
 from gdp.client.send_options import PublisherSettings
@@ -109,13 +109,20 @@ class Protection:
         """Queue what a reader of a best-effort topic lacks, as far as it can be in time."""
         if acknack.missing and not self._queue.is_acknowledged:
             newest = acknack.newest, acknack.newest_part
-            self.late.request(reader, acknack.missing, now_s, newest=newest, rtt_s=self._paths.rtt_s)
+            self.late.request(
+                reader,
+                acknack.missing,
+                now_s,
+                newest=newest,
+                rtt_s=self._paths.paces.rtt_s(reader) or self._paths.rtt_s,
+            )
 
     def poll_frames(self, now_s: float, limit_bytes: int, heartbeats: list[bytes]) -> list[bytes]:
         """Return Heartbeats and about ``limit_bytes`` of other frames, as they leave now; with 0 nothing new does."""
         paths, parity, again = self._paths, self.parity, 0
         is_doubled, self.has_more = not self._has_one_path and paths.is_doubled(now_s), False
         before, sent, after = list[bytes](), list[bytes](), list[bytes]()
+        paths.paces.begin_turn()
         if limit_bytes > 0:
             left = limit_bytes // ((self._queue.mtu or MTU_MIN_BYTES) * (2 if is_doubled else 1)) or 1
             if parity.waiting:
@@ -125,7 +132,13 @@ class Protection:
             sent = self._poll_data(now_s, left)
             again = self._window.retransmissions + self.late.retransmissions - repaired
             if self._loss is not None:
-                parity.handle_sent(sent, self._loss, paths.capacity_bytes_s, now_s)
+                parity.handle_sent(
+                    sent,
+                    self._loss,
+                    paths.capacity_bytes_s,
+                    now_s,
+                    paths.paces.pace_of_lossy(self._readers.active, LOSS_MIN),
+                )
             left -= len(sent)
             self.has_more = left <= 0
             if parity.waiting:

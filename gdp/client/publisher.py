@@ -31,7 +31,8 @@ from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.intervals import NEVER_S
-from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
+from gdp.limits import MTU_MIN_BYTES, PACE_MAX, SPREAD, WINDOW_BYTES
+from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.bundle import BUNDLE_BYTES
 from gdp.message.loss import LossReason
 from gdp.message.send_window import SendWindow
@@ -100,16 +101,18 @@ class Publisher:
         self.losses = self.queue.ledger.losses
         self.matched = ReaderProxies(topic, source, settings.patience)
         self._heartbeats = HeartbeatSchedule(description, past.status_number)
-        self.sent_frames = SentFrames(self._node_paths, counts_losses=settings.paths != SPREAD)
+        self.governing_paths = GoverningPaths(
+            paths=self._node_paths, readers=self.matched, queue=self.queue, window=self._window, settings=settings
+        )
+        self.sent_frames = SentFrames(
+            self._node_paths, counts_losses=settings.paths != SPREAD, paces=self.governing_paths.paces.stated
+        )
         self.acknowledgements = AckNackHandler(
             readers=self.matched,
             queue=self.queue,
             window=self._window,
             heartbeats=self._heartbeats,
             sent_frames=self.sent_frames,
-        )
-        self.governing_paths = GoverningPaths(
-            paths=self._node_paths, readers=self.matched, queue=self.queue, window=self._window, settings=settings
         )
         self.protection = Protection(
             source=source,
@@ -312,6 +315,7 @@ class Publisher:
         if self.sent_frames.handle_report(source, report, now_s, waited_s, hops):
             self.drops[DropReason.UNPROVEN] += 1
         self.protection.handle_report(source, report, now_s, is_new=is_new)
+        self._handle_pace(source, report, now_s)
         if self._fastest_governs:
             self._window.governing = next(iter(self.governing_paths.fastest()), None)
         path = self._node_paths.get(source)
@@ -322,11 +326,19 @@ class Publisher:
         self._heartbeats.is_reminder_wanted |= is_old  # it has not received the new epoch yet
         return True
 
+    def _handle_pace(self, reader: bytes, report: AckNack, now_s: float) -> None:
+        """Note the pace that a reader has stated to its switch; a Heartbeat gives it another, if it is to have one."""
+        paces, is_paced = self.governing_paths.paces, report.flags is AckNackFlag.PACED
+        if paces.handle_report(reader, report.share if is_paced else PACE_MAX, now_s):
+            self._heartbeats.is_reminder_wanted = True
+
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self.acknowledgements.handle_timer(now_s)
         for name in self.governing_paths.blocking.slow(now_s):
             self.acknowledgements.exclude(name, now_s)
+        self._heartbeats.wanted |= self.governing_paths.paces.slow_down(now_s)
+        self.governing_paths.paces.keep(self.matched.active)
         self.protection.late.drop_expired(now_s)
         if now_s >= self._awaits_until_s:
             self._awaits_until_s = NEVER_S
@@ -339,7 +351,9 @@ class Publisher:
         protection, blocking = self.protection, self.governing_paths.blocking
         due_s = self._awaits_until_s
         if protection.late.messages or blocking.blocks:
-            due_s = min(due_s, protection.late.get_timer(), blocking.get_timer())
+            due_s = min(
+                due_s, protection.late.get_timer(), blocking.get_timer(), self.governing_paths.paces.slowing.get_timer()
+            )
         of_readers = self._window.get_timer(), self.matched.next_silent()
         if not self.matched.active or self.queue.mtu is None:
             return min(due_s, *of_readers)
@@ -371,8 +385,11 @@ class Publisher:
         heartbeats: list[bytes] = []
         schedule = self._heartbeats
         if (schedule.wanted or schedule.is_reminder_wanted) and schedule.is_due(now_s):
-            wire = self.acknowledgements.poll_heartbeat(now_s, self.governing_paths.patience_s(now_s))
+            patience_s, paces = self.governing_paths.patience_s(now_s), self.governing_paths.paces.to_state()
+            wire = self.acknowledgements.poll_heartbeat(now_s, patience_s, paces)
             heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
+        if queue.is_empty:
+            self.governing_paths.paces.slowing.blocks.clear()  # all that is published leaves in time
         return frames

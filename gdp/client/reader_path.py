@@ -21,8 +21,9 @@ from gdp.intervals import FORGET_S, NEVER_S, PACE_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 from gdp.requests import Backoff
 
-__all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
+__all__ = ["BURST_S", "FLIGHT_FRAMES", "ReaderPath", "ReaderPaths"]
 
+FLIGHT_FRAMES: Final = 16  # of those that leave at once and are confirmed together, at most
 BURST_S: Final = 0.001  # frames of this time leave at once: a timer for each frame would cost more than it smooths
 _TIMEOUTS: Final = Backoff(0.3, 4.0)
 _TIMEOUT_TRIPS: Final = 4.0
@@ -41,6 +42,7 @@ class ReaderPath:
     """Path to one reader node.
 
     Attributes:
+        mtu: bytes of a full frame.
         controller: its congestion controller.
         sent_bytes: of all frames so far.
         may_probe: one frame may leave whatever the window: what a report of it shows as lost makes space.
@@ -49,7 +51,7 @@ class ReaderPath:
     """
 
     def __init__(self, mtu: int, now_s: float) -> None:
-        self._mtu = mtu
+        self.mtu = mtu
         self.sent_bytes = 0
         self.controller = PathController(mtu)
         self.restart(now_s)
@@ -57,7 +59,7 @@ class ReaderPath:
     def restart(self, now_s: float) -> None:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
         self.controller.rate.forget_all()
-        self.controller = PathController(self._mtu)
+        self.controller = PathController(self.mtu)
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
         self._late_reports = 0  # in a row
         self._hops: int | None = None
@@ -68,7 +70,7 @@ class ReaderPath:
 
     def allowance(self, now_s: float, *, urgent: bool = False) -> int:
         """Return how many bytes may leave now; 0: none."""
-        controller, mtu = self.controller, self._mtu
+        controller, mtu = self.controller, self.mtu
         if self.may_probe:
             return mtu
         free = int(controller.limit) - controller.rate.inflight
@@ -95,7 +97,7 @@ class ReaderPath:
         """Return when the next frame may leave; infinity: not before something is confirmed."""
         if self.may_probe:
             return 0.0
-        next_s = self.controller.next_send_s(self._mtu)
+        next_s = self.controller.next_send_s(self.mtu)
         return NEVER_S if next_s is None else next_s
 
     def note_idle(self) -> None:
@@ -201,8 +203,8 @@ class ReaderPath:
         if not self.governs_others:
             self.controller.rate.forget_all()
             self._timeouts = min(self._timeouts, 1)
-        if mtu != self._mtu:
-            self._mtu = mtu
+        if mtu != self.mtu:
+            self.mtu = mtu
             self.controller.set_mtu(mtu)
 
     def handle_timer(self, now_s: float) -> None:

@@ -12,6 +12,9 @@ from gdp.client.timer_queue import TimerQueue
 from gdp.client.writer_proxy import WriterProxy
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
+from gdp.intervals import JOIN, NEVER_S
+from gdp.limits import PACE_MAX
+from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 
 __all__ = ["Reception"]
@@ -19,6 +22,9 @@ __all__ = ["Reception"]
 
 class Reception:
     """The writer proxies of one participant, with those that have news.
+
+    Args:
+        state: states to the switch the pace of what a publisher (the second name) sends to a topic.
 
     Attributes:
         under_way: the writer proxy whose next fragment is expected.
@@ -28,14 +34,21 @@ class Reception:
         timers: of the writer proxies.
     """
 
-    def __init__(self, subscriptions: Subscriptions, send: Callable[[list[bytes]], None]) -> None:
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        send: Callable[[list[bytes]], None],
+        state: Callable[[Name, Name, int], None],
+    ) -> None:
         self._subscriptions = subscriptions
         self._send = send
+        self._state = state
         self.fed: dict[WriterProxy, Subscription] = {}
         self.under_way: tuple[WriterProxy, Subscription] | None = None
         self.messages: list[Message] = []
         self.reporting: dict[WriterProxy, None] = {}
         self.timers = TimerQueue[WriterProxy]()
+        self._paces: dict[tuple[Name, Name], tuple[int, float]] = {}  # stated; and when again, by topic and publisher
 
     def receive(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
         """Pass a frame to its writer proxy.
@@ -74,11 +87,23 @@ class Reception:
     def report(self, now_s: float) -> None:
         """Send the reports that are due."""
         for writer_proxy in self.reporting:
+            if writer_proxy.pace < PACE_MAX or self._paces:
+                self._state_pace(writer_proxy, now_s)
             notes = writer_proxy.control_to_send(now_s)
             if notes:
                 self._send(notes)
             self.timers.touched[writer_proxy] = None
         self.reporting.clear()
+
+    def _state_pace(self, writer_proxy: WriterProxy, now_s: float) -> None:
+        """State the pace of a writer proxy to the switch, if it is new there or was stated a while ago."""
+        key, pace = (writer_proxy.topic, writer_proxy.publisher), writer_proxy.pace
+        stated, again_s = self._paces.get(key, (PACE_MAX, NEVER_S))
+        if pace != stated or now_s >= again_s:
+            self._paces[key] = pace, now_s + JOIN.refresh_s
+            self._state(*key, pace)
+            if pace == stated == PACE_MAX:
+                del self._paces[key]
 
     def close(self, writer_proxies: Iterable[WriterProxy], *, goodbye: bool) -> None:
         """Close writer proxies; ``goodbye``: also send each publisher a goodbye."""

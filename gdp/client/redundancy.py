@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from gdp.frame.codec import PARTS_AT
+from gdp.frame.codec import INCARNATION_AT, PARTS_AT
 from gdp.intervals import NEVER_S
 from gdp.limits import SENDS_MAX
 from gdp.message.second_copies import REPEATED_PARTS_MAX
@@ -26,7 +26,7 @@ _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings le
 _UNKNOWN: Final = 2  # sendings before anything is measured
 _LEAST_BYTES_S: Final = 8_000.0
 _RATE_CHANGE: Final = 0.1
-_PARTS: Final = slice(PARTS_AT, PARTS_AT + 4)
+_PARTS: Final = slice(PARTS_AT, INCARNATION_AT)
 
 
 class CopyBudget:

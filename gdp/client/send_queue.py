@@ -14,6 +14,7 @@ number under its seal, sent or not (``gdp/message/ledger.py``).
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import Final
 
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
@@ -62,6 +63,7 @@ class SendQueue:
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
         bytes_s: bytes of frames per second that this topic may send now; None: unknown.
+        pace_of: returns the pace of a best-effort message of so many bytes that begins to leave.
         has_parity: messages sealed from now on leave space for parity frames, and announce them.
     """
 
@@ -85,6 +87,7 @@ class SendQueue:
         self.options = options = settings.options
         self.bytes_s: float | None = None
         self.has_parity = False
+        self.pace_of: Callable[[int], int] = lambda _size: 0
         self._best_effort = BestEffortQueue(options.deadline_s)
         window.set_history_bounds(options.history_bytes, options.history_age_s)
 
@@ -239,7 +242,7 @@ class SendQueue:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
         window, best_effort, messages = self._window, self._best_effort, self._gathered.messages
         left = limit if limit > 0 else 1
-        frames = best_effort.poll_frames(left) if best_effort.waiting else []
+        frames = best_effort.poll_frames(left, self.pace_of) if best_effort.waiting else []
         if not messages or window.has_frames:
             frames += window.frames_to_send(now_s, max(left - len(frames), 1) if frames else left)
         while messages:
@@ -247,7 +250,11 @@ class SendQueue:
             if left <= 0 or (window.unsent if self.is_acknowledged else best_effort.waiting):
                 break
             self._seal_next()
-            frames += window.frames_to_send(now_s, left) if self.is_acknowledged else best_effort.poll_frames(left)
+            frames += (
+                window.frames_to_send(now_s, left)
+                if self.is_acknowledged
+                else best_effort.poll_frames(left, self.pace_of)
+            )
         return frames
 
     def refragment_best_effort(self, mtu: int) -> bool:

@@ -4,7 +4,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A report states how many frames its reader has received, and the newest of them. Frames keep their order on a path. So
 everything that left up to that frame has arrived or is lost, and the count shows how many are lost. Frames that leave
-at once form flights of at most ``_FLIGHT_FRAMES``; a flight is confirmed as a whole. A frame that is sent again gives
+at once form flights of at most ``FLIGHT_FRAMES``; a flight is confirmed as a whole. A frame that is sent again gives
 no round trip, because its confirmation may be that of the first time (Karn's rule).
 
 Each frame is entered once, when it leaves. What a report shows of it is handed to the path of its reader
@@ -15,21 +15,20 @@ Each frame is entered once, when it leaves. What a report shows of it is handed 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from gdp import burst
-from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.client.reader_path import FLIGHT_FRAMES, ReaderPath, ReaderPaths
 from gdp.congestion.delivery_rate import Flight
-from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
+from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT, PACE_AT
 from gdp.message.acknack import AckNack
 from gdp.message.frame_loss import FrameLoss
 from gdp.message.receipts import ReceiptCheck
 
 __all__ = ["SentFrames"]
 
-_FLIGHT_FRAMES: Final = 16
 _MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
 
@@ -48,7 +47,8 @@ class _Reader:
     received: int = -1  # count in its latest report; -1: none yet
     newest: tuple[int, int] = (0, 0)  # message and fragment in its latest report
     partial: int = 0  # frames of the oldest flight that came, of frames sent again
-    unseen: int = 0  # frames sent before it began to count
+    unseen: int = 0  # frames sent before it began to count, or not to it
+    withheld: deque[tuple[int, int]] = field(default_factory=deque)  # frames not sent to it, with the count of all then
     repairs: int = 0  # frames sent again to several readers, which are in no flight
     lost: int = 0
     receipts: ReceiptCheck = field(default_factory=ReceiptCheck)
@@ -60,6 +60,7 @@ class SentFrames:
     Args:
         paths: of the participant.
         counts_losses: frames keep their order; not so if they are striped over two paths.
+        paces: of readers that do not get frames of a higher pace, by name; it changes as they state others.
 
     Attributes:
         loss: share of urgent frames lost, copies included.
@@ -67,8 +68,11 @@ class SentFrames:
         leaving: what ``count`` is to enter by ``sent``, so that the frames need not wait for that; None: nothing.
     """
 
-    def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
+    def __init__(
+        self, paths: ReaderPaths, *, counts_losses: bool = True, paces: Mapping[bytes, int] | None = None
+    ) -> None:
         self._paths = paths
+        self._paces = {} if paces is None else paces
         self._counts_losses = counts_losses
         self.leaving: tuple[Sequence[bytes], Sequence[bytes], float, int] | None = None
         self.loss = FrameLoss()
@@ -98,33 +102,35 @@ class SentFrames:
         if len(self._readers) > readers:
             self.keep(names)
         if again and readers > 1:
-            size = sum(map(len, frames[:again]))
-            samples = burst.samples(frames, 0, again) if self._counts_losses else ()
             for name in names:
-                self._paths.path(name, now_s).controller.pace.charge(size, now_s)
+                repairs = frames[:again]
+                if name in self._paces:
+                    repairs = [frame for frame in repairs if frame[PACE_AT] <= self._paces[name]]
+                samples = burst.samples(repairs, 0, len(repairs)) if self._counts_losses else ()
+                self._paths.path(name, now_s).controller.pace.charge(sum(map(len, repairs)), now_s)
                 if name in self._readers:
-                    self._readers[name].repairs += again
+                    self._readers[name].repairs += len(repairs)
                     self._readers[name].receipts.sent(samples, 0, is_repair=True)
             for frame in frames[:again]:
                 number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
                 if number in self._runs:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
-        if again:
-            self._add(frames[:again], names, now_s, is_repair=True)
-            frames = frames[again:]
-        if frames:
-            self._add(frames, names, now_s, is_repair=False)
+        for some, is_repair in ((frames[:again], True), (frames[again:], False)) if again else ((frames, False),):
+            for run in self._of_one_pace(some) if self._paces else (some,):
+                if run:
+                    self._add(run, names, now_s, is_repair=is_repair)
+        frames = frames[again:]
         if not readers or (frames and len(self._runs) > _MESSAGES_MAX):
             self._forget_places()
 
     def _add(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, *, is_repair: bool) -> None:
-        """Count frames that all leave for the first time, or all again."""
+        """Count frames that all leave for the first time, or all again, at one pace."""
         before, paths, count = self._count, self._paths, len(frames)
         samples = burst.samples(frames, 0, count) if self._counts_losses else ()  # striped ones would prove no order
         sizes: list[tuple[int, int]] = []
-        for at in range(0, count, _FLIGHT_FRAMES):
-            flight = frames[at : at + _FLIGHT_FRAMES]
+        for at in range(0, count, FLIGHT_FRAMES):
+            flight = frames[at : at + FLIGHT_FRAMES]
             sizes.append((sum(map(len, flight)), len(flight)))
         self._count += count
         self._note_places(frames, before + 1, is_repair=is_repair)
@@ -132,14 +138,25 @@ class SentFrames:
             path, reader, place = paths.path(name, now_s), self._readers.get(name), before
             if reader is None:
                 reader = self._readers[name] = _Reader(resolved=before)
+            if name in self._paces and frames[0][PACE_AT] > self._paces[name]:
+                reader.withheld.append((self._count, count))
+                continue
             if samples:
                 reader.receipts.sent(samples, before + 1, is_repair=is_repair)
-            for size, count in sizes:
-                record = path.sent(size, count, now_s)
-                place += count
+            for size, of_flight in sizes:
+                record = path.sent(size, of_flight, now_s)
+                place += of_flight
                 record.place, record.is_repair = place, is_repair
                 reader.flights.append(record)
                 paths.leaving.append(record)
+
+    def _of_one_pace(self, frames: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
+        """Yield runs of frames that state one pace."""
+        begin = 0
+        for end in range(1, len(frames) + 1):
+            if end == len(frames) or frames[end][PACE_AT] != frames[begin][PACE_AT]:
+                yield frames[begin:end]
+                begin = end
 
     def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
@@ -210,6 +227,8 @@ class SentFrames:
         while reader.flights and reader.flights[0].place <= place:
             confirmed.append(reader.flights.popleft())
             reader.resolved = confirmed[-1].place
+        while reader.withheld and reader.withheld[0][0] <= place:
+            reader.unseen += reader.withheld.popleft()[1]
         if has_begun:
             reader.unseen, reader.lost = (place - acknack.received) & _COUNT_MASK, 0
         held_s = None if is_repair else acknack.held_us / 1e6 + waited_s
@@ -220,7 +239,7 @@ class SentFrames:
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
-        frames = reader.resolved - before
+        frames = sum(flight.frames for flight in confirmed) if self._paces else reader.resolved - before
         judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost) if self._counts_losses else 0
         is_unproven = judged > new_lost
         if is_unproven and held_s is not None:

@@ -36,6 +36,7 @@ from gdp.intervals import NEVER_S, READER
 from gdp.limits import (
     NACKS_PER_REPORT,
     NUMBER_MAX,
+    PACE_MAX,
     REPLAY_WINDOW_MESSAGES,
     REPORT_DELAY_S,
     SEQUENCE_BYTES,
@@ -87,6 +88,7 @@ class WriterProxy:
         recovery: lost frames that parity has restored.
         schedule: when reports are due.
         second_path_s: when a frame of the publisher last came by a second path.
+        pace: that the publisher gave this reader, to be stated to its switch.
 
     Raises:
         StatementError: MALFORMED, the publisher's ``exchange`` is no key.
@@ -134,6 +136,8 @@ class WriterProxy:
         self.advertisement: Advertisement | None = None
         self.advertisement_sequence = 0
         self.second_path_s = float("-inf")
+        self.pace = PACE_MAX
+        self._paced_by = 0  # number of the Heartbeat that brought it
         if not introduces:
             self.state = WriterProxyState.LIVE
             self._set_reliable(_WAITING)
@@ -264,9 +268,12 @@ class WriterProxy:
         expected = self.delivery.expected
         part, sequence = self._data.progress(expected), self.delivery.sequence
         share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
+        flags = AckNackFlag.NONE
+        if self.pace < PACE_MAX:
+            flags, share = AckNackFlag.PACED, self.pace
         newest, newest_part, came_s = schedule.newest
         acknack = AckNack(
-            AckNackFlag.NONE, expected, part, missing or late, sequence, self.losses.total, share,
+            flags, expected, part, missing or late, sequence, self.losses.total, share,
             schedule.received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
             (self._data.frames - self.recovery.recovered) & FRAMES_MASK, schedule.receipts & RECEIPTS_MASK,
         )  # fmt: skip
@@ -399,6 +406,10 @@ class WriterProxy:
             self.state = WriterProxyState.LIVE
         if status.description and reassembled.number > self._described:
             self.description, self._described = status.description, reassembled.number
+        for reader, pace in status.paces:
+            if reader == self._reader.name and reassembled.number > self._paced_by:
+                self.pace, self._paced_by = pace, reassembled.number
+                self.delivery.is_thinned = pace < PACE_MAX
         self._sent = max(self._sent, (status.sent_number, status.sent_part))
         self.delivery.handle_heartbeat(status, now_s, is_newest=is_newest)
         self.schedule.due_s = now_s

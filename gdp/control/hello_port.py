@@ -16,6 +16,7 @@ from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_quality import LinkQuality
 from gdp.control.link_state import link_key
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.pace import ReaderPace
 from gdp.control.strangers import Strangers
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, StatementError
@@ -164,7 +165,7 @@ class HelloPort:
             sequence, before = self.ended[name, nonce]
             self.ended[name, nonce] = sequence, max(before, received)
 
-    def receive_join(self, join: Join | JoinRefresh, neighbour: Neighbour) -> None:
+    def receive_join(self, join: Join | JoinRefresh | ReaderPace, neighbour: Neighbour) -> None:
         """Note a verified join, leave or refresh of a neighbour.
 
         Raises:

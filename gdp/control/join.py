@@ -16,7 +16,7 @@ from gdp.crypto.schema import NAME, NAME_OR_ZERO, STATEMENT, Body, Keyed, many, 
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.intervals import LEASE_MAX_S
-from gdp.limits import FRAME_MAX_BYTES, PATHS_MAX
+from gdp.limits import FRAME_MAX_BYTES, PACE_MAX, PATHS_MAX
 from gdp.names import ZERO, Name
 
 __all__ = ["ROUTE_MAX", "Join", "Route", "RouteLink"]
@@ -58,6 +58,7 @@ class Join(Body):
         proof: the signed advertisement of the publisher, which states that it is at ``switch``; empty in a leave.
         path: 1, or 2 for the tree of second copies. Source: ``docs/explanation/two-paths.md``.
         route: what remains of the path that the reader's switch chose; empty: the receiver follows its own.
+        pace: the highest of the branches below; frames of a higher one are for faster readers.
     """
 
     TYPE = StatementType.JOIN
@@ -77,6 +78,7 @@ class Join(Body):
     proof: Annotated[bytes, Keyed("c", STATEMENT)] = b""
     path: Annotated[int, Keyed("a", uint(PATHS_MAX, 1))] = 1
     route: Annotated[Route, Keyed("r", many(_LINK, ROUTE_MAX))] = ()
+    pace: Annotated[int, Keyed("q", uint(PACE_MAX), PACE_MAX, is_omitted=True)] = PACE_MAX
 
     def check(self) -> None:
         """Return if the route has no loop. Raises ``StatementError``: MALFORMED, a switch stands twice."""

@@ -28,8 +28,8 @@ from gdp.frame.codec import (
     HOPS_AT,
     LENGTH_AT,
     NUMBER_AT,
+    PACE_AT,
     PART_AT,
-    PARTS_AT,
     Header,
     authenticated,
     encode,
@@ -118,7 +118,7 @@ class ControlSealer:
         length = NAME_BYTES + len(body) + TAG_BYTES
         header = self._header[:LENGTH_AT] + _LENGTH_AND_NUMBER.pack(length, number) + self._header[PART_AT:]
         additional = header[:HOPS_AT] + header[HOPS_AT + 1 :] + self._context
-        return header + self._topic + self._aead.encrypt(header[NUMBER_AT:PARTS_AT], body, additional)
+        return header + self._topic + self._aead.encrypt(header[NUMBER_AT:PACE_AT], body, additional)
 
 
 class ControlOpener:

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, INCARNATION_AT, NUMBER_AT, Header, encode
+from gdp.frame.codec import HEADER_BYTES, INCARNATION_AT, NUMBER_AT, PACE_AT, Header, encode
 from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
@@ -255,6 +255,11 @@ class Sealed(Sequence[bytes]):
         if end > len(self._frames):
             self._seal_until(end)
         return self._frames[at]
+
+    def set_pace(self, pace: int) -> None:
+        """Set the pace in the headers, before any frame is sealed."""
+        self._head = self._head[:PACE_AT] + bytes([pace]) + self._head[PACE_AT + 1 :]
+        self._running = None if self._signer is None else digest_of(self._head)
 
     @property
     def largest(self) -> int:

@@ -48,16 +48,18 @@ class ParitySealer:
         to = destination if address is None else address
         self._header = Header(int(Kind.PARITY), 0, HOPS_MAX, epoch, 0, 0, 0, 1, incarnation, to, source)
 
-    def seal(self, number: int, part: int, parts: int, flags: int, body: bytes) -> bytes:
+    def seal(self, number: int, part: int, parts: int, flags: int, body: bytes, pace: int = 0) -> bytes:
         """Return the frame of a body.
 
         Args:
             part: count of the message's parity frames before it.
             parts: of the message.
-            flags: of the message.
+            flags: of the message, as its ``pace``.
         """
         length = len(body) + TAG_BYTES
-        header = self._header._replace(flags=flags & ~_LAST, length=length, number=number, part=part, parts=parts)
+        header = self._header._replace(
+            flags=flags & ~_LAST, length=length, number=number, part=part, parts=parts, pace=pace
+        )
         head = encode(header)
         return head + self._aead.encrypt(_NONCE.pack(number, part), body, authenticated(head))
 

@@ -4,7 +4,7 @@ Sans-I/O; the only codec that a data path imports. ``gdp/frame/layers.py`` is th
 compare the two. Offsets count from the first byte after the EtherType (see ``spec.md``)::
 
     0 version  1 kind  2 flags  3 hops left, second path  4 key epoch (2)  6 payload length (2)  8 message number (8)
-    16 part (4)  20 parts (4)  24 incarnation (8)  32 destination (32)  64 source (32)  96 payload
+    16 part (4)  20 pace  21 parts (3)  24 incarnation (8)  32 destination (32)  64 source (32)  96 payload
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ __all__ = [
     "NUMBER_AND_PART",
     "NUMBER_AT",
     "OVERHEAD_BYTES",
+    "PACE_AT",
     "PARTS_AT",
+    "PARTS_MASK",
     "PART_AT",
     "SECOND_PATH",
     "SOURCE_AT",
@@ -55,7 +57,9 @@ HOPS_AT: Final = 3
 LENGTH_AT: Final = 6
 NUMBER_AT: Final = 8
 PART_AT: Final = 16
-PARTS_AT: Final = 20
+PACE_AT: Final = 20
+PARTS_AT: Final = 21
+PARTS_MASK: Final = (1 << 24) - 1  # of the four bytes from ``PACE_AT`` on
 INCARNATION_AT: Final = 24
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64
@@ -63,7 +67,9 @@ HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
 SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 
 NUMBER_AND_PART: Final = struct.Struct("!QI")  # at ``NUMBER_AT``
-_HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
+_HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")  # pace and parts as one number
+_LAYOUT: Final = "BBBBHHQIB3sQ32s32s"
+_PACE_SHIFT: Final = 24
 _BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 assert _HEADER.size == HEADER_BYTES
@@ -83,20 +89,24 @@ class Header(NamedTuple):
     incarnation: int
     destination: bytes
     source: bytes
+    pace: int = 0  # of the slowest branch that gets a copy
 
 
 def layout() -> dict[str, tuple[int, int]]:
     """Return offset and size in bytes of every header field; a test compares them with the Scapy layer."""
-    sizes = [struct.calcsize(f"!{each}") for each in re.findall("[0-9]*[A-Zs]", _HEADER.format)]
+    *fields, pace = Header._fields
+    fields.insert(fields.index("parts"), pace)
+    sizes = [struct.calcsize(f"!{each}") for each in re.findall("[0-9]*[A-Zs]", _LAYOUT)]
     return {
         name: (sum(sizes[:index]), size)
-        for index, (name, size) in enumerate(zip(("version", *Header._fields), sizes, strict=True))
+        for index, (name, size) in enumerate(zip(("version", *fields), sizes, strict=True))
     }
 
 
 def encode(header: Header) -> bytes:
     """Return the 96 bytes of a header (version 1)."""
-    return _HEADER.pack(VERSION, *header)
+    *before, parts, incarnation, destination, source, pace = header
+    return _HEADER.pack(VERSION, *before, pace << _PACE_SHIFT | parts, incarnation, destination, source)
 
 
 def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
@@ -110,13 +120,17 @@ def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
         raise FrameError(DropReason.TRUNCATED, "header")
     if frame[at] != VERSION:
         raise FrameError(DropReason.BAD_VERSION, str(frame[at]))
-    header = new_tuple(Header, _BEHIND_VERSION.unpack_from(frame, at))
-    _, _, _, _, length, _, part, parts, _, _, _ = header
+    fields = _BEHIND_VERSION.unpack_from(frame, at)
+    _, _, _, _, length, _, part, parts, _, _, _ = fields
+    pace = 0
+    if parts > PARTS_MASK:
+        pace, parts = parts >> _PACE_SHIFT, parts & PARTS_MASK
+        fields = *fields[:7], parts, *fields[8:]
     if size - HEADER_BYTES < length:
         raise FrameError(DropReason.TRUNCATED, "payload")
     if not part < parts <= PARTS_MAX:
         raise FrameError(DropReason.BAD_PARTS, f"{part} of {parts}")
-    return header
+    return new_tuple(Header, (*fields, pace))
 
 
 def authenticated(header: bytes) -> bytes:

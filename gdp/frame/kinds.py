@@ -46,6 +46,7 @@ class Kind(IntEnum):
     COOKIE = 0x8B
     REVOKED = 0x8C  # between neighbours: which revocations each keeps, and those that the other lacks
     JOIN_REFRESH = 0x8D  # to the neighbour: which joins stand, and back: which of them are unknown
+    PACE = 0x8E  # a reader to its switch: which messages of a publisher its branch gets
 
 
 class Flag(IntFlag):

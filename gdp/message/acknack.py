@@ -32,10 +32,10 @@ class AckNackFlag(IntFlag):
     NONE = 0
     NEW = 1  # it has not seen a Heartbeat: it requests its start
     BYE = 2  # it leaves
+    PACED = 4  # it has stated its pace to its switch
 
 
-_BYE: Final = int(AckNackFlag.BYE)
-_FLAGS: Final = tuple(map(AckNackFlag, range(_BYE + 1)))  # by value: to construct one takes longer
+_FLAGS: Final = {int(flag): flag for flag in AckNackFlag} | {0: AckNackFlag.NONE}  # to construct one takes longer
 
 
 class MissingRange(NamedTuple):
@@ -51,7 +51,7 @@ class AckNack(NamedTuple):
 
     Messages with sequence numbers before ``sequence`` were delivered, except ``lost`` of them. A report flagged NEW
     names what its reader had of this incarnation of the publisher before, and zeros if nothing. ``share`` is how much
-    of striped messages the second path is to carry, in 255ths.
+    of striped messages the second path is to carry, in 255ths; in a report flagged PACED it is the reader's pace.
 
     ``received`` counts the verified DATA frames of this incarnation, modulo 2^32; the newest of them was (newest,
     newest_part), which came ``held_us`` microseconds before this report left. The writer measures the path by them. In
@@ -92,7 +92,7 @@ class AckNack(NamedTuple):
         if size < _HEAD_BYTES:
             raise FrameError(DropReason.TRUNCATED, "report")
         flags, share, number, part, sequence, lost, *path, count = _HEAD.unpack_from(wire)
-        if count > NACKS_PER_REPORT or size != _HEAD_BYTES + count * _RANGE.size or flags > _BYE:
+        if count > NACKS_PER_REPORT or size != _HEAD_BYTES + count * _RANGE.size or flags not in _FLAGS:
             raise FrameError(DropReason.MALFORMED, "report")
         ranges: tuple[MissingRange, ...] = ()
         if count:

@@ -37,6 +37,7 @@ class LossReason(IntEnum):
     DETACHED = 10  # the route to the publisher was gone in between
     LIFESPAN = 11  # it could not leave its publisher in time, on a best-effort topic
     CALL_ENDED = 12  # a request whose call ended before it was complete here
+    THINNED = 13  # for faster readers: it is behind a link that does not carry every message
 
     @property
     def label(self) -> str:

@@ -24,7 +24,7 @@ from gdp import burst
 from gdp.burst.cipher import BODY_AT, Plaintext
 from gdp.crypto.envelope import SEAL_BYTES, SHARED_FLAGS, TAG_BYTES, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PART_AT, PARTS_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PACE_AT, PART_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
@@ -147,7 +147,7 @@ class Reassembler:
             return 0
         frame, head, first = arrivals[at].frame, message.head, message.top + 1
         if (
-            frame[NUMBER_AT:PARTS_AT] != head[NUMBER_AT:PART_AT] + first.to_bytes(4, "big")
+            frame[NUMBER_AT:PACE_AT] != head[NUMBER_AT:PART_AT] + first.to_bytes(4, "big")
             or frame[DESTINATION_AT:BODY_AT] != head[DESTINATION_AT:]
         ):
             return 0  # a frame of another message

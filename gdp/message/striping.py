@@ -14,13 +14,12 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.frame.codec import PARTS_AT, second_path_copy
+from gdp.frame.codec import INCARNATION_AT, PACE_AT, PART_AT, PARTS_AT, second_path_copy
 from gdp.limits import PATH_LAG_MAX_S, STRIPES_FROM_PARTS
 
 __all__ = ["SHARE_WHOLE", "StripedPaths", "Striper"]
 
 SHARE_WHOLE: Final = 255
-_PART_AT: Final = PARTS_AT - 4
 _START: Final = 0.5
 _KEPT: Final = 64  # messages under way whose paths are compared
 _STEP: Final = 0.25  # of the share, for a path that is idle during the whole message
@@ -136,5 +135,5 @@ class Striper:
 
 def _is_striped(frame: bytes) -> bool:
     """Return whether a frame takes one path alone."""
-    parts = int.from_bytes(frame[PARTS_AT : PARTS_AT + 4], "big")
-    return parts >= STRIPES_FROM_PARTS and frame[_PART_AT:PARTS_AT] != b"\0\0\0\0"
+    parts = int.from_bytes(frame[PARTS_AT:INCARNATION_AT], "big")
+    return parts >= STRIPES_FROM_PARTS and frame[PART_AT:PACE_AT] != b"\0\0\0\0"

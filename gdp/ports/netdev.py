@@ -28,7 +28,7 @@ from gdp.intervals import PACE_S, TICK_S
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
 from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, Keepalives, LinkCallback, Port, ReceivedFrame
 from gdp.ports.rtnetlink import Link, LinkMonitor
-from gdp.switch.table import Hops, Table
+from gdp.switch.table import Hops, Paces, Table
 
 __all__ = ["NetdevPlane", "NoDeviceError"]
 
@@ -57,6 +57,7 @@ class NetdevPlane(ABC):
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._entries: Mapping[bytes, Hops] | None = None if table is None else table.entries
         self._sides: Mapping[bytes, int] = {} if table is None else table.sides
+        self._paces: Mapping[bytes, Paces] = {} if table is None else table.paces
         self._ports: dict[int, Port] = {}
         self._mtus: dict[int, int] = {}  # of the ports that are up
         self._devices: dict[int, int] = {}  # ifindex of an open device -> port index

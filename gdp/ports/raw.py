@@ -277,7 +277,8 @@ class RawPlane(NetdevPlane):
             hops = entries.get(key)
             if hops is None:
                 hops = entries.get(key[:NAME_BYTES], NOWHERE)
-            if key and largest <= self._narrowest(hops) and (key not in sides or is_side(sides[key], port)):
+            is_from_side = key not in sides or is_side(sides[key], port)
+            if key and largest <= self._narrowest(hops) and is_from_side and key not in self._paces:
                 at = first * step + ETHER_BYTES + HOPS_AT
                 end = at + (count - 1) * step + 1
                 pool[at:end:step] = pool[at:end:step].translate(_ONE_LESS)
@@ -302,7 +303,7 @@ class RawPlane(NetdevPlane):
         """Decide on one frame in a slot with the reference, and act on the decision."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
-        decision = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
+        decision = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port, self._paces)
         if isinstance(decision, Drop):
             drops[decision.reason] += 1
         elif isinstance(decision, Forward):

@@ -121,7 +121,7 @@ class ScapyPlane(NetdevPlane):
         if self._entries is None:
             self._punt(index, frame)
             return
-        decision = decide(frame, self._entries, self._mtus, self._sides, index)
+        decision = decide(frame, self._entries, self._mtus, self._sides, index, self._paces)
         if isinstance(decision, Drop):
             counters.drops[decision.reason] += 1
         elif isinstance(decision, Forward):

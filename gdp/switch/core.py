@@ -152,6 +152,7 @@ class SwitchCore:
             Kind.JOIN: joins.handle_join,
             Kind.LEAVE: joins.handle_join,
             Kind.JOIN_REFRESH: joins.handle_refresh,
+            Kind.PACE: joins.handle_pace,
             Kind.REVOKE: self._revoker.receive_revocation,
             Kind.REVOKED: self._revoker.receive_sync,
             Kind.REDIRECT: self._locations.receive_redirect,

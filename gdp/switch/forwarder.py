@@ -11,7 +11,7 @@ sections 3 and 7. The order of the checks:
    drop, wrong side; an entry without hops: drop, no route. A copy for the second path has a key of its own, the
    destination with its last bit inverted; a miss is a drop, because the first copy travels anyway;
 5. one copy to every hop, or to its alternate while the hop's port is down; a copy to a port that is down, or whose link
-   is too narrow, is dropped alone.
+   is too narrow, is dropped alone, as is one whose hop has a lower pace than the frame.
 """
 
 from __future__ import annotations
@@ -28,20 +28,23 @@ from gdp.frame.codec import (
     HOPS_MASK,
     KIND_AT,
     OVERHEAD_BYTES,
+    PACE_AT,
     SECOND_PATH,
     second_path_key,
 )
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Kind
 from gdp.names import NAME_BYTES
-from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
+from gdp.switch.table import MACS_BYTES, Hop, Hops, Paces, is_side
 
 __all__ = ["PUNT", "Decision", "Drop", "Forward", "Punt", "decide", "rewrite"]
 
 _NO_SIDES: Final[Mapping[bytes, int]] = {}
+_NO_PACES: Final[Mapping[bytes, Paces]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 _KIND: Final = ETHER_BYTES + KIND_AT
 _HOPS: Final = ETHER_BYTES + HOPS_AT
 _LENGTH: Final = ETHER_BYTES + 6
+_PACE: Final = ETHER_BYTES + PACE_AT
 _DESTINATION: Final = ETHER_BYTES + DESTINATION_AT
 
 
@@ -72,6 +75,7 @@ def decide(
     mtus: Mapping[int, int],
     sides: Mapping[bytes, int] = _NO_SIDES,
     port: int = 0,
+    paces: Mapping[bytes, Paces] = _NO_PACES,
 ) -> Decision:
     """Return the decision for a frame. Any bytes get a decision; nothing is raised.
 
@@ -80,6 +84,7 @@ def decide(
         mtus: port index to MTU (bytes after the Ethernet header) of the ports that are up.
         sides: the table's masks of ports that frames may come from.
         port: index of the port that this frame came from.
+        paces: the table's paces of hops.
     """
     if len(frame) < OVERHEAD_BYTES:
         return Drop(DropReason.TRUNCATED)
@@ -108,13 +113,17 @@ def decide(
         return Drop(DropReason.WRONG_SIDE)
     if not hops:
         return Drop(DropReason.NO_ROUTE)
-    return _fit(hops, len(frame) - ETHER_BYTES, mtus)
+    thinned = 0
+    if key in paces:
+        fast = tuple(hop for hop, pace in zip(hops, paces[key], strict=True) if frame[_PACE] <= pace)
+        hops, thinned = fast, len(hops) - len(fast)
+    return _fit(hops, len(frame) - ETHER_BYTES, mtus, thinned)
 
 
-def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
+def _fit(hops: Hops, size: int, mtus: Mapping[int, int], thinned: int) -> Forward:
     """Return the hops whose link takes ``size`` bytes after the Ethernet header, and the reasons of the others."""
     good: list[Hop] = []
-    lost: list[DropReason] = []
+    lost = [DropReason.THINNED] * thinned
     for hop in hops:
         exit_: Hop = hop[:2]
         mtu = mtus.get(exit_[0])

@@ -11,6 +11,7 @@ from typing import Final
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
+from gdp.control.pace import ReaderPace
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
@@ -76,6 +77,19 @@ class JoinHandler:
             self._multicast.upstream.join_unknown(refresh, neighbour, now.mono_s)
         else:
             self._multicast.refresh(refresh, neighbour, now.mono_s)
+
+    def handle_pace(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
+        """Handle the pace of an attached reader.
+
+        Raises:
+            StatementError: as ``handle_join``.
+        """
+        pace = ReaderPace.from_fields(statement.expect(StatementType.PACE))
+        if statement.signer != neighbour.name or neighbour.role.is_switch:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a pace is from an attached reader")
+        self._check(neighbour, statement, now.mono_s, 1.0)
+        self._state.neighbours.ports[neighbour.port].receive_join(pace, neighbour)
+        self._multicast.set_pace(pace, neighbour)
 
     def _check(self, neighbour: Neighbour, statement: Statement, now_s: float, tokens: float) -> None:
         if not self._paces.spend(neighbour.name, now_s, tokens):

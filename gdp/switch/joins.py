@@ -72,7 +72,7 @@ class JoinSender:
         sessions = self._state.neighbours.sessions_with(at[0], name)
         if sessions is None:
             return None
-        return JoinTerms(sessions, tree.switch, tree.domain, tree.allowed, mtu, backup_for, route)
+        return JoinTerms(sessions, tree.switch, tree.domain, tree.allowed, mtu, backup_for, route, tree.pace)
 
     def send_join(self, tree: Tree, at: Downstream, name: Name, terms: JoinTerms | None, evidence: bytes) -> None:
         """Send a whole join to a neighbour; none to one that is not up."""
@@ -172,6 +172,7 @@ class JoinSender:
             proof=tree.proof if lease_s else b"",
             path=tree.path,
             route=terms.route,
+            pace=terms.pace,
         )
         return join.to_wire(self._state.me, self._state.identity.key)
 

@@ -25,10 +25,11 @@ from typing import Final
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
+from gdp.control.pace import ReaderPace
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, StatementError
 from gdp.intervals import JOIN, JOIN_PROOF
-from gdp.limits import TREES_MAX
+from gdp.limits import PACE_MAX, TREES_MAX
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.switch.forwarding_state import ForwardingState
@@ -104,11 +105,13 @@ class MulticastTrees:
             if location.sequence >= tree.version:
                 self.upstream.place_at(tree, *place)
                 tree.allowed = allowed
+            before = tree.branches.get(at)
             branch = Branch(
                 expires_s=reader.expires_s,
                 mtu=self._state.neighbours.mtu_of(at[0]),
                 evidence=reader.advertisement.wire,
                 wants_pair=reader.advertisement.paths > 1 and location.proof is not None and location.proof.paths > 1,
+                pace=PACE_MAX if before is None else before.pace,
             )
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1
@@ -198,6 +201,7 @@ class MulticastTrees:
             route=join.route,
             place=(join.switch, join.domain),
             proven_until_s=now_s + JOIN_PROOF.lease_s,
+            pace=join.pace,
         )
         branch.fit(self._state.neighbours.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
@@ -234,6 +238,15 @@ class MulticastTrees:
             self._entries.install(tree)
         if unknown:
             self._joins.send_unknown(at, neighbour.name, tuple(unknown))
+
+    def set_pace(self, pace: ReaderPace, neighbour: Neighbour) -> None:
+        """Set the pace of an attached reader's branch, and bring the highest pace upstream."""
+        tree = self.trees.get(pace.topic, pace.publisher)
+        branch = None if tree is None else tree.branches.get((neighbour.port, neighbour.mac))
+        if tree is not None and branch is not None and branch.pace != pace.pace:
+            branch.pace = pace.pace
+            self._entries.install(tree)
+            self.upstream.restate(tree)
 
     def path_counts(self) -> dict[str, int]:
         """Return how many flows to readers here want two paths, by what they have.

@@ -12,6 +12,8 @@ An entry may restrict the sides from which its frames come (reverse path forward
 ports, for the trees of topics. A frame from another side is dropped, so that no node downstream of a publisher can
 impersonate it.
 
+Each hop of such an entry may have a pace: frames that state a higher one are for faster branches.
+
 Leases are stored apart from the entries, so that the hot dictionary holds only what forwarding needs. A heap holds for
 every entry at least one item that is no later than the end of its lease. Renewing a lease leaves the item unchanged; it
 is corrected when it reaches the top. So no operation visits all entries, except a rebuild that as many changes have
@@ -27,7 +29,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
 from gdp.errors import LocalError
-from gdp.limits import TABLE_MAX
+from gdp.limits import PACE_MAX, TABLE_MAX
 from gdp.names import NAME_BYTES
 
 __all__ = [
@@ -39,6 +41,7 @@ __all__ = [
     "Hop",
     "Hops",
     "Observer",
+    "Paces",
     "ProtectedHop",
     "Table",
     "is_side",
@@ -50,6 +53,7 @@ MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the fr
 Hop = tuple[int, bytes]  # port index, the 12 bytes of addresses
 ProtectedHop = tuple[int, bytes, int, bytes]  # a hop, and its alternate
 Hops = tuple[Hop | ProtectedHop, ...]
+Paces = tuple[int, ...]  # of hops
 
 NOWHERE: Final[Hops] = ()
 EVERY_SIDE: Final = (1 << 64) - 1
@@ -80,13 +84,15 @@ class Table:
     Attributes:
         entries: key to hops. Data planes hold this very dictionary; it is never replaced.
         sides: key to the mask of ports that frames may come from; what is not in it may come from everywhere.
+        paces: key to the pace of each hop, in order; hops of what is not in it get every frame.
     """
 
-    __slots__ = ("_ends", "_heap", "_max", "_observer", "_shared", "entries", "sides")
+    __slots__ = ("_ends", "_heap", "_max", "_observer", "_shared", "entries", "paces", "sides")
 
     def __init__(self, max_entries: int = TABLE_MAX) -> None:
         self.entries: dict[bytes, Hops] = {}
         self.sides: dict[bytes, int] = {}
+        self.paces: dict[bytes, Paces] = {}
         self._ends: dict[bytes, float] = {}
         self._heap: list[tuple[float, bytes]] = []
         self._shared: dict[Hops, Hops] = {}
@@ -106,7 +112,7 @@ class Table:
         if observer is not None and self.entries:
             observer.put(self.entries)
 
-    def install(self, key: bytes, hops: Hops, expires_s: float, sides: int = EVERY_SIDE) -> bool:
+    def install(self, key: bytes, hops: Hops, expires_s: float, sides: int = EVERY_SIDE, paces: Paces = ()) -> bool:
         """Add or replace an entry and its lease; False when the table is full and the key is new.
 
         Args:
@@ -114,6 +120,7 @@ class Table:
             hops: where copies go; equal tuples are shared in memory. ``NOWHERE`` makes a negative entry.
             expires_s: end of the lease, on the monotonic clock of the caller.
             sides: mask of ports that frames may come from, as ``sides_of`` makes it.
+            paces: of the hops, in order; empty: each gets every frame.
 
         Raises:
             LocalError: a key or an address of another length.
@@ -125,12 +132,19 @@ class Table:
                 return False
             key = bytes(key)  # plain bytes: looked up faster than a subclass
         hops = self._share(hops)
-        is_news = self.entries.get(key) != hops or self.sides.get(key, EVERY_SIDE) != sides
+        if all(pace == PACE_MAX for pace in paces):
+            paces = ()
+        before = self.entries.get(key), self.sides.get(key, EVERY_SIDE), self.paces.get(key, ())
+        is_news = before != (hops, sides, paces)
         self.entries[key] = hops
         if sides != EVERY_SIDE:
             self.sides[bytes(key)] = sides
         else:
             self.sides.pop(key, None)
+        if paces:
+            self.paces[bytes(key)] = paces
+        else:
+            self.paces.pop(key, None)
         self._ends[key] = expires_s
         if known is None or expires_s < known:
             heapq.heappush(self._heap, (expires_s, key))
@@ -145,6 +159,7 @@ class Table:
             return False
         del self._ends[key]
         self.sides.pop(key, None)
+        self.paces.pop(key, None)
         self._rebuild_if_stale()
         if self._observer is not None:
             self._observer.remove((key,))
@@ -162,6 +177,7 @@ class Table:
             del self._ends[key]
             del self.entries[key]
             self.sides.pop(key, None)
+            self.paces.pop(key, None)
             gone.append(key)
         if self._observer is not None and gone:
             self._observer.remove(gone)

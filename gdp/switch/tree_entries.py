@@ -29,7 +29,7 @@ class TreeEntries:
         """Install the entry of a tree that has branches, with its backups."""
         tree.protection = self._protection(tree)
         hops = tree.hops(self._state.neighbours.own_macs())
-        if not self._state.table.install(tree.key, hops, tree.expires_s(), tree.sides):
+        if not self._state.table.install(tree.key, hops, tree.expires_s(), tree.sides, tree.paces(hops)):
             self.drops[DropReason.QUOTA] += 1
         if tree.path == 2:
             self._second.setdefault(tree.publisher, {})[tree.topic] = tree

@@ -20,9 +20,9 @@ from typing import NamedTuple
 from gdp.control.join import Route, RouteLink
 from gdp.due_queue import DueQueue
 from gdp.frame.codec import second_path_key
-from gdp.limits import FRAME_MAX_BYTES
+from gdp.limits import FRAME_MAX_BYTES, PACE_MAX
 from gdp.names import Name
-from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
+from gdp.switch.table import MACS_BYTES, Hop, Hops, Paces, ProtectedHop, sides_of
 
 __all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees", "owner_of"]
 
@@ -46,6 +46,7 @@ class Branch:
     wants_pair: bool = False  # a reader attached here for which this switch chooses the routes
     place: tuple[Name, Name] | None = None  # switch and domain of the publisher, as its last join named them
     proven_until_s: float = float("inf")  # no refresh prolongs it beyond
+    pace: int = PACE_MAX  # frames of a higher one are for faster branches
 
     @property
     def is_active(self) -> bool:
@@ -67,6 +68,7 @@ class JoinTerms(NamedTuple):
     mtu: int
     backup_for: Name
     route: Route
+    pace: int
 
 
 class SentJoin(NamedTuple):
@@ -141,6 +143,11 @@ class Tree:
         return min(branch.mtu for branch in self._wanted())
 
     @property
+    def pace(self) -> int:
+        """Return the highest pace downstream."""
+        return max((branch.pace for branch in self._wanted()), default=PACE_MAX)
+
+    @property
     def evidence(self) -> bytes:
         """Return the advertisement of the reader whose route it follows, or else whose branch has the longest lease."""
         if (guide := self.guide) is not None:
@@ -213,6 +220,10 @@ class Tree:
             else:
                 hops.append((*hop, backup[0], backup[1] + mac_of[backup[0]]))
         return tuple(hops)
+
+    def paces(self, hops: Hops) -> Paces:
+        """Return the pace of the branch of each hop."""
+        return tuple(self.branches[hop[0], hop[1][: MACS_BYTES // 2]].pace for hop in hops)
 
 
 class Trees:

@@ -19,6 +19,7 @@ from scapy.fields import (
     IntField,
     LongField,
     ShortField,
+    ThreeBytesField,
     XByteField,
     XLongField,
     XShortField,
@@ -50,7 +51,10 @@ __all__ = ["FIRST_LINE", "dissector", "prefix_of"]
 FIRST_LINE: Final = "-- Wireshark dissector of the Global Data Plane"
 _TEMPLATE: Final = "gdp.lua"
 _MARK: Final = "@tables@"
-_UINTS: Final = ((ByteField, "uint8"), (ShortField, "uint16"), (IntField, "uint32"), (LongField, "uint64"))
+_UINTS: Final = (
+    (ByteField, "uint8"), (ShortField, "uint16"), (ThreeBytesField, "uint24"), (IntField, "uint32"),
+    (LongField, "uint64"),
+)  # fmt: skip
 _HEX: Final = (XByteField, XShortField, XLongField)
 
 

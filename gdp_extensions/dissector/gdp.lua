@@ -6,7 +6,8 @@
 local proto = Proto("gdp", "Global Data Plane")
 
 local TYPES = {
-  uint8 = ProtoField.uint8, uint16 = ProtoField.uint16, uint32 = ProtoField.uint32, uint64 = ProtoField.uint64,
+  uint8 = ProtoField.uint8, uint16 = ProtoField.uint16, uint24 = ProtoField.uint24,
+  uint32 = ProtoField.uint32, uint64 = ProtoField.uint64,
 }
 
 local known = {} -- ProtoFields by their filter name
@@ -476,7 +477,7 @@ function proto.dissector(tvb, pinfo, root)
   end
   local version, kind = tvb(place.version, 1):uint(), tvb(place.kind, 1):uint()
   local flags, hops = tvb(place.flags, 1):uint(), tvb(place.hops_left, 1):uint()
-  local length, part, parts = tvb(place.length, 2):uint(), tvb(place.part, 4):uint(), tvb(place.parts, 4):uint()
+  local length, part, parts = tvb(place.length, 2):uint(), tvb(place.part, 4):uint(), tvb(place.parts, 3):uint()
   local number = tostring(tvb(place.number, 8):uint64())
   local source, destination = short_name(tvb, place.source), short_name(tvb, place.destination)
   local size = math.min(length, here - HEADER_BYTES)

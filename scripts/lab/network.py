@@ -305,7 +305,7 @@ class SimNetwork:
         node.came[end.port] += 1
         if node.table is not None:
             mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
-            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
+            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port, node.table.paces)
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
                 return _QUIET

@@ -4,10 +4,10 @@ Sans-I/O; numbers only. Numbers are in host byte order; names and addresses are 
 
     key      destination (32)  source, or zero for every source (32)
     entry    port, or GROUP or NOWHERE (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
-             group (4)  counter (4)  mask of the ports that its frames may come from (8)
+             group, or the pace of the one hop (4)  counter (4)  mask of the ports that its frames may come from (8)
     port     ifindex, 0 when it is down (4)  MTU (4)  flags (4)  unused (4)
     group    number of branches (4)  unused (4)
-             64 times: port (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
+             64 times: port (2)  pace (1)  unused (1)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
     count    frames (8)  bytes (8), on each CPU
     totals   drops by reason (8 each), the rest of ``Total`` (8 each), frames by side but the shared one (8 each), on
              each CPU
@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
+from itertools import repeat
 from typing import Final
 
 from gdp.errors import DROP_COUNTERS
+from gdp.limits import PACE_MAX
 from gdp.names import NAME_BYTES
-from gdp.switch.table import MACS_BYTES, SHARED_SIDE, Hops
+from gdp.switch.table import MACS_BYTES, SHARED_SIDE, Hops, Paces
 
 __all__ = [
     "BRANCHES_MAX",
@@ -40,6 +42,7 @@ __all__ = [
     "PORTS_MAX",
     "PORT_BYTES",
     "TOTALS_BYTES",
+    "BranchAt",
     "EntryAt",
     "PortAt",
     "PortFlag",
@@ -69,8 +72,16 @@ class EntryAt(IntEnum):
     MACS = 4
     ALTERNATE = 4 + MACS_BYTES  # port and addresses of the alternate
     GROUP = 2 * (4 + MACS_BYTES)
+    PACE = GROUP  # of an entry without a group
     COUNTER = GROUP + 4
     SIDES = COUNTER + INDEX_BYTES
+
+
+class BranchAt(IntEnum):
+    """Offsets in a branch, which is like the beginning of an entry."""
+
+    PORT = 0
+    PACE = 2
 
 
 class PortAt(IntEnum):
@@ -100,7 +111,7 @@ _HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}sI")
 _TAIL: Final = struct.Struct("=IQ")
 _PORT: Final = struct.Struct("=IIII")
 _GROUP_HEAD: Final = struct.Struct("=II")
-_BRANCH: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}s")
+_BRANCH: Final = struct.Struct(f"=HBx{MACS_BYTES}sI{MACS_BYTES}s")
 _NO_ALTERNATE: Final = (NOWHERE_PORT, bytes(MACS_BYTES))
 
 ENTRY_BYTES: Final = _HEAD.size + _TAIL.size
@@ -118,9 +129,9 @@ def entry_head(
     alternate_port: int = NOWHERE_PORT,
     alternate_macs: bytes = bytes(MACS_BYTES),
     *,
-    group: int = 0,
+    group: int = PACE_MAX,
 ) -> bytes:
-    """Return the bytes of an entry before its counter."""
+    """Return the bytes of an entry before its counter; ``group`` is the pace, where it has none."""
     return _HEAD.pack(port, macs, alternate_port, alternate_macs, group)
 
 
@@ -134,7 +145,10 @@ def port(ifindex: int, mtu: int, flags: int) -> bytes:
     return _PORT.pack(ifindex, mtu, flags, 0)
 
 
-def group(branches: Hops) -> bytes:
-    """Return a group of at most ``BRANCHES_MAX`` branches."""
-    body = b"".join(_BRANCH.pack(*branch, *(_NO_ALTERNATE if len(branch) == 2 else ())) for branch in branches)
+def group(branches: Hops, paces: Paces = ()) -> bytes:
+    """Return a group of at most ``BRANCHES_MAX`` branches, with their paces, where they have some."""
+    body = b"".join(
+        _BRANCH.pack(branch[0], pace, *branch[1:], *(_NO_ALTERNATE if len(branch) == 2 else ()))
+        for branch, pace in zip(branches, paces or repeat(PACE_MAX), strict=False)
+    )
     return (_GROUP_HEAD.pack(len(branches), 0) + body).ljust(GROUP_BYTES, b"\0")

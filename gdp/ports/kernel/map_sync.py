@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
+from gdp.limits import PACE_MAX
 from gdp.names import NAME_BYTES
 from gdp.ports.kernel.abi import (
     BRANCHES_MAX,
@@ -35,7 +36,7 @@ from gdp.ports.kernel.abi import (
 )
 from gdp.ports.kernel.maps import KernelMap
 from gdp.ports.kernel.syscall import BpfError
-from gdp.switch.table import EVERY_SIDE, Hops, Table
+from gdp.switch.table import EVERY_SIDE, Hops, Paces, Table
 
 __all__ = ["EntryCounts", "MapSync"]
 
@@ -48,7 +49,7 @@ _UNCOUNTED: Final = 0  # counter shared by all entries without one of their own
 @dataclass(slots=True)
 class _Group:
     number: int
-    hops: Hops
+    branches: tuple[Hops, Paces]
     users: int = 0
 
 
@@ -73,12 +74,13 @@ class MapSync:
     def __init__(self, table: Table | None, entries: KernelMap, groups: KernelMap, counts: KernelMap) -> None:
         self._table: Mapping[bytes, Hops] = {} if table is None else table.entries
         self._sides: Mapping[bytes, int] = {} if table is None else table.sides
+        self._paces: Mapping[bytes, Paces] = {} if table is None else table.paces
         self._entries, self._groups, self._counts = entries, groups, counts
         self._counter_of: dict[bytes, int] = {}  # by the table's key: entries in the kernel
         self._key_of: list[bytes] = [b""]  # by counter
         self._free_counters: deque[int] = deque()
         self._group_of: dict[bytes, _Group] = {}  # by key, of the entries that have a group
-        self._group_by: dict[Hops, _Group] = {}
+        self._group_by: dict[tuple[Hops, Paces], _Group] = {}
         self._free_groups: deque[int] = deque(range(groups.max_entries))
         self._waiting: dict[bytes, None] = {}  # entries that wait for space in the map
         self._unfit: set[bytes] = set()
@@ -105,10 +107,10 @@ class MapSync:
         for key, hops in items.items():
             if group_of and key in group_of:
                 left.append(group_of.pop(key))
-            head = headers.get(id(hops))
+            head = None if key in self._paces else headers.get(id(hops))
             if head is None:
                 head = self._head(key, hops)
-                if len(hops) < _GROUP_FROM:
+                if len(hops) < _GROUP_FROM and key not in self._paces:
                     headers[id(hops)] = head
             if self._is_ambiguous(key) or not head:
                 self._leave_out(key)
@@ -236,20 +238,22 @@ class MapSync:
             return b""
         if len(hops) >= _GROUP_FROM:
             return self._join_group(key, hops)
-        return entry_head(*hops[0]) if hops else entry_head(NOWHERE_PORT)
+        paces = self._paces.get(key, (PACE_MAX,))
+        return entry_head(*hops[0], group=paces[0]) if hops else entry_head(NOWHERE_PORT)
 
     def _join_group(self, key: bytes, hops: Hops) -> bytes:
-        known = self._group_by.get(hops)
+        branches = hops, self._paces.get(key, ())
+        known = self._group_by.get(branches)
         if known is None:
             if not self._free_groups:
                 return b""
-            known = _Group(self._free_groups.popleft(), hops)
+            known = _Group(self._free_groups.popleft(), branches)
             try:
-                self._groups.put(_index(known.number), group(hops))
+                self._groups.put(_index(known.number), group(*branches))
             except BpfError:
                 self._free_groups.append(known.number)
                 return b""
-            self._group_by[hops] = known
+            self._group_by[branches] = known
         known.users += 1
         self._group_of[key] = known
         return entry_head(GROUP, group=known.number)
@@ -257,6 +261,6 @@ class MapSync:
     def _leave_group(self, left: _Group) -> None:
         left.users -= 1
         if not left.users:
-            del self._group_by[left.hops]
+            del self._group_by[left.branches]
             self._groups.remove(_index(left.number))
             self._free_groups.append(left.number)

@@ -13,8 +13,8 @@ cases::
           no: up            yes: up             no: up                 no: up                     no: up
                                                       known -> another side's: drop | nowhere | one hop | a group
 
-While a hop's port is down, the program uses its alternate. One write into the map of ports takes a port down, however
-many entries name it.
+A hop whose pace is below the frame's gets no copy. While a hop's port is down, the program uses its alternate. One
+write into the map of ports takes a port down, however many entries name it.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from gdp.ports.kernel.abi import (
     GROUP_HEAD_BYTES,
     INDEX_BYTES,
     NOWHERE_PORT,
+    BranchAt,
     EntryAt,
     PortAt,
     PortFlag,
@@ -68,10 +69,12 @@ _CONGESTION_NOTED: Final = 2  # NET_XMIT_CN: sent, though the queue is getting f
 #     -72  index of a map (4)  unused (4)
 #     -80  pointer to the group (8)
 #     -88  ifindex of a branch (8)
+#     -96  pace of the frame (8)
 _KEY: Final = -2 * NAME_BYTES
 _INDEX: Final = _KEY - 8
 _GROUP: Final = _INDEX - 8
 _IFINDEX: Final = _GROUP - 8
+_PACE: Final = _IFINDEX - 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,6 +235,9 @@ class ForwarderProgram(Assembler):
 
     def _one_hop(self) -> None:
         """Forward to one hop. R2: the port; R4 points to the chosen port in the entry, then its addresses."""
+        self.load(Reg.R3, _FRAME, self._at["pace"], 1)
+        self.load(Reg.R4, _ENTRY, EntryAt.PACE, 4)
+        self.jump_if(Reg.R3, ">", Reg.R4, "thinned")
         self._find(self._maps.ports, Reg.R2)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.move(Reg.R4, _ENTRY)
@@ -269,14 +275,7 @@ class ForwarderProgram(Assembler):
 
     def _group(self) -> None:
         """Send a copy to every branch that can take it; after the first copy nothing may go up."""
-        self.label("group")
-        self.load(Reg.R2, _ENTRY, EntryAt.GROUP, 4)
-        self._find(self._maps.groups, Reg.R2)
-        self.jump_if(Reg.R0, "==", 0, "up")
-        self.store(Reg.R10, _GROUP, Reg.R0, 8)
-        self._one_hop_fewer()
-        self._count_taken()
-        self._count_entry("group")
+        self._begin_group()
         self.move(_TURN, 0)
         self.label("branch")
         self.jump_if(_TURN, ">=", BRANCHES_MAX, "drop")
@@ -286,7 +285,10 @@ class ForwarderProgram(Assembler):
         self.move(_BRANCH, _TURN)
         self.shift_left(_BRANCH, BRANCH_BYTES.bit_length() - 1)
         self.add(_BRANCH, Reg.R1)
-        self.load(Reg.R2, _BRANCH, GROUP_HEAD_BYTES, 4)
+        self.load(Reg.R2, _BRANCH, GROUP_HEAD_BYTES + BranchAt.PACE, 1)
+        self.load(Reg.R3, Reg.R10, _PACE, 8)
+        self.jump_if(Reg.R3, ">", Reg.R2, "branch thinned")
+        self.load(Reg.R2, _BRANCH, GROUP_HEAD_BYTES + BranchAt.PORT, 2)
         self._find(self._maps.ports, Reg.R2)
         self.jump_if(Reg.R0, "==", 0, "branch down")
         self.load(Reg.R2, Reg.R0, PortAt.IFINDEX, 4)
@@ -312,6 +314,7 @@ class ForwarderProgram(Assembler):
         self.add(_TURN, 1)
         self.jump("branch")
         for label, reason in (
+            ("branch thinned", DropReason.THINNED),
             ("branch down", DropReason.PORT_DOWN),
             ("branch too narrow", DropReason.TOO_BIG),
             ("branch full", DropReason.PORT_FULL),
@@ -319,6 +322,19 @@ class ForwarderProgram(Assembler):
             self.label(label)
             self._count(reason)
             self.jump("next branch")
+
+    def _begin_group(self) -> None:
+        """Find the group of an entry, and keep what the frame shows no longer once it was sent."""
+        self.label("group")
+        self.load(Reg.R2, _ENTRY, EntryAt.GROUP, 4)
+        self._find(self._maps.groups, Reg.R2)
+        self.jump_if(Reg.R0, "==", 0, "up")
+        self.store(Reg.R10, _GROUP, Reg.R0, 8)
+        self.load(Reg.R2, _FRAME, self._at["pace"], 1)
+        self.store(Reg.R10, _PACE, Reg.R2, 8)
+        self._one_hop_fewer()
+        self._count_taken()
+        self._count_entry("group")
 
     def _send_copy(self) -> None:
         """Write the branch's addresses into the frame and send a clone; R0: 0, or an error."""
@@ -336,6 +352,10 @@ class ForwarderProgram(Assembler):
         self.call(_CLONE_REDIRECT)
 
     def _ends(self) -> None:
+        self.label("thinned")
+        self._count_taken()
+        self._count(DropReason.THINNED)
+        self.jump("drop")
         self.label("nowhere")
         self._count_taken()
         self._count(DropReason.NO_ROUTE)

@@ -27,6 +27,7 @@ def headers(draw: st.DrawFn, length: int) -> Header:
         incarnation=draw(u64),
         destination=draw(names),
         source=draw(names),
+        pace=draw(u8),
     )
 
 

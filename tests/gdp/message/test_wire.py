@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gdp.errors import FrameError
 from gdp.limits import NACKS_PER_REPORT
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
-from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
+from gdp.message.heartbeat import PACES_MAX, STARTS_MAX, Heartbeat, StreamStart
 from gdp.message.loss import GONE_MAX, LossReason, LostRange
 from gdp.message.renumbering import MOVES_MAX, Renumbering
 from gdp.message.striping import SHARE_WHOLE
@@ -17,7 +17,7 @@ from gdp.message.striping import SHARE_WHOLE
 U64 = st.integers(0, (1 << 64) - 1)
 U32 = st.integers(0, (1 << 32) - 1)
 MISSING = st.lists(st.builds(MissingRange, U64, U32, U32), max_size=NACKS_PER_REPORT).map(tuple)
-FLAGS = st.sampled_from([AckNackFlag.NONE, AckNackFlag.NEW, AckNackFlag.BYE])
+FLAGS = st.sampled_from([*AckNackFlag, AckNackFlag.NONE])
 REPORTS = st.builds(
     AckNack, FLAGS, U64, U32, MISSING, U64, U64, st.integers(0, SHARE_WHOLE), U32, U64, U32, U32, U32, U64
 )
@@ -30,6 +30,7 @@ STARTS = st.dictionaries(
 )
 LOST = st.builds(lambda a, b, reason: LostRange(min(a, b), max(a, b), reason), U64, U64, st.sampled_from(LossReason))
 GONE = st.lists(LOST, max_size=GONE_MAX).map(tuple)
+PACES = st.dictionaries(st.binary(min_size=32, max_size=32), st.integers(0, 255), max_size=PACES_MAX)
 
 
 @given(REPORTS)
@@ -37,7 +38,7 @@ def test_a_report_comes_back_as_it_was(acknack: AckNack) -> None:
     assert AckNack.from_wire(acknack.to_wire()) == acknack
 
 
-@given(U64, U64, STARTS, st.binary(max_size=100), MOVES, GONE)
+@given(U64, U64, STARTS, st.binary(max_size=100), MOVES, GONE, PACES)
 def test_a_status_comes_back_as_it_was(
     one: int,
     other: int,
@@ -45,8 +46,10 @@ def test_a_status_comes_back_as_it_was(
     description: bytes,
     moves: tuple[Renumbering, ...],
     gone: tuple[LostRange, ...],
+    paces: dict[bytes, int],
 ) -> None:
-    status = Heartbeat(min(one, other), max(one, other), one % (1 << 32), starts, description, moves, one, other, gone)
+    ends = min(one, other), max(one, other), one % (1 << 32)
+    status = Heartbeat(*ends, starts, description, moves, one, other, gone, tuple(paces.items()))
     assert Heartbeat.from_wire(status.to_wire()) == status
 
 

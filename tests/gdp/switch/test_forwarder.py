@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from gdp.errors import DropReason
 from gdp.switch.forwarder import Drop, Forward, Punt, decide, rewrite
-from tests.fixtures_forwarding import CASES, ENTRIES, MTUS, ONE, TO_WIDE, Case, frame
+from tests.fixtures_forwarding import CASES, ENTRIES, MTUS, ONE, PACES, TO_WIDE, Case, frame
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_each_fixture_gets_its_decision(case: Case) -> None:
-    decision = decide(case.frame, ENTRIES, MTUS)
+    decision = decide(case.frame, ENTRIES, MTUS, paces=PACES)
     assert isinstance(decision, Punt) == case.punted
     if isinstance(decision, Drop):
         assert (decision.reason,) == case.drops

@@ -24,7 +24,7 @@ from gdp.ports.kernel.map_sync import MapSync
 from gdp.ports.kernel.program import DROP, REDIRECT, UP
 from gdp.ports.kernel.syscall import LoadRefusedError
 from gdp.switch.forwarder import Drop, Forward, Punt, decide, rewrite
-from gdp.switch.table import NOWHERE, Hops, Table, sides_of
+from gdp.switch.table import NOWHERE, Hops, Paces, Table, sides_of
 from tests.fixtures_forwarding import (
     ANYBODY,
     CASES,
@@ -61,13 +61,18 @@ class Step:
     copies: int
 
 
+def paces_of(entries: Mapping[bytes, Hops]) -> dict[bytes, Paces]:
+    """Return paces of the hops of entries for one source, as only trees have them."""
+    return {key: (100,) * len(entries[key]) for key in entries if key.endswith(SOURCE) and len(key) > len(SOURCE)}
+
+
 def forwards(loaded: LoadedProgram, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
     """Set the program's entries; ports have no device, because nothing is sent here."""
     table = Table()
     for port in range(UNKNOWN_PORT):
         loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
     for key in list(entries):
-        table.install(key, entries[key], 1.0)
+        table.install(key, entries[key], 1.0, paces=paces_of(entries).get(key, ()))
     table.observe(MapSync(table, *loaded.of_entries))
     return table
 
@@ -99,7 +104,7 @@ def step(loaded: LoadedProgram, given: bytes) -> Step:
 
 def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
     """Check that the program did the same as ``decide`` and ``rewrite``, or punted for a permitted reason."""
-    said = decide(given, entries, MTUS)
+    said = decide(given, entries, MTUS, paces=paces_of(entries))
     if done.retval == UP:
         reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
         assert isinstance(said, Punt) or reasons & LEFT_TO_PYTHON or destination_of(given) + bytes(32) in entries
@@ -176,6 +181,7 @@ def frames(draw: st.DrawFn) -> bytes:
         hops_left=draw(st.sampled_from([0, 1, 2, 64, 127, 128, 129, 130, 192, 255])),
         length=draw(st.none() | st.just(max(len(payload) + draw(NEAR), 0))),
         padding=bytes(draw(st.integers(0, 3))),
+        pace=draw(st.sampled_from([0, 99, 100, 101, 255])),
     )
     changes = draw(st.lists(st.tuples(st.integers(12, 20), st.integers(0, 255)), max_size=1))
     changed = bytearray(TO_US + whole[6:])
