@@ -12,8 +12,6 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-__all__ = ["PASS_MORE", "child_environment"]
-
 PASS_MORE: Final = "FOG_PASS_ENVIRONMENT"
 _NAMES: Final = (
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "LANGUAGE", "LC_*", "TZ", "TERM", "COLORTERM", "NO_COLOR"),

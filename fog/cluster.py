@@ -14,8 +14,6 @@ from fog.hardware import Hardware
 from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
 
-__all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest", "RobotNode"]
-
 
 @dataclass(frozen=True, slots=True)
 class CloudNode:

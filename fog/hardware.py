@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["Hardware", "Offer"]
-
 GPUS: Final = ("T4", "L4", "A10G", "V100", "A100", "H100", "K80", "P100", "P4", "L40S")
 _FORM: Final = "cpu:N, mem:GiB, a GPU such as T4, or gpu:T4:2; several with commas between"
 

@@ -11,8 +11,6 @@ from enum import Enum
 
 from fog.hardware import Offer
 
-__all__ = ["Machine", "MachineBundle", "MachineSpec", "MachineState", "Program"]
-
 
 class MachineState(Enum):
     """State of a machine."""

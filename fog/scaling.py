@@ -17,8 +17,6 @@ from typing import Final, NamedTuple, TypeAlias
 
 from gdp.errors import LocalError
 
-__all__ = ["Autoscaler", "CallCounts", "ScaleWindow", "ScalingPolicy", "policy_from_keys"]
-
 MACHINES_MAX: Final = 1_000
 WINDOW_S: Final = 30.0  # over which load is measured
 _DOWN_S: Final = 300.0  # the highest recommendation of so long holds

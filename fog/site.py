@@ -48,9 +48,6 @@ from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.ownership import refuse_foreign_folder
 
-__all__ = ["SCRATCH", "ProviderName", "Site", "SiteConfig", "open_site", "peek_site", "save_topology", "state_folder"]
-__all__ += ["topology_now", "with_gateway"]
-
 ProviderName = Literal["local", "aws", "skypilot"]
 
 _ID_BYTES: Final = 3

@@ -23,8 +23,6 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from gdp.config.schema import Section, Unique
 
-__all__ = ["AUTOMATIC", "AUTOMATIC_REPLICA", "Gateway", "Topology"]
-
 _LABEL: Final = r"^[a-z0-9][a-z0-9-]{0,10}$"  # ``to-LABEL`` is the name of a device
 _GATEWAYS_MAX: Final = 64
 _AUTOMATIC_LABEL: Final = "gateway"

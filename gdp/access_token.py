@@ -9,8 +9,6 @@ import secrets
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["is_access_token", "new_access_token", "query_token"]
-
 _TOKEN_BYTES: Final = 24
 
 

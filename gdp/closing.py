@@ -9,8 +9,6 @@ from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import TypeVar
 
-__all__ = ["ClosedOnExit"]
-
 _C = TypeVar("_C")
 
 

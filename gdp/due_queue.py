@@ -14,8 +14,6 @@ from typing import Any, Final, Generic, TypeVar
 
 from gdp.intervals import NEVER_S
 
-__all__ = ["DueQueue", "earliest"]
-
 _SLACK: Final = 64  # void entries that are not yet worth a rebuild
 
 K = TypeVar("K")

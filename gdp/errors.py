@@ -10,19 +10,6 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-__all__ = [
-    "DROP_COUNTERS",
-    "ConfigError",
-    "DropReason",
-    "EnvelopeError",
-    "FrameError",
-    "GdpError",
-    "LocalError",
-    "RemoteError",
-    "StatementError",
-    "StoreError",
-]
-
 
 class DropReason(IntEnum):
     """Reason why a frame, a message or a statement was dropped.

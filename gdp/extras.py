@@ -19,8 +19,6 @@ from gdp.errors import LocalError
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-__all__ = ["MissingExtraError", "Seam", "find_entry_point", "install_command", "require_extra"]
-
 T = TypeVar("T")
 
 _ROOT: Final = Path(__file__).resolve().parents[1]

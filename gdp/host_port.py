@@ -6,8 +6,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["PORT_MAX", "checked_host_port", "split_host_port"]
-
 PORT_MAX: Final = 65_535
 _TEXT_MAX: Final = 128
 

@@ -24,8 +24,6 @@ from gdp.token_bucket import TokenBucket
 if TYPE_CHECKING:
     import ssl  # most nodes serve without TLS
 
-__all__ = ["Answer", "HttpServer"]
-
 log = logging.getLogger(__name__)
 
 _READ_BYTES: Final = 8 * 1024

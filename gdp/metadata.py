@@ -14,8 +14,6 @@ import cbor2
 from gdp.errors import LocalError
 from gdp.names import Name, name_of
 
-__all__ = ["KINDS", "SALT", "Metadata", "hidden"]
-
 KINDS: Final = frozenset({"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "enrolment"})
 SALT: Final = "salt"  # key of the unguessable part
 _VALUE_MAX_CHARS: Final = 4_096

@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["NAME_BYTES", "OWNER_KEY_BYTES", "ZERO", "Name", "name_of"]
-
 NAME_BYTES: Final = 32
 OWNER_KEY_BYTES: Final = 33  # a compressed P-256 point; SEC 1, section 2.3.3
 _PREFIX: Final = b"gdp-name-1"

@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 from typing import Final
 
-__all__ = ["escaped", "printable"]
-
 _CHARS_MAX: Final = 300
 _LAYOUT: Final = "\n\t"
 

@@ -18,8 +18,6 @@ from typing import Final, Generic, TypeVar
 
 from gdp.due_queue import DueQueue
 
-__all__ = ["Backoff", "Requests"]
-
 _GROWING_MAX: Final = 64  # 2**63 times the first pause is above every bound
 
 K = TypeVar("K")

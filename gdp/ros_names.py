@@ -13,24 +13,6 @@ import functools
 import re
 from typing import Final, Literal, TypeAlias
 
-__all__ = [
-    "ACTION_INFIX",
-    "NAME_FORM",
-    "NAME_MAX_CHARS",
-    "PATTERN_FORM",
-    "PREFIX_FORM",
-    "TYPE_FORMS",
-    "Kind",
-    "covers",
-    "fits_kind",
-    "is_name",
-    "is_of_every_node",
-    "is_pattern",
-    "leaves_out",
-    "matches",
-    "resolved",
-]
-
 Kind: TypeAlias = Literal["topic", "service", "action"]
 
 ACTION_INFIX: Final = "/_action/"  # between an action's name and its parts; ROS 2 design article on actions

@@ -9,18 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
-__all__ = [
-    "BROADCAST",
-    "KeepaliveOffer",
-    "KeepaliveRun",
-    "NodeCore",
-    "OutgoingFrames",
-    "ProtocolCore",
-    "ReceivedFrame",
-    "Timestamps",
-    "new_tuple",
-]
-
 BROADCAST: Final = b"\xff" * 6
 new_tuple: Final = tuple.__new__  # of a named tuple: one call, where its constructor is two and ``_make`` three
 

@@ -11,8 +11,6 @@ from collections.abc import Callable, Hashable, Mapping
 from itertools import count
 from typing import TypeVar
 
-__all__ = ["add_edge", "shortest_paths"]
-
 N = TypeVar("N", bound=Hashable)
 
 

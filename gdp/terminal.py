@@ -9,8 +9,6 @@ import sys
 
 from gdp.printable import escaped
 
-__all__ = ["echo", "for_stdout"]
-
 
 def echo(text: str = "", *, err: bool = False) -> None:
     """Print text and a line feed, and flush it; ``err``: to standard error."""

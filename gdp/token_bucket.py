@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-__all__ = ["TokenBucket", "TokenBuckets"]
-
 
 class TokenBucket:
     """Tokens that refill at a rate, up to a burst; it starts full."""

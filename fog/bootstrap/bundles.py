@@ -30,9 +30,6 @@ from gdp.intervals import ADVERTISEMENT
 from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["PROXY", "SWITCH", "RobotDevices", "gateway_boot", "machine_boot", "machine_label"]
-__all__ += ["node_names", "robot_boot", "robot_rule"]
-
 PROXY: Final = "proxy"
 SWITCH: Final = "switch"
 # Fast DDS 3 and later, and earlier versions

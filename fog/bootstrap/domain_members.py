@@ -18,8 +18,6 @@ from gdp.enrolment.removal import remove_machine
 from gdp.trust.join_token import JoinRole, JoinToken
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["DomainMembers"]
-
 
 class DomainMembers:
     """Members of the domain with these files on this host.

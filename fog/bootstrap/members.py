@@ -19,8 +19,6 @@ from gdp.stores.issue import delegate, make_node
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
 from gdp.trust.right import Right
 
-__all__ = ["Authority", "metadata_of", "right_of"]
-
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
 _CALLS: Final = (Right.SERVE, Right.CALL)
 

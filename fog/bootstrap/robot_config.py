@@ -27,8 +27,6 @@ from gdp.stores.keyring import load_public_key
 from proxy.config import matching
 from proxy.config.config import ProxyConfig
 
-__all__ = ["add_rules", "control_socket_of", "reload", "reload_proxy", "remove_rules"]
-
 log = logging.getLogger(__name__)
 
 _HEAD: Final = "# Rules of cluster {cluster}; fog writes this file, and removes it with the cluster.\nimport:\n"

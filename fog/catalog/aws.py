@@ -14,8 +14,6 @@ from importlib import resources
 
 from fog.hardware import Hardware, Offer
 
-__all__ = ["AwsPrices", "aws_offers", "aws_prices"]
-
 
 @dataclass(frozen=True, slots=True)
 class AwsPrices:

@@ -11,8 +11,6 @@ from typing import Final
 
 from fog.hardware import GPUS, Hardware, Offer
 
-__all__ = ["LOCAL_REGIONS", "local_offers"]
-
 LOCAL_REGIONS: Final = ("local-a", "local-b", "local-c", "local-d")
 
 _TYPES: Final = {

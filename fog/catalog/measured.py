@@ -11,8 +11,6 @@ from importlib import resources
 
 from fog.plan.evidence import Measured, Pair
 
-__all__ = ["measured"]
-
 
 @functools.cache
 def measured() -> Measured:

@@ -12,8 +12,6 @@ from fog.catalog.local import LOCAL_REGIONS, local_offers
 from fog.hardware import Hardware, Offer
 from gdp.errors import LocalError
 
-__all__ = ["PROVIDERS", "price_list", "regions_of"]
-
 PROVIDERS = ("local", "aws")
 
 

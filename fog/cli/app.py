@@ -16,9 +16,6 @@ from fog.site import open_site
 from gdp.cli.program import Program
 from gdp.cli.version import Version
 
-__all__ = ["app", "main"]
-
-
 app = Program("fog", help="Replicated ROS services on machines that may be taken away.", no_args_is_help=True)
 main = app.run
 

@@ -26,8 +26,6 @@ from gdp.errors import LocalError, StoreError
 from gdp.intervals import LOOK_S, STOP_S
 from gdp.terminal import echo
 
-__all__ = ["clear", "down", "end_cluster"]
-
 _PATIENCE_S: Final = 20.0  # time for the supervisor; afterwards this process releases the machines
 _TRIES: Final = 5
 

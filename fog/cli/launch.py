@@ -35,8 +35,6 @@ from gdp.intervals import LOOK_S
 from gdp.stores.keyring import load_salt
 from gdp.terminal import echo
 
-__all__ = ["WAIT_S", "GatewayKind", "begin", "follow", "launch"]
-
 log = logging.getLogger(__name__)
 
 WAIT_S: Final = 600.0  # for the replicas, unless another time is given

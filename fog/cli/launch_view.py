@@ -29,8 +29,6 @@ from fog.topology import Gateway
 from gdp.cli.console import console
 from gdp.terminal import echo
 
-__all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
-
 BY_HAND: Final = "by fog down"
 
 

@@ -25,8 +25,6 @@ from gdp.errors import LocalError
 from gdp.intervals import WATCH_S
 from gdp.terminal import echo
 
-__all__ = ["logs", "new_lines"]
-
 _LINES: Final = 50
 _WINDOW: Final = 2_000  # lines in which a poll looks for those that it knows
 _SUPERVISOR: Final = "supervisor"

@@ -21,8 +21,6 @@ from fog.plan.target import Target, machines_for
 from fog.providers.provider import Provider
 from gdp.errors import GdpError, LocalError
 
-__all__ = ["Market", "choices", "in_regions", "market", "reached", "refusal"]
-
 _MISSPELLED: Final = 0.9  # of the letters are the same; me-central-1 is not eu-central-1
 
 

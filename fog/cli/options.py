@@ -19,18 +19,6 @@ from fog.supervisor.journal import Cluster, Journal
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
-__all__ = [
-    "AsJson",
-    "ClusterName",
-    "ClusterOption",
-    "SiteFile",
-    "State",
-    "machine_of",
-    "opened",
-    "peeked",
-    "the_cluster",
-]
-
 SiteFile = Annotated[
     Path | None,
     typer.Option("--site", metavar="FILE", help="fog.yaml; without it the one in this folder, else a site of its own"),

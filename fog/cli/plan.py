@@ -29,8 +29,6 @@ from gdp.errors import LocalError
 from gdp.intervals import DAY_S
 from gdp.terminal import echo
 
-__all__ = ["cost_table", "plan"]
-
 _MOST_ROWS = 15
 
 Target = Annotated[float, typer.Option(help="largest share of time without any replica, such as 0.0005")]

@@ -23,8 +23,6 @@ from gdp.terminal import echo
 if TYPE_CHECKING:
     from fog.cluster import RobotNode
 
-__all__ = ["INTERRUPTED", "Started", "resolved", "run"]
-
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
 Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"

@@ -24,8 +24,6 @@ from gdp.cli.node import Logs, running
 from gdp.errors import LocalError
 from gdp.terminal import echo
 
-__all__ = ["push", "scale", "ssh", "supervise"]
-
 _LINES: Final = 50
 
 scale = typer.Typer(no_args_is_help=True, help="Add or take away replicas while all runs.")

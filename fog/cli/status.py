@@ -36,8 +36,6 @@ from gdp.cli.console import Columns, console
 from gdp.intervals import WATCH_S
 from gdp.terminal import echo
 
-__all__ = ["cost", "ls", "status"]
-
 _EVENTS: Final = 20
 _LATEST: Final = 6
 _FLEETING: Final = {"age_s", "usd", "usd_ever"}

@@ -16,8 +16,6 @@ from fog.software.wheels import DEBIAN_12, Platform, wheels
 from gdp.cli.node import failing_clearly
 from gdp.terminal import echo
 
-__all__ = ["wheels_command"]
-
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="where the wheels are written; `software.wheels`")]
 Sources = Annotated[
     list[str] | None,

@@ -25,8 +25,6 @@ from fog.machine import MachineState
 from gdp.errors import LocalError
 from gdp.intervals import DRAIN_S
 
-__all__ = ["DRAINS", "MachineAgent"]
-
 log = logging.getLogger(__name__)
 
 DRAINS: Final = "proxy"  # the program that tracks calls in progress

@@ -10,8 +10,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-__all__ = ["BoundedLog", "last_lines"]
-
 _HALF_BYTES: Final = 2 << 20
 
 

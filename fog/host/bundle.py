@@ -15,8 +15,6 @@ from fog.machine import MachineBundle, Program
 from gdp.errors import LocalError
 from gdp.stores.files import private, write_all
 
-__all__ = ["BOOT_FILE", "JOIN_FILE", "MEMBER_FOLDER", "install", "pack", "read_programs", "unpack"]
-
 BOOT_FILE: Final = "boot.json"
 JOIN_FILE: Final = "join.json"  # token and label, until the machine has joined
 MEMBER_FOLDER: Final = "member"  # keys and, of a rented machine, what else `gdp join` makes

@@ -19,8 +19,6 @@ from fog.host.bundle import JOIN_FILE
 from gdp.cli.node import Logs, report, running
 from gdp.cli.program import Program
 
-__all__ = ["main"]
-
 log = logging.getLogger(__name__)
 
 app = Program("fog-machine")

@@ -21,8 +21,6 @@ from gdp.errors import LocalError
 from gdp.stores.files import read_private
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["JOIN_DEADLINE_S", "join", "join_file"]
-
 log = logging.getLogger(__name__)
 
 # a cloud machine must boot an image and install packages; the token has expired by then

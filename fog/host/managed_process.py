@@ -22,8 +22,6 @@ from fog.child_environment import child_environment
 from fog.host.bounded_log import BoundedLog
 from fog.machine import Program
 
-__all__ = ["NODE_USER", "ManagedProcess"]
-
 NODE_USER: Final = "FOG_NODE_USER"  # environment variable with the user for nodes; default: the user of the agent
 
 _READ_BYTES: Final = 1 << 16

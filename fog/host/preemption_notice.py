@@ -10,8 +10,6 @@ import math
 from pathlib import Path
 from typing import Final
 
-__all__ = ["NOTICE_FILE", "given_unix_s", "read_notice", "write_notice"]
-
 NOTICE_FILE: Final = "notice.json"
 
 

@@ -19,8 +19,6 @@ from fog.machine import Program
 from gdp.intervals import STEADY_S
 from gdp.requests import Backoff
 
-__all__ = ["ProgramSupervisor"]
-
 log = logging.getLogger(__name__)
 
 RESTARTS: Final = Backoff(0.1, 10.0)

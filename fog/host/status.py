@@ -14,8 +14,6 @@ from typing import Final
 
 from fog.machine import MachineState
 
-__all__ = ["STATUS_FILE", "ProgramStatus", "Status"]
-
 STATUS_FILE: Final = "status.json"
 
 

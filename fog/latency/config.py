@@ -23,8 +23,6 @@ from pydantic import AfterValidator, Field
 
 from gdp.config.schema import Section
 
-__all__ = ["LatencyConfig", "ProbeEndpoint"]
-
 _FORM: Final = re.compile(r"(?:(tcp|udp)://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._{}-]+):(\d{1,5})")
 _EVERY: Final = "*"
 _AWS: Final = {_EVERY: "ec2.{region}.amazonaws.com:443"}  # every region's public endpoint

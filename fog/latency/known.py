@@ -20,8 +20,6 @@ from fog.plan.duration import duration_text
 from gdp.errors import StoreError
 from gdp.intervals import CACHE_S
 
-__all__ = ["NO_ENDPOINT", "Latencies", "Latency"]
-
 log = logging.getLogger(__name__)
 
 _FILE: Final = "latency.json"

@@ -15,8 +15,6 @@ from typing import Final
 
 from fog.latency.config import ProbeEndpoint
 
-__all__ = ["TRIES", "Probed", "probe", "probe_all"]
-
 TRIES: Final = 5
 _AT_ONCE_MAX: Final = 16
 _NONCE_BYTES: Final = 16

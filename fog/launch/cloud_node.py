@@ -16,8 +16,6 @@ from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, re
 from gdp.errors import LocalError
 from gdp.stores.files import read_at_most
 
-__all__ = ["cloud_node", "parameter_rule", "parameters_in"]
-
 _TUPLE: Final = "!!python/tuple"
 
 

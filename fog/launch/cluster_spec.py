@@ -18,8 +18,6 @@ from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
 from gdp.ros_names import Kind
 
-__all__ = ["ClusterKeywords", "ClusterSpec"]
-
 _NAME: Final = "[a-z0-9][a-z0-9-]{0,31}"
 
 

@@ -12,16 +12,6 @@ from typing import Literal, TypeAlias
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "DeclareLaunchArgument",
-    "LaunchConfiguration",
-    "LaunchDescription",
-    "Node",
-    "Parameters",
-    "Text",
-    "written",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class LaunchConfiguration:

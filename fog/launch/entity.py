@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from fog.launch.cluster_spec import ClusterKeywords, ClusterSpec
 from fog.launch.unreturned import record
 
-__all__ = ["FogCluster"]
-
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class FogCluster(ClusterKeywords):

@@ -23,8 +23,6 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 from gdp.terminal import echo
 
-__all__ = ["cache_file", "free_domain", "kept", "offered"]
-
 Found = tuple[tuple[str, str, str], ...]
 
 # the ports of lower domains are in Linux's ephemeral range; ROS 2, "The ROS_DOMAIN_ID"

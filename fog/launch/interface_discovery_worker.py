@@ -27,8 +27,6 @@ from proxy.bridge.core.action_interface import action_of, is_part
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.endpoints.ros2 import Ros2Endpoint
 
-__all__ = ["main", "offers"]
-
 PATIENCE_S: Final = 30.0
 QUIET_S: Final = 2.0  # after the last change; a node rarely takes longer between two of its services
 _LINES: Final = 8

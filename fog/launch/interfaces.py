@@ -13,8 +13,6 @@ from gdp.errors import LocalError
 from gdp.ros_names import Kind, fits_kind, is_name
 from gdp.service.replication import Mode, Replication
 
-__all__ = ["Offered", "SomeReplication", "carried", "replication_rule"]
-
 Offered: TypeAlias = Mapping[str, str | Mapping[str, object]]
 SomeReplication: TypeAlias = Replication | str | Mapping[str, object]
 

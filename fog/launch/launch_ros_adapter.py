@@ -20,8 +20,6 @@ from fog.cluster import CloudNode
 from fog.launch.cloud_node import parameter_rule, parameters_in
 from gdp.errors import LocalError
 
-__all__ = ["cloud_node"]
-
 _MADE: Final = "launch_params_"  # prefix of files that launch_ros creates for maps of parameters and does not delete
 
 

@@ -11,8 +11,6 @@ import importlib.util
 from pathlib import Path
 from typing import Final
 
-__all__ = ["WORDS", "has_ros_launch", "word"]
-
 _OWN: Final = {"CloudMachine": "fog.launch.machines", "SpotMachine": "fog.launch.machines"}
 _EITHER: Final = {  # name -> location in ``fog``, location in ROS 2
     "DeclareLaunchArgument": ("fog.launch.description", "launch.actions"),

@@ -26,8 +26,6 @@ from fog.launch.lazy_names import has_ros_launch
 from fog.launch.unreturned import watch
 from gdp.errors import ConfigError, GdpError, LocalError
 
-__all__ = ["Loaded", "Probe", "key_values", "load"]
-
 Probe: TypeAlias = Callable[[Sequence[CloudNode]], Sequence[tuple[str, str, str]]]
 
 _ENTRY: Final = "generate_launch_description"

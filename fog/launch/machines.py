@@ -15,8 +15,6 @@ from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 
-__all__ = ["REPLICAS", "CloudMachine", "SpotMachine", "filled"]
-
 REPLICAS: Final = 2
 
 

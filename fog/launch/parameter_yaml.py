@@ -14,8 +14,6 @@ import yaml
 from gdp.config.yaml_source import LOADER
 from gdp.errors import LocalError
 
-__all__ = ["BYTES_MAX", "DEPTH_MAX", "read_parameters"]
-
 BYTES_MAX: Final = 1 << 20
 DEPTH_MAX: Final = 32
 _TUPLE: Final = "tag:yaml.org,2002:python/tuple"

@@ -17,8 +17,6 @@ from typing import Final
 from fog.cluster import CloudNode
 from gdp.errors import LocalError
 
-__all__ = ["PYTHON", "command_line", "deferred", "file_of"]
-
 PYTHON: Final = "{python}"  # the machine's Python, see fog.machine.Program
 
 

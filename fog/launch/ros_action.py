@@ -33,8 +33,6 @@ from fog.launch.unreturned import watch_ros_launch
 from gdp.errors import GdpError, LocalError
 from gdp.host.run_registry import Run, RunRegistry
 
-__all__ = ["FogCluster"]
-
 log = logging.getLogger(__name__)
 
 FOG: Final = (sys.executable, "-m", "fog.cli.app")

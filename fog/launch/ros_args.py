@@ -14,8 +14,6 @@ from typing import Final, TypeAlias
 
 from gdp.errors import LocalError
 
-__all__ = ["named", "parameters_of_file", "parameters_of_map", "remapped"]
-
 _PARAMETERS: Final = "ros__parameters"
 _INT_MIN, _INT_MAX = -(1 << 63), (1 << 63) - 1
 _Section: TypeAlias = tuple[Sequence[str], Mapping[str, object]]

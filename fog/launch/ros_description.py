@@ -19,8 +19,6 @@ from fog.launch.launch_ros_adapter import cloud_node
 from fog.launch.ros_action import FogCluster
 from gdp.errors import LocalError
 
-__all__ = ["gathered"]
-
 
 def gathered(
     description: object, arguments: Mapping[str, str]

@@ -18,8 +18,6 @@ from fog.cluster import CloudNode
 from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
 
-__all__ = ["Node"]
-
 
 class Node(launch_ros.actions.Node):  # type: ignore[misc]  # launch_ros has no types
     """ROS node; see ``launch_ros.actions.Node``.

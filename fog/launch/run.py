@@ -12,8 +12,6 @@ from fog.cluster import CloudNode
 from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Replace this process with the node; exit with status 2 if it is not found."""

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["StartGate", "main"]
-
 _SERVING: Final = "serving"
 
 

@@ -21,8 +21,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["LaunchFile", "adopt", "record", "watch", "watch_ros_launch"]
-
 _ENTRY: Final = "generate_launch_description"
 _MADE: Final = "__fog_clusters__"
 _LOADER: Final = "launch.launch_description_sources.python_launch_file_utilities"

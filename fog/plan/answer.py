@@ -18,8 +18,6 @@ from fog.plan.failure import chance_down, joint
 from fog.plan.mix import Kind
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool, Standing, pool_for
 
-__all__ = ["Answer", "Question", "answer", "assumptions"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Question:

@@ -15,8 +15,6 @@ from fog.cluster import MachineRequest
 from fog.hardware import Hardware, Offer
 from gdp.errors import LocalError
 
-__all__ = ["BY_BOTH", "Choice", "Weights", "choose"]
-
 
 @dataclass(frozen=True, slots=True)
 class Weights:

@@ -16,8 +16,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from fog.plan.failure import joint, replicas_needed
 from gdp.errors import LocalError
 
-__all__ = ["joint_in_one_region", "joint_over_regions", "more_in_one_region"]
-
 
 def joint_in_one_region(chances: Iterable[float], factor: float) -> float:
     """Return the chance that all machines of one region are down at once; 1 for an empty region.

@@ -10,8 +10,6 @@ from typing import Final
 
 from fog.hardware import Offer
 
-__all__ = ["HOURS_A_MONTH", "Bill", "compared"]
-
 HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
 
 

@@ -10,8 +10,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["duration_text", "seconds_from_text"]
-
 _UNITS_S: Final = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Measured", "Pair"]
-
 
 @dataclass(frozen=True, slots=True)
 class Pair:

@@ -14,8 +14,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["chance_down", "joint", "replicas_needed"]
-
 _ROUNDING: Final = 1e-9  # 0.1 ** 3 exceeds 0.001 by rounding, but three replicas are enough
 
 

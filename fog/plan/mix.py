@@ -14,8 +14,6 @@ from typing import Final
 from fog.plan.failure import joint, replicas_needed
 from gdp.errors import LocalError
 
-__all__ = ["Kind", "Mix", "cheapest_mix"]
-
 _MOST_MIXES: Final = 200_000
 
 

@@ -14,8 +14,6 @@ from fog.plan.correlation import joint_in_one_region, more_in_one_region
 from fog.plan.failure import joint
 from fog.plan.mix import Kind, Mix, cheapest_mix
 
-__all__ = ["ON_DEMAND_DOWN", "PAPER_RECOVERY_S", "PAPER_UPTIME_S", "Pool", "Standing", "pool_for"]
-
 PAPER_UPTIME_S: Final = 15 * 3600.0  # the worked example of FogROS2-FT
 PAPER_RECOVERY_S: Final = 20 * 60.0
 ON_DEMAND_DOWN: Final = 0.005  # AWS's service level agreement promises 99.5 % a month for a single EC2 machine

@@ -20,8 +20,6 @@ from fog.plan.failure import chance_down, joint
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S
 from gdp.errors import LocalError
 
-__all__ = ["MACHINES_MAX", "Target", "machines_for"]
-
 MACHINES_MAX: Final = 64
 _ROUNDING: Final = 1e-9
 

@@ -15,17 +15,6 @@ from numpy.typing import NDArray
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "Share",
-    "Trace",
-    "none_up",
-    "outages",
-    "pool_down",
-    "replica_down",
-    "share_with_interval",
-    "times_independent",
-]
-
 Steps = NDArray[np.bool_]
 
 

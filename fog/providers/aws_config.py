@@ -15,8 +15,6 @@ from pydantic import Field
 from fog.providers.cloud_init import Setup
 from gdp.config.schema import Section
 
-__all__ = ["AwsConfig", "Ssh"]
-
 
 class Ssh(Section):
     """Settings of logins."""

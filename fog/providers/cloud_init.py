@@ -37,17 +37,6 @@ from gdp.config.schema import ExistingFile, Section
 from gdp.errors import LocalError
 from gdp.stores.files import read_at_most
 
-__all__ = [
-    "HOME",
-    "USER_DATA_MAX_BYTES",
-    "AptSource",
-    "Placed",
-    "Setup",
-    "cloud_config",
-    "placed",
-]
-__all__ += ["lines_of", "shell_script", "user_data"]
-
 HOME: Final = "/var/lib/fog"
 USER_DATA_MAX_BYTES: Final = 16 * 1024
 _INSTALLED: Final = "/opt/fog"

@@ -11,8 +11,6 @@ from typing import Protocol, runtime_checkable
 from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineBundle, MachineSpec
 
-__all__ = ["AccountProvider", "GatewayProvider", "Provider"]
-
 
 class Provider(Protocol):
     """Provider of machines. All calls may block; none keeps state that a restart would lose.

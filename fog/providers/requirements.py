@@ -15,8 +15,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.files import read_at_most
 
-__all__ = ["FILE_MAX_BYTES", "pinned", "read_requirements"]
-
 FILE_MAX_BYTES: Final = 1 << 20
 _EXPECTED: Final = (
     "expected a wheel's URL with its hash (https://...whl#sha256=HEX), or name==version --hash=sha256:HEX"

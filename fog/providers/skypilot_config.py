@@ -12,8 +12,6 @@ from pydantic import AfterValidator, Field
 from fog.providers.cloud_init import Setup
 from gdp.config.schema import Section
 
-__all__ = ["SkyPilotConfig"]
-
 _PODS: Final = ("kubernetes", "k8s", "ssh")  # SkyPilot's words for Kubernetes; its pools of ssh hosts run k3s
 
 

@@ -12,8 +12,6 @@ from ros2cli.command import CommandExtension, add_subparsers_on_demand
 
 from fog.ros2cli.verb import VerbExtension
 
-__all__ = ["FogCommand"]
-
 _VERB = "_verb"
 
 

@@ -10,8 +10,6 @@ import argparse
 
 from ros2launch.option import OptionExtension
 
-__all__ = ["FogOption"]
-
 
 class FogOption(OptionExtension):  # type: ignore[misc]  # ros2launch has no types
     """Adds no option."""

@@ -12,8 +12,6 @@ from typing import Final
 
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 
-__all__ = ["VerbExtension"]
-
 
 class VerbExtension:
     """The extension point ``fog.verb``; ros2cli sets ``NAME`` to the name of the entry point."""

@@ -13,8 +13,6 @@ from gdp.config.schema import Directory, Section
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port, split_host_port
 
-__all__ = ["SOFTWARE_PORT", "SoftwareConfig", "listening_host_port"]
-
 SOFTWARE_PORT: Final = 4781
 IGNORED: Final = (".git/", "__pycache__/", "*.pyc")
 

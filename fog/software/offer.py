@@ -17,8 +17,6 @@ from fog.software.config import SoftwareConfig
 from fog.software.workspace import packed_parts, parts_of, remove_unused
 from gdp.errors import LocalError
 
-__all__ = ["WHEELS", "WORKSPACE", "Offered", "offered", "remove_unused_archives", "signature"]
-
 WHEELS: Final = "wheels"
 WORKSPACE: Final = "workspace"
 _PARTS: Final = "workspace"  # folder of archives in the scratch folder

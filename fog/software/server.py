@@ -36,8 +36,6 @@ from gdp.http_server import Answer, HttpServer
 from gdp.intervals import SERVER_S
 from gdp.stores.files import private, read_private, write_all
 
-__all__ = ["SOFTWARE_FILE", "SoftwareServer"]
-
 SOFTWARE_FILE: Final = "software.json"  # on the machine, too: what ``fetch`` reads
 _FETCHES_MAX: Final = 8  # of one file with one URL; a machine repeats a download that was cut
 _CONNECTIONS_MAX: Final = 32

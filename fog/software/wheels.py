@@ -21,8 +21,6 @@ from urllib.parse import unquote, urlsplit
 
 from gdp.errors import LocalError
 
-__all__ = ["DEBIAN_12", "Platform", "build_wheel", "dependency_wheels", "own_project", "wheels"]
-
 _PACKAGE: Final = "gdp-ros"
 _PATIENCE_S: Final = 1_800.0
 

@@ -19,8 +19,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["IGNORE_FILE", "Part", "packed_parts", "parts_of", "remove_unused"]
-
 IGNORE_FILE: Final = ".fogignore"  # at the top of the workspace: more patterns, one a line
 _TOP: Final = "top"
 _FOLDER_PREFIX: Final = "d-"

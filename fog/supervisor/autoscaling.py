@@ -15,8 +15,6 @@ from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import calls_of
 from gdp.intervals import POLL_S
 
-__all__ = ["Autoscaling"]
-
 
 class Autoscaling:
     """Number of machines of each cluster that scales."""

@@ -19,8 +19,6 @@ from fog.site import Site
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S, UPKEEP_S
 
-__all__ = ["LOG", "ensure", "held", "is_running", "pid_of"]
-
 _LOCK: Final = "supervisor.lock"
 LOG: Final = "supervisor.log"
 _LOG_MAX_BYTES: Final = 4 << 20

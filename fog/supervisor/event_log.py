@@ -11,8 +11,6 @@ import time
 from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
 
-__all__ = ["EventLog"]
-
 log = logging.getLogger(__name__)
 
 

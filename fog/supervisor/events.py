@@ -11,8 +11,6 @@ from typing import NamedTuple
 from fog.machine import Machine, MachineState
 from fog.supervisor.core.record import Record
 
-__all__ = ["Change", "changes"]
-
 
 class Change(NamedTuple):
     """Event; ``since_unix_s``: its time, if the machine's or the provider's records contain it."""

@@ -14,8 +14,6 @@ from fog.bootstrap.bundles import PROXY, SWITCH
 from fog.providers.provider import Provider
 from gdp.errors import GdpError
 
-__all__ = ["MACHINE", "decode_logs", "encode_logs"]
-
 MACHINE: Final = "machine"  # log of the machine agent, in addition to those of its programs
 _LINES: Final = 20
 _CHARS: Final = 4_000

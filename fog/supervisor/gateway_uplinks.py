@@ -18,8 +18,6 @@ from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_actions import ATTACH, DETACH, MachineActions
 
-__all__ = ["GatewayUplinks"]
-
 
 class GatewayUplinks:
     """Controller that maintains one gateway in each group of machines."""

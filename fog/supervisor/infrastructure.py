@@ -32,8 +32,6 @@ from gdp.intervals import LOOK_S, MINUTE_S
 if TYPE_CHECKING:
     from fog.providers.local.provider import LocalProvider
 
-__all__ = ["command_of", "is_up", "local_provider", "open_provider", "set_up", "tear_down"]
-
 log = logging.getLogger(__name__)
 
 _OWN_SPACE: Final = Path("/proc/self/ns/net")

@@ -22,8 +22,6 @@ from gdp.config.schema import first_fault
 from gdp.errors import LocalError, StoreError
 from gdp.stores.transactions import TransactionFile
 
-__all__ = ["FINAL_LOGS", "Cluster", "Entry", "Journal"]
-
 FINAL_LOGS: Final = "final logs"
 
 _EVENTS_MAX: Final = 10_000  # older ones are deleted

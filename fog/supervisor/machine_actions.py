@@ -30,8 +30,6 @@ from fog.supervisor.placement import place, stopgap
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import CACHE_S
 
-__all__ = ["ATTACH", "DETACH", "ActionRunner", "Done", "MachineActions"]
-
 ATTACH: Final = "attach uplink"
 DETACH: Final = "detach uplink"
 _MAX: Final = 8  # concurrent actions

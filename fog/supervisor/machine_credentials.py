@@ -24,8 +24,6 @@ from gdp.errors import GdpError, LocalError, StoreError
 from gdp.intervals import DAY_S
 from gdp.stores.keyring import load_domain
 
-__all__ = ["MachineCredentials", "Release", "remove_member"]
-
 log = logging.getLogger(__name__)
 
 # arguments: plan, name of the machine, the provider's id

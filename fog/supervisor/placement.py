@@ -16,8 +16,6 @@ from fog.supervisor.core.record import Outcome, Record
 from gdp.intervals import HOUR_S
 from gdp.requests import Backoff
 
-__all__ = ["held_until", "place", "stopgap", "wary_until"]
-
 _WARINESS: Final = Backoff(60.0, 3_600.0)  # by losses
 _HOLDS: Final = Backoff(1.0, 300.0)  # by failed requests
 _PATIENCE: Final = 4  # after this many consecutive failures in any region, the cause is probably not a region

@@ -37,8 +37,6 @@ from gdp.host.service_notifier import service_notifier
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from gdp.ports.tcp_server import listen_tcp
 
-__all__ = ["supervise"]
-
 log = logging.getLogger(__name__)
 
 _DONE_S: Final = 2.0  # it ends after this time without a wanted cluster

@@ -23,8 +23,6 @@ from gdp.names import Name
 from gdp.state.control_protocol import Command
 from proxy.config.config import ProxyConfig
 
-__all__ = ["calls_of", "received_by", "sent_by"]
-
 _SENT: Final = re.compile(rb'^gdp_messages_total\{direction="out"\} (\S+)$', re.MULTILINE)
 
 

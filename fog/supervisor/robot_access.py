@@ -12,8 +12,6 @@ from fog.cluster import ClusterPlan
 from fog.site import Site
 from fog.supervisor.watch import Watch
 
-__all__ = ["RobotAccess"]
-
 _ROBOT_DAYS: Final = 365.0
 
 

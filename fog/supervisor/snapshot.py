@@ -10,8 +10,6 @@ from typing import Final
 from fog.supervisor.core.record import Record, stage
 from fog.supervisor.journal import Entry, Journal
 
-__all__ = ["supervisor_snapshot"]
-
 _EVENTS_MAX: Final = 40
 _MACHINES_MAX: Final = 200  # of one cluster
 _CLUSTERS_MAX: Final = 32

@@ -35,8 +35,6 @@ from gdp.errors import GdpError
 from gdp.intervals import MINUTE_S, WATCH_S
 from gdp.stores.keyring import load_public_key
 
-__all__ = ["Heard", "Supervisor"]
-
 Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that serve it, each 64 hex digits
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing

@@ -17,8 +17,6 @@ from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import received_by, sent_by
 from gdp.intervals import POLL_S
 
-__all__ = ["UsageLimits"]
-
 _ON_THIS_HOST: Final = "local"
 
 

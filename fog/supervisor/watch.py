@@ -27,8 +27,6 @@ from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 
-__all__ = ["Watch"]
-
 log = logging.getLogger(__name__)
 
 _SETTLED_S: Final = 3.0  # after it is attached, until a missing server counts as unreachable

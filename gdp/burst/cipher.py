@@ -34,8 +34,6 @@ from gdp.frame.codec import (
 from gdp.frame.kinds import Flag
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["BODY_AT", "SALT_BYTES", "TAG_BYTES", "MessageCipher", "Plaintext"]
-
 SALT_BYTES: Final = 8
 TAG_BYTES: Final = 16
 BODY_AT: Final = HEADER_BYTES + SALT_BYTES  # of the ciphertext in a frame

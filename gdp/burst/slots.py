@@ -14,8 +14,6 @@ from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, HOPS_MASK, SECOND_PATH, s
 from gdp.frame.kinds import CONTROL_FROM, VERSION
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["received", "runs", "samples"]
-
 _SAMPLE_BITS: Final = 63  # of a frame's last byte: none is set in a sample
 
 # From the header on: version, kind, hops left, payload length, destination and source as one key.

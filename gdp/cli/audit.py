@@ -15,8 +15,6 @@ from gdp.cli.output import show
 from gdp.errors import LocalError
 from gdp.stores.audit_log import verify_audit
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="Audit logs of switches, RIBs, domains and owners.")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="the folder with audit.jsonl")]

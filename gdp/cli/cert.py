@@ -51,8 +51,6 @@ from gdp.terminal import echo
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="Memberships: issue, renew, install, show, revoke; rollover of roots.")
 app.add_typer(rollover.app, name="rollover")
 

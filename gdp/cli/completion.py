@@ -15,8 +15,6 @@ import typer
 from gdp.cli import options
 from gdp.cli.output import show
 
-__all__ = ["PROGRAMS", "complete_node", "completion", "completion_script"]
-
 PROGRAMS: Final = (
     "gdp",
     "gdp-delegate",

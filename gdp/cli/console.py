@@ -14,8 +14,6 @@ if TYPE_CHECKING:  # a node starts without this library
     from rich.console import Console
     from rich.table import Table
 
-__all__ = ["Columns", "console", "folding"]
-
 _PIPE_COLUMNS: Final = 10_000
 _COLUMNS_MIN: Final = 20
 

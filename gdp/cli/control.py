@@ -21,8 +21,6 @@ from gdp.management.control_client import NotRunningError, find_control_socket, 
 from gdp.state.control_protocol import Command, Response
 from gdp.terminal import echo
 
-__all__ = ["drain", "reload", "status"]
-
 _FAILED: Final = 1
 _NOT_RUNNING: Final = 3
 

@@ -36,8 +36,6 @@ from gdp.trust.adcert import AdCert
 from gdp.trust.audit import Action
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["app", "main"]
-
 _RULES: Final = "rules"
 
 

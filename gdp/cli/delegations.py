@@ -21,8 +21,6 @@ from gdp.stores.keyring import DELEGATIONS, load_delegation
 from gdp.trust.adcert import AdCert
 from gdp.trust.delegation import Delegation
 
-__all__ = ["described", "ls", "show_file", "until"]
-
 _MEANING: Final = ("kind", "name", "type")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="a node's directory, or its delegations")]

@@ -16,8 +16,6 @@ import gdp
 from gdp.cli.machine import say
 from gdp.errors import LocalError
 
-__all__ = ["demo"]
-
 _SECONDS: Final = 5.0
 _PICTURE: Final = """\
    domain school                                 domain cloud

@@ -18,8 +18,6 @@ from gdp.cli.rollover import described_root
 from gdp.stores.issue import ROOT_DAYS, make_domain
 from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="Create a trust domain, let machines join it, or look at one.")
 app.command("create", no_args_is_help=True)(create)
 app.command("token", no_args_is_help=True)(token)

@@ -32,8 +32,6 @@ from gdp.state.columns import columns
 from gdp.terminal import echo
 from gdp.trust.join_token import JoinRole
 
-__all__ = ["create", "ls", "remove", "serve", "token"]
-
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}", re.ASCII)
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="of the domain")]

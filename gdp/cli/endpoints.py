@@ -19,8 +19,6 @@ from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidate
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_identity
 
-__all__ = ["endpoints"]
-
 Identity = Annotated[Path, typer.Argument(metavar="DIR", help="the identity of a switch")]
 Public = Annotated[list[str], typer.Option("--public", metavar="ADDRESS:PORT", help="reachable from everywhere")]
 Uplinks = Annotated[int, typer.Option("--uplinks", min=1, max=4, help="how many uplinks have tunnels")]

@@ -20,8 +20,6 @@ from gdp.errors import LocalError
 from gdp.management.running_nodes import RunningNode
 from gdp.terminal import echo
 
-__all__ = ["explain"]
-
 _EXITS: Final = {Verdict.FINE: 0, Verdict.FAULT: 1, Verdict.UNKNOWN: 3}
 _WINDOW_S: Final = 1.0
 

@@ -18,8 +18,6 @@ from gdp.extras import MissingExtraError, Seam, find_entry_point
 if TYPE_CHECKING:
     from typer import Context
 
-__all__ = ["ANY_ARGUMENTS", "COMMANDS", "ExtendedGroup", "placeholder"]
-
 ANY_ARGUMENTS = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": list[str]()}
 _EXTRAS: Final = {
     **dict.fromkeys(("delegate", "recording", "rule", "service", "topic", "watch"), "proxy"),

@@ -22,8 +22,6 @@ from gdp.management.control_client import NodeConnection, NotRunningError, find_
 from gdp.state.state_answers import ASK
 from gdp.stores.keyring import CARD, load_card
 
-__all__ = ["FactGathering", "LocalDirectory", "local_directory"]
-
 # A long request has many frames, any of which may be lost: the last attempt is for what was cut.
 _REPLY_BYTES: Final = (2_500, 2_500, DIAGNOSTIC_REPLY_MAX_BYTES)
 

@@ -13,8 +13,6 @@ from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.program import Program
 from gdp.cli.version import Version
 
-__all__ = ["app", "main"]
-
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 
 

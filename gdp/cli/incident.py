@@ -23,8 +23,6 @@ from gdp.stores.files import private, write_all
 from gdp.stores.keyring import load_node_keys
 from gdp.terminal import echo
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="What happened at a node: save its journal, show it, and run it again.")
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="An incident that gdp incident save wrote.")]

@@ -42,8 +42,6 @@ from gdp.sharing.upkeep import ShareUpkeep
 from gdp.stores.keyring import CARD
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["agent", "join", "run_agent", "up"]
-
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]")
 
 JOIN_TOKEN: Final = Secret("join token", "--token-file", "GDP_TOKEN")

@@ -18,8 +18,6 @@ from gdp.stores.keyring import storage, store_again
 from gdp.stores.passphrase import FILE_VARIABLE, VARIABLE, new_passphrase
 from gdp.stores.private_keys import TOKEN_KEYS, Storage
 
-__all__ = ["app", "asked_passphrase", "token_key"]
-
 app = typer.Typer(
     no_args_is_help=True,
     help=(

@@ -16,8 +16,6 @@ from gdp.crypto.certificates import Role
 from gdp.stores.issue import make_node_keys, make_owner
 from gdp.stores.keyring import OWNER_PUBLIC, REQUEST
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="Make keys for an owner of names, or for a node.")
 
 RoleOption = Annotated[

@@ -20,8 +20,6 @@ from gdp.stores.files import public, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import DELEGATIONS, OWNER_PUBLIC, load_domain, load_owner
 
-__all__ = ["lab"]
-
 _SWITCH: Final = """\
 identity: switch
 domain: {{root: switch/root.crt}}

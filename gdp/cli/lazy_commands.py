@@ -17,8 +17,6 @@ from typer.main import get_command, get_group
 from gdp.cli.program import ungrouped
 from gdp.cli.version import with_version
 
-__all__ = ["LazyCommand", "LazyCommands"]
-
 
 @dataclass(frozen=True, slots=True)
 class LazyCommand:

@@ -17,8 +17,6 @@ from gdp.management.control_client import NodeConnection, NotRunningError, find_
 from gdp.management.running_nodes import RunningNode, find_running_nodes
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Node", "connect", "find_name", "local_nodes", "names_of_machine"]
-
 Node = Annotated[
     str | None,
     typer.Option(

@@ -30,8 +30,6 @@ from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.terminal import echo
 
-__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run_programs", "say", "start_machine"]
-
 BORDER_SEEN_S: Final = 20.0
 
 AtDirectory = Annotated[

@@ -15,8 +15,6 @@ from gdp.cli.output import show
 from gdp.metadata import hidden
 from gdp.names import name_of
 
-__all__ = ["name"]
-
 Owner = Annotated[
     Path | None,
     typer.Option("--owner", metavar="FILE", help="the owner's public key, PEM; without it the name is unowned"),

@@ -24,27 +24,6 @@ from gdp.terminal import echo
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-__all__ = [
-    "WRONG",
-    "AwaitIface",
-    "Check",
-    "Config",
-    "Format",
-    "FoundConfig",
-    "Json",
-    "Level",
-    "Logs",
-    "MemberPlane",
-    "Verbose",
-    "emit",
-    "emit_wait",
-    "failing_clearly",
-    "report",
-    "running",
-    "set_up_logging",
-    "with_plane",
-]
-
 # NumPy's OpenBLAS starts a thread for each core as soon as it is loaded. No command uses them, and a thread that exists
 # before the confinement of rights keeps its rights.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -16,21 +16,6 @@ from gdp.errors import LocalError
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
 from gdp.metadata import Metadata
 
-__all__ = [
-    "Days",
-    "Directory",
-    "Force",
-    "Host",
-    "Json",
-    "KeyUri",
-    "Kind",
-    "Label",
-    "More",
-    "NameOptions",
-    "Out",
-    "Protect",
-]
-
 Kind = Annotated[str, typer.Option("--kind", help="topic, service, action, switch, rib, proxy, ...")]
 More = Annotated[list[str], typer.Option("--meta", metavar="KEY=VALUE", help="further metadata; may be repeated")]
 

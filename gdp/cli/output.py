@@ -20,16 +20,6 @@ if TYPE_CHECKING:  # a short command loads nothing of keys
     from gdp.crypto.validity import Validity
     from gdp.trust.right import Right
 
-__all__ = [
-    "epochs_from_text",
-    "items_from_text",
-    "moment",
-    "rights_from_text",
-    "show",
-    "span",
-    "table",
-]
-
 
 def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = None) -> None:
     """Print a result; ``plain``, if given, replaces the lines for people."""

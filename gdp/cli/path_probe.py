@@ -14,8 +14,6 @@ from gdp.limits import HOPS_MAX
 from gdp.management.control_client import NodeConnection
 from gdp.names import Name
 
-__all__ = ["PathProbe"]
-
 _REPLY_BYTES: Final = 2_000  # a dozen branches
 _BLIND_HOPS: Final = 12  # switches that are asked while the member itself is silent
 _BELOW_MAX: Final = 48  # switches below that are asked, apart from those on the path

@@ -10,8 +10,6 @@ from typing import Final
 
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["path_lines"]
-
 _WORDS: Final = {"publish": "published by", "serve": "served by"}
 
 

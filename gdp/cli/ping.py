@@ -22,9 +22,6 @@ from gdp.names import Name
 from gdp.ports.readiness import readable
 from gdp.terminal import echo
 
-__all__ = ["PingStatistics", "ping", "quantile"]
-
-
 _NOTHING_CAME: Final = 1
 INTERVAL_MIN_S: Final = 0.05  # 20 requests a second; a node answers 32 of one member
 

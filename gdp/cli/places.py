@@ -14,8 +14,6 @@ from gdp.intervals import ANSWER_S
 from gdp.management.control_client import NodeConnection
 from gdp.names import Name
 
-__all__ = ["NOWHERE", "Place", "find_places"]
-
 NOWHERE: Final = (
     "no RIB that answers knows a member that advertises it;"
     " is its publisher up, does it expose the name, and are the RIBs up?"

@@ -18,8 +18,6 @@ from gdp.cli.version import HELP, versioned
 from gdp.errors import GdpError
 from gdp.terminal import echo
 
-__all__ = ["Program", "ungrouped"]
-
 
 class Program(typer.Typer):
     """Application whose commands may take groups of options.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from gdp.crypto.identity import Identity
     from gdp.nodes.relay import Relay
 
-__all__ = ["main"]
-
 app = Program("gdp-relay")
 main = app.run
 

@@ -10,8 +10,6 @@ from gdp.cli.program import Program
 from gdp.intervals import ATTACH_S
 from gdp.names import Name
 
-__all__ = ["main"]
-
 app = Program("gdp-rib")
 main = app.run
 

@@ -25,8 +25,6 @@ from gdp.names import Name
 from gdp.state.control_protocol import Command
 from gdp.terminal import echo
 
-__all__ = ["app"]
-
 app = typer.Typer(no_args_is_help=True, help="Ask RIBs what they know.")
 
 _NONE: Final = 1

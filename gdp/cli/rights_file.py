@@ -40,8 +40,6 @@ from gdp.trust.grants import EPOCH_MAX
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["NameRights", "RightsFile", "delegate_rights"]
-
 _COLUMNS: Final = ("state", "name", "kind", "rights", "node", "until", "file")
 _RIGHTS: Final = ("publish", "read", "serve", "call")  # keys of the file, and rights
 

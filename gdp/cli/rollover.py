@@ -18,8 +18,6 @@ from gdp.stores.issue import ROOT_DAYS
 from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.stores.rollover import NEXT, RETIRED, begin_rollover, finish_rollover
 
-__all__ = ["app", "described_root"]
-
 app = typer.Typer(no_args_is_help=True, help="Another root key for a domain: begin, hand the root out, finish.")
 
 Domain = Annotated[Path, typer.Option("--domain", metavar="DIR", help="the domain's directory, with its root key")]

@@ -13,8 +13,6 @@ import typer
 from gdp.cli.secret import Secret
 from gdp.metadata import SALT
 
-__all__ = ["NAME_SALT", "SaltFile", "read_salt"]
-
 NAME_SALT: Final = Secret("salt", "--salt-file", "GDP_SALT")
 
 SaltFile = Annotated[

@@ -15,8 +15,6 @@ import typer
 
 from gdp.errors import LocalError
 
-__all__ = ["PROMPT", "Secret"]
-
 PROMPT: Final = Path("-")
 
 

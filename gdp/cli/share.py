@@ -35,8 +35,6 @@ from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, load_card, load_owner
 from gdp.terminal import echo
 
-__all__ = ["expose", "import_names", "share"]
-
 SHARE_DAYS: Final = 30.0
 _PROXY_FILE: Final = "proxy.yaml"
 _SWITCH_FILE: Final = "switch.yaml"

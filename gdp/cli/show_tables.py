@@ -21,8 +21,6 @@ from gdp.management.control_client import NodeConnection, NotRunningError
 from gdp.management.running_nodes import RunningNode
 from gdp.terminal import echo
 
-__all__ = ["Table", "show_table"]
-
 _NOTHING = 1
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from gdp.config.config import SwitchConfig
     from gdp.crypto.identity import Identity
 
-__all__ = ["main"]
-
 log = logging.getLogger(__name__)
 
 app = Program("gdp-switch")

@@ -13,8 +13,6 @@ from gdp.errors import LocalError
 from gdp.names import NAME_BYTES, Name
 from gdp.terminal import echo
 
-__all__ = ["cell", "print_table", "select_columns"]
-
 _HEX_DIGITS = 2 * NAME_BYTES
 _LAST = "…"
 _CUT_MIN = 24  # a column is cut only where so much of it is shown

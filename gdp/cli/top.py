@@ -29,8 +29,6 @@ from gdp.terminal import echo
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["top"]
-
 _HEAD: Final = ("NAME", "DIRECTION", "MSG/S", "RATE", "LOST", "LATE", "PUBLISHERS", "READERS", "NODE")
 _FIND_EVERY: Final = 5  # redraws between two searches for nodes that have started
 _BORDER_LINES: Final = 8  # of a terminal, that the table's frame and its texts take

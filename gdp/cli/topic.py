@@ -23,8 +23,6 @@ from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
 from gdp.terminal import echo
 
-__all__ = ["JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
-
 _NOT_RUNNING: Final = 3
 _UNKNOWN: Final = 1
 _HEAD: Final = ("NAME", "TYPE", "DIRECTION", "MSG/S", "RATE", "SIZE", "PUBLISHERS", "READERS", "NODE")

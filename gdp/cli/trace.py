@@ -21,8 +21,6 @@ from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
 from gdp.terminal import echo
 
-__all__ = ["trace"]
-
 _NOTHING_CAME: Final = 1
 
 Budget = Annotated[

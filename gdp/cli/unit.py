@@ -25,8 +25,6 @@ from gdp.errors import LocalError
 from gdp.intervals import SERVER_S
 from gdp.state.columns import columns
 
-__all__ = ["app"]
-
 _NOT_WELL: Final = 1
 _NOTHING: Final = 3
 _ETC: Final = Path("/etc/gdp")

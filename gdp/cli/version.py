@@ -19,9 +19,6 @@ from typer.main import get_command
 import gdp
 from gdp.terminal import echo
 
-__all__ = ["HELP", "Version", "defer_coercion", "versioned", "with_version"]
-
-
 _SHOULD_BE: Final = "Input should be "  # prefix of pydantic, which some versions of the library use
 _USAGE_ERROR: Final[Any] = typer.BadParameter.__mro__[2]  # ClickException, whose module differs among versions
 # Context settings, which sub-commands inherit; lines of the help are as wide as the terminal.

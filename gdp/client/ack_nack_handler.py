@@ -23,8 +23,6 @@ from gdp.message.loss import LossReason
 from gdp.message.renumbering import Renumbering
 from gdp.message.send_window import SendWindow
 
-__all__ = ["AckNackHandler"]
-
 _SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, a Heartbeat states that it was the last
 
 

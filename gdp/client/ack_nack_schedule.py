@@ -14,8 +14,6 @@ from gdp.limits import REPORT_DELAY_S, REPORT_EVERY_BYTES, REPORT_EVERY_MAX_BYTE
 from gdp.message.reassembly import Reassembler
 from gdp.requests import Backoff
 
-__all__ = ["AckNackSchedule"]
-
 _FIRST_BYTES: Final = 3_000
 # between two requests of what is missing, while nothing comes
 _MISSING: Final = Backoff(REPORT_DELAY_S, 16 * REPORT_DELAY_S)

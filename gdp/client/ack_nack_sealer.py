@@ -20,8 +20,6 @@ from gdp.intervals import READER
 from gdp.message.acknack import AckNack
 from gdp.names import Name
 
-__all__ = ["AckNackSealer"]
-
 _TRIES: Final = 3  # under one epoch, before the next is tried
 
 

@@ -49,8 +49,6 @@ from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.withdrawal import Withdrawal
 
-__all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
-
 _FIRST_S: Final = 0.5  # until the first acknowledgement
 _FIRST: Final = Backoff(_FIRST_S, _FIRST_S)
 _RENEWAL_AGAIN: Final = 1 / 12  # of a lease: a renewal has some five frames, and is lost with any of them

@@ -24,8 +24,6 @@ from gdp.message.history_cache import CachedMessage, HistoryCache
 from gdp.message.retransmission import RetransmissionQueue, repair_allowance
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["CACHE_BYTES", "FIRST_CREDIT_BYTES", "BestEffortCache"]
-
 CACHE_BYTES: Final = 8 << 20  # of frames of one topic; the oldest messages go first
 _SHARE: Final = 0.5  # of the bytes sent for the first time: what repairs may add
 FIRST_CREDIT_BYTES: Final = 256 << 10

@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 from gdp.crypto.envelope import Sealed
 from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
 
-__all__ = ["FRESH_S", "BestEffortQueue", "Carried", "is_expired"]
-
 FRESH_S: Final = 0.05  # without a deadline: after this time a message gives way to a newer one
 
 

@@ -14,8 +14,6 @@ from typing import Final, NamedTuple
 
 from gdp.intervals import NEVER_S
 
-__all__ = ["PROGRESS_BYTES", "BlockingReaders", "PathState"]
-
 PROGRESS_BYTES: Final = 256 << 10
 _BLOCKED_SHARE: Final = 0.5  # of the lag in which a reader was the only obstacle
 

@@ -12,8 +12,6 @@ from gdp.crypto.introduction import Introduction
 from gdp.names import Name
 from gdp.trust.lru import Lru
 
-__all__ = ["ControlKeys"]
-
 _REMEMBERED: Final = 4_096
 _PURPOSE: Final = b"gdp-note-shared-1"
 

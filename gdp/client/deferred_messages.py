@@ -12,8 +12,6 @@ from gdp.limits import WINDOW_BYTES
 from gdp.message.ledger import Ledger
 from gdp.message.loss import LossReason
 
-__all__ = ["DeferredMessages"]
-
 
 class DeferredMessages:
     """Messages that wait for the first reader; those beyond the history are lost.

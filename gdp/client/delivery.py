@@ -28,8 +28,6 @@ from gdp.message.renumbering import Renumbering
 from gdp.names import Name
 from gdp.sansio import new_tuple
 
-__all__ = ["NOT_BEGUN", "Delivered", "Delivery", "Ended"]
-
 _BUNDLE: Final = int(Flag.BUNDLE)
 _OVERHEAD_BYTES: Final = 256  # what a waiting message costs in addition to its bytes
 

@@ -23,8 +23,6 @@ from gdp.message.send_window import SendWindow
 from gdp.names import Name
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["GoverningPaths"]
-
 _ALL: Final = 1 << 30
 _ALONE_FROM_S: Final = 1.0  # after a second path: round trips enough to measure the one that remains
 _LIMIT_BURST_S: Final = 0.05  # of ``max_bits_s``: a burst of this time leaves at once

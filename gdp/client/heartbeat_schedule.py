@@ -19,8 +19,6 @@ from gdp.intervals import NEVER_S, READER
 from gdp.limits import REPORT_DELAY_S
 from gdp.message.heartbeat import STARTS_MAX, Heartbeat, StreamStart
 
-__all__ = ["HeartbeatSchedule"]
-
 _BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
 _PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each sending of a new description but the last
 

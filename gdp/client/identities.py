@@ -16,8 +16,6 @@ from gdp.message.reassembly import VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 
-__all__ = ["PublisherIdentity", "ReaderIdentity", "WriterIdentity"]
-
 
 @dataclass(frozen=True, slots=True)
 class WriterIdentity:

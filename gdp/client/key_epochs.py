@@ -17,8 +17,6 @@ from gdp.frame.kinds import Kind
 from gdp.limits import EPOCH_GRACE_S
 from gdp.names import Name
 
-__all__ = ["KeyEpochs", "Openers", "Secrets"]
-
 Secrets = Mapping[int, bytes]  # key epoch -> topic secret, 32 bytes
 
 _NEVER: Final = float("-inf")

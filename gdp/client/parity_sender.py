@@ -28,8 +28,6 @@ from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
 from gdp.message.parity import OVERHEAD_BYTES, SHARD_OVERHEAD_BYTES, Parity, blocks_of, shard_of, span_of
 
-__all__ = ["LOSS_MIN", "PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
-
 PARITY_BYTES: Final = OVERHEAD_BYTES + TAG_BYTES  # so much smaller are the frames of a message with parity
 LOSS_MIN, LOSS_MAX = 0.001, 0.2  # less needs no parity, and more is no loss that parity can fill
 RTT_MIN_S: Final = 0.010  # below it, detection of a gap takes as long as its repair

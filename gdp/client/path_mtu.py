@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.limits import FRAME_MAX_BYTES, MTU_HOLD_S, MTU_MIN_BYTES, MTU_NARROWINGS
 
-__all__ = ["PLATEAUS", "PathMtu"]
-
 PLATEAUS: Final = (FRAME_MAX_BYTES, 32_000, 17_914, 8_166, 4_352, 2_002, 1_492, 1_006, MTU_MIN_BYTES)
 
 

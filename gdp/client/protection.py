@@ -37,8 +37,6 @@ from gdp.message.acknack import AckNack
 from gdp.message.send_window import SendWindow
 from gdp.message.striping import Striper
 
-__all__ = ["Protection"]
-
 
 class Protection:
     """Policy of protection of one publisher.

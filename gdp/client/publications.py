@@ -30,8 +30,6 @@ from gdp.frame.codec import Header
 from gdp.message.loss import LossReason
 from gdp.names import Name
 
-__all__ = ["Publications"]
-
 
 class Publications:
     """All publishers of one participant.

@@ -38,8 +38,6 @@ from gdp.message.loss import LossReason
 from gdp.message.send_window import SendWindow
 from gdp.names import Name
 
-__all__ = ["Publisher"]
-
 _ALL: Final = 1 << 30
 _AWAITED_MAX: Final = 64  # messages kept for readers that waited; as many as a latched topic of ROS keeps here
 

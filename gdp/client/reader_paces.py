@@ -20,8 +20,6 @@ from gdp.limits import PACE_MAX, REPORT_DELAY_S
 from gdp.message.heartbeat import PACES_MAX
 from gdp.requests import Backoff
 
-__all__ = ["ReaderPaces"]
-
 _STEPS: Final = 4  # paces in a doubling of the rate, from 1 kB/s on
 _MOVED_STEPS: Final = 3  # a rate that has changed by so many is another pace
 _MOVED_REPORTS: Final = 100  # of full delay, after the one before

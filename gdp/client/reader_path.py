@@ -21,8 +21,6 @@ from gdp.intervals import FORGET_S, NEVER_S, PACE_S
 from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 from gdp.requests import Backoff
 
-__all__ = ["BURST_S", "FLIGHT_FRAMES", "ReaderPath", "ReaderPaths"]
-
 FLIGHT_FRAMES: Final = 16  # of those that leave at once and are confirmed together, at most
 BURST_S: Final = 0.001  # frames of this time leave at once: a timer for each frame would cost more than it smooths
 _TIMEOUTS: Final = Backoff(0.3, 4.0)

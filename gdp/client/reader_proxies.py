@@ -28,8 +28,6 @@ from gdp.message.heartbeat import StreamStart
 from gdp.names import Name
 from gdp.requests import Backoff
 
-__all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
-
 READERS_MAX: Final = 1_024
 _INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered, and readers given up
 _EPOCHS_KEPT: Final = 2  # the one in use and the one before

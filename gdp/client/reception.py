@@ -17,8 +17,6 @@ from gdp.limits import PACE_MAX
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["Reception"]
-
 
 class Reception:
     """The writer proxies of one participant, with those that have news.

@@ -19,8 +19,6 @@ from gdp.limits import SENDS_MAX
 from gdp.message.second_copies import REPEATED_PARTS_MAX
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["CopyBudget", "Redundancy", "parity_budget", "sends_for"]
-
 _OFFSETS_S: Final = (0.004, 0.007)  # of the second and the third sending after the first
 _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings leave at most 0.1 % undelivered
 _UNKNOWN: Final = 2  # sendings before anything is measured

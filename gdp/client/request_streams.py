@@ -22,8 +22,6 @@ from gdp.errors import LocalError
 from gdp.intervals import NEVER_S
 from gdp.names import Name
 
-__all__ = ["RequestStreams"]
-
 _PATIENCE: Final = 2.0  # of the time that a copy should take
 
 

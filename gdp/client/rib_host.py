@@ -26,8 +26,6 @@ from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 
-__all__ = ["RibHost"]
-
 
 class RibHost:
     """Protocol core of a RIB node."""

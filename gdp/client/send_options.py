@@ -13,22 +13,6 @@ from gdp.errors import LocalError
 from gdp.intervals import HOUR_S
 from gdp.limits import WINDOW_BYTES
 
-__all__ = [
-    "DEFAULT_OPTIONS",
-    "HISTORY_BYTES_MAX",
-    "HISTORY_MESSAGES_MAX",
-    "PRIORITIES",
-    "RATE_MAX_BITS_S",
-    "RATE_MIN_BITS_S",
-    "RELIABLE",
-    "WEIGHT_MAX",
-    "Priority",
-    "PublisherSettings",
-    "SendOptions",
-    "checked",
-    "is_urgent",
-]
-
 Priority: TypeAlias = Literal["urgent", "interactive", "high", "normal", "low", "bulk", "background"]
 PRIORITIES: Final[tuple[Priority, ...]] = get_args(Priority)  # first what leaves first
 

@@ -33,8 +33,6 @@ from gdp.message.loss import LossReason
 from gdp.message.renumbering import MOVES_MAX, Renumbering
 from gdp.message.send_window import SendWindow
 
-__all__ = ["SendQueue"]
-
 _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
 _RELIABLE: Final = int(Flag.RELIABLE)

@@ -18,8 +18,6 @@ from gdp.client.publisher import Publisher
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES
 
-__all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
-
 BYTES_AT_ONCE: Final = 160 << 10  # of ordinary frames, before any other publisher has its turn
 BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
 _QUANTUM_FRAMES: Final = 2  # of the publisher with the least share in each round, where the path is the limit

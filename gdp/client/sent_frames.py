@@ -27,8 +27,6 @@ from gdp.message.acknack import AckNack
 from gdp.message.frame_loss import FrameLoss
 from gdp.message.receipts import ReceiptCheck
 
-__all__ = ["SentFrames"]
-
 _MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
 

@@ -11,8 +11,6 @@ from typing import Final, NamedTuple
 
 from gdp.names import Name
 
-__all__ = ["FIRST", "SequenceRegistry", "SequenceState"]
-
 SEQUENCE_REGISTRY_MAX: Final = 4_096
 
 

@@ -17,8 +17,6 @@ from gdp.intervals import NEIGHBOUR
 from gdp.names import Name
 from gdp.trust.right import Right
 
-__all__ = ["Services", "StallClock"]
-
 
 class StallClock:
     """Time of a participant's latest event, and since when it has been scheduled without a stall; monotonic seconds."""

@@ -34,8 +34,6 @@ from gdp.trust.lru import Lru
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
-
 ENDED_MAX: Final = 4_096  # closed writer proxies whose end is remembered
 ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may return
 

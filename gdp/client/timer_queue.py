@@ -10,8 +10,6 @@ from typing import Generic, Protocol, TypeVar
 from gdp.due_queue import DueQueue
 from gdp.intervals import NEVER_S
 
-__all__ = ["HasTimer", "TimerQueue"]
-
 
 class HasTimer(Protocol):
     """An object that has a timer."""

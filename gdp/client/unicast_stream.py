@@ -35,15 +35,6 @@ from gdp.limits import MTU_MIN_BYTES, PRIVATE_WAIT_BYTES
 from gdp.message.reassembly import VerifiesDigest
 from gdp.names import Name
 
-__all__ = [
-    "Party",
-    "PeerIncarnation",
-    "UnicastReceiver",
-    "UnicastStream",
-    "private_incarnation",
-    "private_name",
-]
-
 # A second path by which frames of the reader came is taken to lead back to it for this time. It may be silent for long.
 _SIGNED: Final = b"gdp-private-1"
 _SESSION: Final = b"gdp-private-session-1"

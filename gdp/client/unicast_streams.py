@@ -21,8 +21,6 @@ from gdp.intervals import FORGET_S
 from gdp.message.loss import LossReason
 from gdp.names import Name
 
-__all__ = ["STREAMS_MAX", "UnicastStreams"]
-
 STREAMS_MAX: Final = 1_024
 
 

@@ -55,8 +55,6 @@ from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["WriterProxy", "WriterProxyState"]
-
 ANNOUNCE_S: Final = 0.1
 _LATCHED: Final = int(Flag.LATCHED)
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing

@@ -65,18 +65,6 @@ from gdp.limits import (
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.files import read_private
 
-__all__ = [
-    "LISTEN_DEFAULT",
-    "DataPlane",
-    "LeaseSeconds",
-    "LinksConfig",
-    "PortConfig",
-    "Quotas",
-    "RibConfig",
-    "SwitchConfig",
-    "UplinkPlane",
-]
-
 
 def _endpoint(text: str) -> str:
     try:

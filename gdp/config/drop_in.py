@@ -18,8 +18,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.files import private, public, write_all
 
-__all__ = ["drop_in_directory", "locked", "read_drop_in", "write_drop_in"]
-
 _SALT: Final = re.compile(r"""\bsalt["']?[ \t]*:""")  # under `metadata`
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 

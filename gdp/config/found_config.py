@@ -13,8 +13,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.ownership import refuse_shared_folder
 
-__all__ = ["SWITCH_FILE", "find_switch_config"]
-
 SWITCH_FILE: Final = "switch.yaml"
 
 

@@ -19,8 +19,6 @@ from typing import Final
 
 from gdp.config.yaml_source import KeyPath, Mark, Plain, YamlSource, read_yaml
 
-__all__ = ["MACHINE_FILE", "NODE_SECTIONS", "read_sections", "section_source"]
-
 MACHINE_FILE: Final = "machine.yaml"
 NODE_SECTIONS: Final = ("switch", "relay", "rib", "proxy")  # in the order of their start
 _DOMAIN: Final = "domain"

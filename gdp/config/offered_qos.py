@@ -16,8 +16,6 @@ from gdp.crypto.schema import NAME, Keyed
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["OFFERED_DEPTH_MAX", "OfferedQos"]
-
 OFFERED_DEPTH_MAX: Final = 1_000
 _MAX_BYTES: Final = 1_024
 _NAME: Final = Keyed("name", NAME)

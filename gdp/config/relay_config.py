@@ -27,8 +27,6 @@ from gdp.config.schema import (
 from gdp.names import Name
 from gdp.relay.framing import MTU_MAX, MTU_MIN
 
-__all__ = ["RelayBorder", "RelayConfig", "RelayServer"]
-
 RELAY_PORT: Final = 443
 CLIENTS_MAX: Final = 64
 MTU_DEFAULT: Final = 1_350  # of a tunnel: a path keeps its MTU when frames change between tunnel and relay

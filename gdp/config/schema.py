@@ -19,28 +19,6 @@ from gdp.config.yaml_source import ConfigFileError, KeyPath, YamlSource, read_ya
 from gdp.errors import ConfigError, LocalError
 from gdp.names import Name
 
-__all__ = [
-    "AuditFolder",
-    "ControlSocket",
-    "Directory",
-    "Domain",
-    "ExistingFile",
-    "Identity",
-    "Ifname",
-    "Metrics",
-    "NewFile",
-    "RequiredName",
-    "Sandbox",
-    "Section",
-    "StateFolder",
-    "TokenFolders",
-    "Unique",
-    "first_fault",
-    "load",
-    "read_name",
-    "relative",
-]
-
 # The search for plugins of pydantic reads the metadata of each installed package, and we use none.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 

@@ -18,8 +18,6 @@ import yaml
 from gdp.errors import ConfigError
 from gdp.stores.files import read_at_most
 
-__all__ = ["LOADER", "ConfigFileError", "KeyPath", "Mark", "Plain", "YamlSource", "read_yaml"]
-
 Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
 KeyPath: TypeAlias = "tuple[str | int, ...]"
 Mark: TypeAlias = "tuple[int, int]"  # line and column, both from 1

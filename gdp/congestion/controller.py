@@ -36,8 +36,6 @@ from gdp.congestion.path_model import FIRST_RTT_S, PathModel
 from gdp.congestion.states import TRANSITIONS, Signal, State
 from gdp.requests import Backoff
 
-__all__ = ["PathController"]
-
 _LEAST_FRAMES: Final = 2
 _FIRST_FRAMES: Final = 32  # as Google's QUIC; RFC 6928 has 10
 _LEAST_RTT_S: Final = 1e-5

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["Cubic"]
-
 _C: Final = 0.8  # section 5: 0.4
 _BETA: Final = 0.8  # section 4.6: 0.7
 _GROWTH_MAX: Final = 1.5  # of the target over the window, section 4.2

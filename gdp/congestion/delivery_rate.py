@@ -11,8 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import takewhile
 
-__all__ = ["DeliveryRate", "Flight"]
-
 
 @dataclass(slots=True, eq=False)
 class Flight:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 
-__all__ = ["WindowedExtreme"]
-
 
 class WindowedExtreme:
     """Highest sample of a window, or the lowest one.

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["Pacer"]
-
 _DELAY_MOST_S: Final = 0.25  # by the pace; longer only if one frame takes longer
 _CREDIT_SHARE, _CREDIT_MOST_S = 0.125, 0.01  # of a round trip; less than a time slice loses the pace on a busy core
 

@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.congestion.filters import WindowedExtreme
 
-__all__ = ["FIRST_RTT_S", "PathModel"]
-
 FIRST_RTT_S: Final = 0.02  # until one is measured
 _NOISE_S: Final = 0.002
 _HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come

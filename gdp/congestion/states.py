@@ -12,8 +12,6 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Final
 
-__all__ = ["TRANSITIONS", "Signal", "State"]
-
 
 class State(Enum):
     """What governs the window."""

@@ -26,8 +26,6 @@ from gdp.errors import DropReason, FrameError, StatementError
 from gdp.intervals import Rate
 from gdp.token_bucket import TokenBucket, TokenBuckets
 
-__all__ = ["Admission", "Cookies", "cookie_payload", "read_cookie", "seal_cookie"]
-
 _DIGEST: Final = "sha256"
 _SECRET_BYTES: Final = 32
 # a secret is used for this time, and its cookies are accepted for as long again; WireGuard, 5.4.7

@@ -13,8 +13,6 @@ from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason
 from gdp.names import Name
 
-__all__ = ["AdvertiseAck"]
-
 
 @dataclass(frozen=True, slots=True)
 class AdvertiseAck(Body):

@@ -14,8 +14,6 @@ from typing import ClassVar, Final
 from gdp.errors import DropReason, FrameError, RemoteError
 from gdp.requests import Backoff
 
-__all__ = ["ErrorBoundary"]
-
 _FAULTS_BEFORE: Final = 3  # in one name, over one neighbour, until that is quarantined
 _QUARANTINES: Final = Backoff(10.0, 300.0)
 _FORGIVEN_S: Final = 600.0  # after the last fault

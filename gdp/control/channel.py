@@ -38,8 +38,6 @@ from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
 
-__all__ = ["Channels", "Opened", "Outgoing"]
-
 _RECORD: Final = 0x01  # a statement begins with 0xd2
 _UNKNOWN: Final = 0x02
 _ID_BYTES: Final = 8

@@ -21,8 +21,6 @@ from gdp.names import ZERO, Name
 from gdp.trust.adcert import CHAIN
 from gdp.trust.right import RIGHT, Right
 
-__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "RightEvidence", "cut_to_fit"]
-
 ASK_MAX_CHARS: Final = 16
 _ERROR_MAX_CHARS: Final = 32
 _SHORT_REPLY_BYTES: Final = 360  # an empty result, and a few counters

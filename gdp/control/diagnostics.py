@@ -29,8 +29,6 @@ from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
 from gdp.trust.lru import Lru
 
-__all__ = ["Answerer", "Diagnostics", "OnReply", "Question", "Reply"]
-
 _PEERS_MAX: Final = 1_024  # whose certificates and replay windows are kept
 _WINDOW: Final = 256  # requests of one member that may overtake each other
 _PENDING_MAX: Final = 1_024  # requests of our own without a reply yet

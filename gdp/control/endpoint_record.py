@@ -20,8 +20,6 @@ from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 from gdp.trust.domain import Policy
 
-__all__ = ["CANDIDATES_MAX", "RECORD_MAX_BYTES", "UPLINKS_MAX", "Candidate", "CandidateType", "EndpointRecord"]
-
 CANDIDATES_MAX: Final = 16
 UPLINKS_MAX: Final = 4
 RECORD_MAX_BYTES: Final = 4 << 10

@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.errors import DropReason, StatementError
 
-__all__ = ["ENDPOINTS", "ENDPOINT_NAMES_MAX", "item_of", "record_in"]
-
 ENDPOINTS: Final = b"endpoints"
 ENDPOINT_NAMES_MAX: Final = 64  # in one request of a switch
 _LEASE_BYTES: Final = 4

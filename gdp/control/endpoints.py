@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 from gdp.errors import LocalError
 from gdp.names import Name
 
-__all__ = ["ENDPOINT_MAX_BYTES", "Endpoint", "inner_address", "tunnel_vni"]
-
 _PORT_MAX: Final = 65_535
 _ULA: Final = b"\xfd"  # RFC 4193, section 3.1, locally assigned
 _ADDRESS_BYTES: Final = 16

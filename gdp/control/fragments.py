@@ -28,8 +28,6 @@ from gdp.limits import (
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import ZERO
 
-__all__ = ["ControlFragmenter", "ControlReassembler"]
-
 _COST_BYTES: Final = 200  # overhead of an unfinished statement, in addition to its bytes
 _FAR_MTU: Final = MTU_MIN_BYTES  # behind the first link there may be a tunnel, or any link there may be
 

@@ -18,25 +18,6 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = [
-    "COOKIES_MAX",
-    "COOKIE_BYTES",
-    "DIGEST_BYTES",
-    "ECHO_BYTES",
-    "HEARD_MAX",
-    "HELLO_MAX_BYTES",
-    "INCARNATION_BYTES",
-    "INTERVAL_MAX_MS",
-    "MULTIPLIER_MAX",
-    "NONCE_BYTES",
-    "NO_KEEPALIVES",
-    "OBSERVED_MAX",
-    "RTCERTS_MAX",
-    "Hello",
-    "Timing",
-    "echo_of",
-]
-
 NONCE_BYTES: Final = 8
 ECHO_BYTES: Final = 16
 DIGEST_BYTES: Final = 8

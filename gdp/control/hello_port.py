@@ -24,8 +24,6 @@ from gdp.limits import COST_AUTO
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 
-__all__ = ["ANSWER_S", "UNREACHABLE", "HelloPort"]
-
 _ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
 _CREDIT_MAX_BYTES: Final = 16 << 10
 _QUALITIES_MAX: Final = 128  # neighbours and former ones; above all that a port has at once

@@ -28,8 +28,6 @@ from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["HelloReception", "VerifiedHello"]
-
 _PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
 _RTCERTS_REMEMBERED: Final = 256
 

@@ -14,8 +14,6 @@ from typing import Final, TypeVar
 from gdp.control.hello import echo_of
 from gdp.names import Name
 
-__all__ = ["IdentityConflicts"]
-
 _CLASH_S: Final = 3.0  # another node must have our identity for this time, and is reported for as long
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _K = TypeVar("_K")

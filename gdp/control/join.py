@@ -19,8 +19,6 @@ from gdp.intervals import LEASE_MAX_S
 from gdp.limits import FRAME_MAX_BYTES, PACE_MAX, PATHS_MAX
 from gdp.names import ZERO, Name
 
-__all__ = ["ROUTE_MAX", "Join", "Route", "RouteLink"]
-
 ROUTE_MAX: Final = 32  # links of one path
 
 

@@ -16,8 +16,6 @@ from gdp.crypto.schema import Body, Keyed, joined, octets, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 
-__all__ = ["NUMBERS_MAX", "JoinRefresh"]
-
 NUMBERS_MAX: Final = 128  # of one statement, so that it fits into a frame of Ethernet's MTU
 _NUMBERS: Final = joined(
     8, partial(int.from_bytes, byteorder="big"), partial(int.to_bytes, length=8, byteorder="big"), NUMBERS_MAX

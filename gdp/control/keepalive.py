@@ -34,24 +34,6 @@ from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
 from gdp.sansio import KeepaliveRun
 
-__all__ = [
-    "HEAD_BYTES",
-    "JITTER",
-    "PAYLOAD_BYTES",
-    "QUEUED_S",
-    "REPORT",
-    "REPORT_AT",
-    "REPORT_BYTES",
-    "SUSPECT_AFTER",
-    "TAGGED_BYTES",
-    "TAG_BYTES",
-    "KeepaliveSession",
-    "Slowness",
-    "keepalive_header",
-    "open_keepalive",
-    "seal_keepalive",
-]
-
 TAG_BYTES: Final = 16
 _DIGEST_AT: Final = HEADER_BYTES + 2
 REPORT: Final = struct.Struct(">QQIB")  # LinkReport

@@ -25,8 +25,6 @@ from gdp.names import Name
 from gdp.sansio import KeepaliveOffer, KeepaliveRun, Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["SessionOffload"]
-
 
 class SessionOffload:
     """Keepalive sessions of one node, as far as a data plane may run them.

@@ -21,8 +21,6 @@ from typing import Final
 
 from gdp.limits import COST_DEFAULT
 
-__all__ = ["COST_MAX", "COST_UNMEASURED", "DampedCost", "link_cost"]
-
 COST_MAX: Final = 1_000_000
 COST_UNMEASURED: Final = 100  # that of a link of 90 ms: until it is measured, no path leaves a known one for it
 BAND: Final = 1.25

@@ -21,8 +21,6 @@ from typing import Final
 from gdp.control.link_quality import LinkQuality
 from gdp.intervals import SCHEDULED_S
 
-__all__ = ["LinkProbe", "patience_s"]
-
 POLLS_MIN: Final = 3  # two may be lost
 _LEAST_S: Final = 0.05
 _UNMEASURED_S: Final = 0.2

@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 
 from gdp.control.link_cost import DampedCost, link_cost
 
-__all__ = ["LOSS_WINDOW", "LinkQuality", "LinkReport", "LossWindow", "RttEstimator"]
-
 LOSS_WINDOW: Final = 256  # keepalives; 18 s at the default interval
 _LOSS_SEEN_MIN: Final = 64  # of fewer keepalives one lost frame would look like a bad link
 _MASK: Final = (1 << LOSS_WINDOW) - 1

@@ -21,8 +21,6 @@ from gdp.crypto.statements import StatementType
 from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
 from gdp.names import Name
 
-__all__ = ["LINK_KEY_MAX", "Adjacency", "AttachedRib", "LinkState", "LinkStateVersion", "Scope", "link_key"]
-
 LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
 MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border

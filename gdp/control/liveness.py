@@ -20,8 +20,6 @@ from gdp.control.settings import NodeSettings
 from gdp.intervals import HELLO_IDLE, NEVER_S, SCHEDULED_S
 from gdp.names import Name
 
-__all__ = ["LivenessMonitor"]
-
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
 _OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
 _UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time

@@ -23,8 +23,6 @@ from gdp.limits import COST_DEFAULT
 from gdp.names import Name
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["TRANSITIONS", "Neighbour", "NeighbourEvent", "NeighbourState"]
-
 
 class NeighbourState(Enum):
     """States of a neighbour."""

@@ -49,8 +49,6 @@ from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["HelloProtocol"]
-
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 

@@ -15,8 +15,6 @@ from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, Neighb
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["Change", "NeighbourTable"]
-
 NEIGHBOURS_MAX: Final = 64  # on one port
 CANDIDATES_MAX: Final = 32  # on one port, that have not echoed our nonce; the one silent for longest is evicted
 _NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})

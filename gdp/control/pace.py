@@ -15,8 +15,6 @@ from gdp.crypto.statements import StatementType
 from gdp.limits import PACE_MAX
 from gdp.names import Name
 
-__all__ = ["ReaderPace"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReaderPace(Body):

@@ -23,8 +23,6 @@ from gdp.crypto.statements import StatementType
 from gdp.intervals import REFUSED_S
 from gdp.names import Name
 
-__all__ = ["IdentityChecks", "Presence"]
-
 NO_ANSWER_S: Final = 1.5  # above the time after which a switch gives up a silent neighbour
 _BELIEVED_S: Final = 0.5  # an answer "is there" is valid for this time, before the switch is queried again
 _CHECKS_MAX: Final = 1_024

@@ -27,8 +27,6 @@ from gdp.crypto.kem import KEM_PUBLIC_BYTES, SEALING_BYTES, KemPrivateKey, KemPu
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["NO_KEY", "SIZES", "PresharedKeyAgreement", "PresharedKeys"]
-
 _KEY_BYTES: Final = 32
 _TAG_BYTES: Final = 16
 _SEALED_BYTES: Final = SEALING_BYTES + _KEY_BYTES

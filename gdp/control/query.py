@@ -14,8 +14,6 @@ from gdp.intervals import LEASE_MAX_S
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
 
-__all__ = ["Query", "Response"]
-
 TRANSIT_MAX: Final = 64
 
 

@@ -16,8 +16,6 @@ from gdp.crypto.schema import CERT, NAME, STATEMENT, Body, Keyed, many, or_empty
 from gdp.crypto.statements import StatementType
 from gdp.names import Name
 
-__all__ = ["RelayedStatement", "relayed"]
-
 
 @dataclass(frozen=True, slots=True)
 class RelayedStatement(Body):

@@ -25,8 +25,6 @@ from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocations import Revocations
 
-__all__ = ["RevocationSync"]
-
 # totals are repeated so that a lost flood is repaired; replies are at most 3 Mbit/s
 _PACE: Final = SyncPace(total_s=30.0, soon_s=0.5, fetch_s=2.0, reply_s=0.08, reply_bytes=32 << 10, draws=2)
 _TAKEN_RATE: Final = Rate(32.0, burst=256.0)  # messages of one neighbour that are verified

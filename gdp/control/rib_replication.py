@@ -13,8 +13,6 @@ from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, FieldSet, Keyed, many
 from gdp.intervals import LEASE_MAX_S
 from gdp.names import Name
 
-__all__ = ["Entry", "Key"]
-
 Key = tuple[Name, Name]  # name, advertiser
 
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from gdp.control.hello import Timing
 from gdp.intervals import ADVERTISEMENT, DETECT_MULTIPLIER, KEEPALIVE_MS, NEIGHBOUR
 
-__all__ = ["NodeSettings"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSettings:

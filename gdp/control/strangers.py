@@ -12,8 +12,6 @@ from typing import Final
 from gdp.crypto.certificates import issuer_label
 from gdp.errors import DropReason
 
-__all__ = ["Stranger", "Strangers"]
-
 STRANGERS_MAX: Final = 8  # on one port; the one silent for longest is evicted
 
 

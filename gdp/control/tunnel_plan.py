@@ -15,18 +15,6 @@ from gdp.control.endpoints import Endpoint
 from gdp.names import Name
 from gdp.requests import Backoff
 
-__all__ = [
-    "DIAL_S",
-    "REBINDS",
-    "UNDERLAY_PREFIXES",
-    "Dialer",
-    "RebindSchedule",
-    "TunnelId",
-    "planned_tunnels",
-    "tunnel_ifname",
-    "underlay_ifname",
-]
-
 DIAL_S: Final = 1.0  # one candidate is tried for this time before the next one
 REBINDS: Final = Backoff(1.0, 30.0)  # between two other UDP ports of an uplink
 _DIGITS: Final = 11  # IFNAMSIZ - 1 less the prefix

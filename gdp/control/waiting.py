@@ -22,8 +22,6 @@ from gdp.names import Name
 if TYPE_CHECKING:
     from gdp.diagnosis.facts import WaitFact
 
-__all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits", "wait_fact"]
-
 _SETTLE_S: Final = 1.0  # a change of the reason is reported after it has lasted this long
 _STRANGER_S: Final = 2.0  # a refused neighbour that was silent for longer is gone
 

@@ -30,8 +30,6 @@ from gdp.crypto.x509_sign import signed_certificate, signed_request
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 
-__all__ = ["CertificateAuthority", "request_membership"]
-
 _KEY_ID_BYTES: Final = 20
 
 

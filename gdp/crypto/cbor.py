@@ -21,8 +21,6 @@ from typing import Final, NoReturn, TypeAlias
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES
 
-__all__ = ["ITEMS_MAX", "Value", "decode", "encode"]
-
 Value: TypeAlias = "bool | int | float | bytes | str | list[Value] | dict[str, Value] | None"
 
 ITEMS_MAX: Final = 2_048  # bounds one decode to about 1 ms and 250 KiB; a link state has 1,100 at most

@@ -18,8 +18,6 @@ from gdp.crypto.x509_profile import DOMAIN_UNIT, Certificate, bad, issuer_common
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["Membership", "Role", "Root", "Unverified", "issuer_label"]
-
 _SUCCESSIONS_MAX: Final = 8
 _PEM_BEGIN: Final = b"-----BEGIN"
 _PEM_END: Final = b"-----END CERTIFICATE-----\n"

@@ -38,16 +38,6 @@ from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = [
-    "JUMP_MAX",
-    "ControlContext",
-    "ControlOpener",
-    "ControlReplayWindow",
-    "ControlSealer",
-    "control_key",
-    "topic_of",
-]
-
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
 _LENGTH_AND_NUMBER: Final = struct.Struct("!HQ")

@@ -15,8 +15,6 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.errors import DropReason, StatementError
 
-__all__ = ["EXCHANGE_KEY_BYTES", "ExchangeKey"]
-
 EXCHANGE_KEY_BYTES: Final = 32
 _SECRET_BYTES: Final = 32
 

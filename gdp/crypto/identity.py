@@ -20,8 +20,6 @@ from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
 
-__all__ = ["Identity", "NodeKeys", "node_metadata"]
-
 
 @dataclass(frozen=True, slots=True)
 class NodeKeys:

@@ -19,8 +19,6 @@ from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 
-__all__ = ["INTRODUCTION_BYTES", "Introduction"]
-
 _LAYOUT: Final = struct.Struct("!Q32s32s33s64s")
 _SIGNED: Final = struct.Struct("!18s32sQQ32s")
 INTRODUCTION_BYTES: Final = _LAYOUT.size

@@ -24,8 +24,6 @@ from cryptography.hazmat.primitives.asymmetric import x25519
 from gdp.crypto.schema import mapped, octets
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["KEM_PRIVATE_BYTES", "KEM_PUBLIC", "KEM_PUBLIC_BYTES", "SEALING_BYTES", "KemPrivateKey", "KemPublicKey"]
-
 _SEED_BYTES: Final = 64
 _MLKEM_PUBLIC_BYTES: Final = 1_184
 _X25519_BYTES: Final = 32

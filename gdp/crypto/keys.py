@@ -19,8 +19,6 @@ from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, decode_ds
 
 from gdp.errors import DropReason, LocalError, StatementError
 
-__all__ = ["KEY_BYTES", "SIGNATURE_BYTES", "WRONG_PASSPHRASE", "PublicKey", "SigningKey", "SoftwareKey", "is_encrypted"]
-
 KEY_BYTES: Final = 33
 SIGNATURE_BYTES: Final = 64
 WRONG_PASSPHRASE: Final = "does not open: a wrong passphrase, or the file was altered"

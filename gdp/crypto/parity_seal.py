@@ -20,8 +20,6 @@ from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX
 
-__all__ = ["ParityOpener", "ParitySealer"]
-
 _NONCE: Final = struct.Struct("!QI")
 _LAST: Final = int(Flag.LAST)
 

@@ -20,9 +20,6 @@ from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 from gdp.crypto.keys import WRONG_PASSPHRASE
 from gdp.errors import LocalError
 
-__all__ = ["KEY_LABEL", "RANDOM_BYTES", "SECRET_LABEL", "der_element", "is_own_form", "is_secret", "open_secret"]
-__all__ += ["protect"]
-
 KEY_LABEL: Final = "ENCRYPTED PRIVATE KEY"  # RFC 7468, section 11
 SECRET_LABEL: Final = "ENCRYPTED GDP SECRET"
 _SALT_BYTES: Final = 16

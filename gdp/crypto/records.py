@@ -14,8 +14,6 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
 
 from gdp.errors import DropReason, EnvelopeError
 
-__all__ = ["RecordKey"]
-
 _NONCE_BYTES: Final = 12
 
 

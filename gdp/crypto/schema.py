@@ -26,36 +26,6 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES
 from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = [
-    "CERT",
-    "CERTIFICATE",
-    "FLAG",
-    "MAP",
-    "NAME",
-    "NAME_OR_ZERO",
-    "OCTETS",
-    "REASON",
-    "STATEMENT",
-    "Body",
-    "FieldSet",
-    "Form",
-    "Keyed",
-    "Spread",
-    "inner",
-    "joined",
-    "literal",
-    "many",
-    "mapped",
-    "number",
-    "octets",
-    "one_of",
-    "or_empty",
-    "packed",
-    "row",
-    "text",
-    "uint",
-]
-
 _B = TypeVar("_B", bound="FieldSet")
 _E = TypeVar("_E", bound=Enum)
 _L = TypeVar("_L", str, bytes)

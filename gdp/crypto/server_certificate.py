@@ -18,8 +18,6 @@ from gdp.crypto.x509_profile import SubjectInfo, bad, read
 from gdp.errors import DropReason, StatementError
 from gdp.metadata import Metadata
 
-__all__ = ["channel_binding", "issue_server_certificate", "verify_server_certificate"]
-
 _UNIT: Final = "enrolment"
 
 

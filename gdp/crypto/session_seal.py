@@ -25,8 +25,6 @@ from typing import Final
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-__all__ = ["session_secret"]
-
 _INFO: Final = b"gdp-session-1"
 
 

@@ -14,8 +14,6 @@ from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import OWNER_KEY_BYTES, Name, name_of
 
-__all__ = ["NAMED_SUBJECT", "SUBJECT", "Subject"]
-
 
 @dataclass(frozen=True, slots=True)
 class Subject:

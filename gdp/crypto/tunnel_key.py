@@ -15,8 +15,6 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.kem import KemPrivateKey
 
-__all__ = ["TUNNEL_KEY_BYTES", "TunnelKey"]
-
 TUNNEL_KEY_BYTES: Final = 32
 
 

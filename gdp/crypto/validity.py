@@ -14,8 +14,6 @@ from gdp.crypto.schema import Keyed, Spread, uint
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.limits import CLOCK_SKEW_S
 
-__all__ = ["VALIDITY", "Validity"]
-
 
 @dataclass(frozen=True, slots=True)
 class Validity:

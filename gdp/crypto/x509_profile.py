@@ -32,25 +32,6 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 
-__all__ = [
-    "CERTIFICATE_MAX_BYTES",
-    "DOMAIN_UNIT",
-    "FOUNDER_URI",
-    "LABEL_MAX_CHARS",
-    "METADATA_URI",
-    "NAME_URI",
-    "RETIRES_URI",
-    "Certificate",
-    "SubjectInfo",
-    "alternative_names",
-    "bad",
-    "distinguished_name",
-    "issuer_common_name",
-    "read",
-    "read_request",
-    "to_pem",
-]
-
 CERTIFICATE_MAX_BYTES: Final = 4_096
 LABEL_MAX_CHARS: Final = 64  # ub-common-name; RFC 5280, appendix A.1
 NAME_URI: Final = "gdp:"

@@ -16,8 +16,6 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
 from gdp.crypto.pbes2 import der_element
 
-__all__ = ["signed_certificate", "signed_request"]
-
 _SEQUENCE: Final = 0x30
 _BITS: Final = 0x03
 _ECDSA_SHA256: Final = bytes.fromhex("300a06082a8648ce3d040302")  # RFC 5758, section 3.2

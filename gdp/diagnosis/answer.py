@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Answer", "Cause", "Verdict"]
-
 
 class Verdict(Enum):
     """Outcome of a diagnosis; the exit codes of ``gdp explain`` are 0, 1 and 3."""

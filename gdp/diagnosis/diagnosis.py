@@ -14,9 +14,6 @@ from gdp.diagnosis.facts import Facts
 from gdp.diagnosis.view import Rule, View
 from gdp.intervals import REPORT_S
 
-__all__ = ["RULES", "diagnose"]
-
-
 _RULES: Final = network_rules.RULES | name_rules.RULES | right_rules.RULES | stream_rules.RULES
 RULES: Final[Mapping[Cause, Rule]] = {cause: _RULES[cause] for cause in Cause if cause in _RULES}
 _MAY_SETTLE: Final = frozenset(

@@ -9,21 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-__all__ = [
-    "Facts",
-    "FlowFact",
-    "GoneFact",
-    "LocationFact",
-    "ProxyFacts",
-    "RibFacts",
-    "RosProcess",
-    "RouteFact",
-    "SwitchFacts",
-    "TunnelFact",
-    "Unreachable",
-    "WaitFact",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaitFact:

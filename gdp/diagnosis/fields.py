@@ -15,8 +15,6 @@ from typing import Any, Final, TypeVar, Union, get_args, get_origin, get_type_hi
 
 from gdp.errors import DropReason, StatementError
 
-__all__ = ["ITEMS_MAX", "TEXT_MAX_CHARS", "from_fields", "to_fields"]
-
 ITEMS_MAX: Final = 256  # of one collection
 TEXT_MAX_CHARS: Final = 1_024
 

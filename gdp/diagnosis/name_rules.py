@@ -13,8 +13,6 @@ from typing import Final
 from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.view import End, Found, Rule, View, short
 
-__all__ = ["RULES"]
-
 _CHECK: Final = "gdp-proxy --config proxy.yaml --check"
 
 

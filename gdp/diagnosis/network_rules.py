@@ -13,8 +13,6 @@ from gdp.diagnosis.facts import SwitchFacts
 from gdp.diagnosis.view import Found, Node, Rule, View, short
 from gdp.limits import CLOCK_SKEW_S
 
-__all__ = ["RULES"]
-
 _START: Final = "gdp up FOLDER"  # on the machine of the node
 _STRANGER: Final = "neighbour-refused"
 _SILENT: Final = ("no-neighbour", "not-heard")

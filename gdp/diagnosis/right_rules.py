@@ -12,8 +12,6 @@ from typing import Final
 from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.view import End, Found, Rule, View, short
 
-__all__ = ["RULES"]
-
 
 def delegation_expired(view: View) -> Iterator[Found]:
     """A delegation is no longer valid."""

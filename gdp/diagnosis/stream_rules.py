@@ -13,8 +13,6 @@ from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.view import Found, Rule, View, short
 from gdp.intervals import REPORT_S
 
-__all__ = ["RULES"]
-
 _CHECK: Final = "gdp-proxy --config proxy.yaml --check"
 _RELOAD: Final = "gdp reload NODE_DIR"
 

@@ -15,8 +15,6 @@ from gdp.diagnosis.fields import from_fields
 from gdp.errors import StatementError
 from gdp.names import ZERO, Name
 
-__all__ = ["ROLES", "Survey"]
-
 ROLES: Final = ("switch", "rib", "switch", "proxy")  # of the rounds: first the near switch, later the others
 _ASKED_MAX: Final = 24  # far nodes of one round
 _GIVES: Final = ("publish", "serve")

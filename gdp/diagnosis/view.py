@@ -10,8 +10,6 @@ from typing import Final, NamedTuple, TypeAlias
 
 from gdp.diagnosis.facts import Facts, FlowFact, GoneFact, ProxyFacts, RibFacts, SwitchFacts, WaitFact
 
-__all__ = ["End", "Found", "Node", "Rule", "View", "short"]
-
 Node: TypeAlias = ProxyFacts | SwitchFacts | RibFacts
 Found: TypeAlias = tuple[str, str]  # sentence and command
 Rule: TypeAlias = Callable[["View"], Iterator[Found]]

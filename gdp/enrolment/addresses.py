@@ -16,8 +16,6 @@ from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 from gdp.host_port import split_host_port
 
-__all__ = ["default_addresses", "default_directory", "duration_s", "endpoint_of", "is_private", "server_text"]
-
 # Documentation addresses (RFC 5737, RFC 3849): a UDP socket that is connected to them only looks up the route.
 _PROBES: Final = ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1"))
 _UNITS: Final = {"s": 1, "m": 60, "h": 3_600, "d": 86_400}

@@ -64,8 +64,6 @@ from gdp.trust.enrolment_wire import (
     UnreachableError,
 )
 
-__all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]
-
 log = logging.getLogger(__name__)
 
 DELEGATION_KIND: Final = "delegation"  # the body is the content of a delegation's file

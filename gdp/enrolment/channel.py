@@ -42,8 +42,6 @@ from gdp.trust.enrolment_wire import (
 )
 from gdp.trust.join_token import fingerprint_of
 
-__all__ = ["CONNECT_S", "Channel", "client_context", "connect", "connect_any"]
-
 CONNECT_S: Final = 10.0
 _GREETING_MAX_BYTES: Final = 64 << 10
 

@@ -27,8 +27,6 @@ from gdp.stores.keyring import CARD, OWNER_PUBLIC, ROOT_CERTIFICATE, load_root
 from gdp.trust.enrolment_wire import DELEGATIONS_MAX
 from gdp.trust.join_token import JOIN_SECRET_BYTES, SERVERS_MAX, JoinRole, JoinToken, fingerprint_of, join_id, join_key
 
-__all__ = ["BORDER", "DomainPlan", "create_domain", "make_token"]
-
 BORDER: Final = "border"  # role and default label of the domain's own machine
 _STATE: Final = "enrolment"
 _NODES: Final = (("switch", Role.SWITCH), ("rib", Role.RIB), ("proxy", Role.PROXY))

@@ -65,8 +65,6 @@ from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["OPENED_MAX", "EnrolmentDesk", "MemberConnection", "refusal_of"]
-
 log = logging.getLogger(__name__)
 
 OPENED_MAX: Final = 64  # requests per token, an hour, whose keys are verified; a machine needs one, or a few

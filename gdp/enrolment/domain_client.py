@@ -41,8 +41,6 @@ from gdp.trust.enrolment_wire import INSTANCE_BYTES, PAGE, ListedMachine, Listed
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["DomainClient", "Machine", "ReceivedMail", "delete_mail", "fetch_mail", "read_inbox"]
-
 log = logging.getLogger(__name__)
 
 _MACHINES: Final = Keyed("nodes", many(inner(ListedMachine), PAGE))

@@ -21,8 +21,6 @@ from gdp.errors import LocalError
 from gdp.host_port import checked_host_port
 from gdp.trust.join_token import SERVERS_MAX, checked_server
 
-__all__ = ["DOMAIN_FILE", "HANDOVER_SOCKET", "MEMBER_DAYS", "DomainConfig", "DomainFiles"]
-
 DOMAIN_FILE: Final = "domain.yaml"
 HANDOVER_SOCKET: Final = "handover.sock"  # in the server's state: the relay gives it connections of its port
 MEMBER_DAYS: Final = 30.0  # also of the border's first memberships

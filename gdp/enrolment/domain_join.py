@@ -45,8 +45,6 @@ from gdp.trust.enrolment_wire import (
 )
 from gdp.trust.join_token import JoinToken, join_id, join_key, join_proof
 
-__all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
-
 log = logging.getLogger(__name__)
 
 _UNUSED: Final = "the token was not used"

@@ -15,8 +15,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["draft_of", "publish_draft", "reserve_space"]
-
 RESERVED_BYTES: Final = 1 << 20
 _RESERVE: Final = "reserved"
 

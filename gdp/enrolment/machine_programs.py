@@ -17,8 +17,6 @@ from gdp.enrolment.programs import MachineProgram, node_program, programs_of
 from gdp.errors import LocalError
 from gdp.intervals import SERVER_S
 
-__all__ = ["FOG_FILE", "Machine", "check_program", "configured_identity", "read_machine"]
-
 FOG_FILE: Final = "fog.yaml"
 
 

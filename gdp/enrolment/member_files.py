@@ -26,8 +26,6 @@ from gdp.stores.keyring import load_root
 from gdp.trust.enrolment_wire import EnrolmentError
 from gdp.trust.join_token import SERVERS_MAX, checked_server, fingerprint_of
 
-__all__ = ["MEMBER_FILE", "MemberConfig", "MemberFiles"]
-
 MEMBER_FILE: Final = "member.yaml"
 
 

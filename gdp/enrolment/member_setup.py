@@ -20,17 +20,6 @@ from gdp.names import Name
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
-__all__ = [
-    "LISTEN_PORT",
-    "RELAY_FILE",
-    "RELAY_PORT",
-    "WATCH_IFACE",
-    "MachinePlan",
-    "record_file_name",
-    "update_relays",
-    "write_configuration",
-]
-
 LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the TCP port of this number
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"

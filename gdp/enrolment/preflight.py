@@ -17,8 +17,6 @@ from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tcp_server import listen_tcp
 from gdp.ports.tunnel.keeper_process import KeeperProcess
 
-__all__ = ["check_ports", "check_tunnels"]
-
 _ALIAS: Final = "gdp preflight"
 _TAKEN: Final = "is in use by another program (ss -lntup shows it); end that one, or state another port with"
 

@@ -17,8 +17,6 @@ from gdp.enrolment.member_setup import RELAY_FILE
 from gdp.errors import LocalError
 from gdp.extras import find_entry_point, install_command
 
-__all__ = ["MachineProgram", "missing_ros", "node_program", "programs_of"]
-
 _NET: Final = ("CAP_NET_RAW", "CAP_NET_ADMIN")
 _AWAIT_S: Final = "60"
 _ROS_VARIABLES: Final = (

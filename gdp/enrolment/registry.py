@@ -25,8 +25,6 @@ from gdp.stores.transactions import TransactionFile
 from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 from gdp.trust.right import Right
 
-__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Plan", "Registry", "StoredMail", "TokenRow"]
-
 MAILBOX_MAX: Final = 1_024  # mails that wait for one node
 MAILBOX_MAX_BYTES: Final = 4 << 20
 _SENDER_MAX: Final = MAILBOX_MAX // 4  # of them, by the nodes of one machine

@@ -26,8 +26,6 @@ from gdp.stores.keyring import load_domain
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
-__all__ = ["Removed", "remove_machine"]
-
 _SUFFIX = ".revoke"
 _TITLE_CHARS = 32  # of the fingerprint
 

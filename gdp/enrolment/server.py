@@ -46,8 +46,6 @@ from gdp.trust.enrolment_wire import (
     read_message,
 )
 
-__all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "bind_unix", "serve_domain", "serve_domain_in_thread"]
-
 log = logging.getLogger(__name__)
 
 STRANGER_S: Final = 10.0

@@ -19,8 +19,6 @@ from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, write_all
 from gdp.stores.keyring import load_domain
 
-__all__ = ["CERTIFICATE_DAYS", "ServerTls", "make_server_tls"]
-
 CERTIFICATE_DAYS: Final = 30.0  # the server issues another one at each start, and each day
 _FILE: Final = "tls.pem"
 

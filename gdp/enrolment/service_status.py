@@ -22,8 +22,6 @@ from gdp.management.control_client import ask_node, control_path, find_control_s
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
 
-__all__ = ["UnitState", "known_units", "unit_state"]
-
 _PACKAGED: Final = Path("/usr/lib/systemd/system")
 _RUNTIME: Final = re.compile(r"^Environment=.*?\bXDG_RUNTIME_DIR=(\S+)", re.MULTILINE)
 _EXEC: Final = re.compile(r"^ExecStart=(.*)$", re.MULTILINE)

@@ -19,8 +19,6 @@ from gdp.enrolment.programs import MachineProgram
 from gdp.enrolment.units import MARK, quoted, unit_names
 from gdp.errors import LocalError
 
-__all__ = ["STATE_FOLDER", "service_texts"]
-
 STATE_FOLDER: Final = Path("/var/lib/gdp-ros")
 _CONFIG_FOLDER: Final = Path("/etc/gdp")
 _PREFIX: Final = Path("/usr/lib/gdp-ros")

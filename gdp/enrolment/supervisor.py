@@ -25,8 +25,6 @@ from gdp.intervals import STEADY_S
 from gdp.requests import Backoff
 from gdp.terminal import echo
 
-__all__ = ["Failures", "supervise"]
-
 log = logging.getLogger(__name__)
 
 _RESTARTS: Final = Backoff(0.2, 15.0)

@@ -16,18 +16,6 @@ from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
 from gdp.stores.files import public, write_all
 
-__all__ = [
-    "MARK",
-    "UNIT_FOLDER",
-    "has_systemd",
-    "install_units",
-    "installed_units",
-    "quoted",
-    "remove_units",
-    "systemctl",
-    "unit_names",
-]
-
 MARK: Final = (
     "# gdp service: "  # begins the first line of each unit, in earlier versions too; then the machine's folder
 )

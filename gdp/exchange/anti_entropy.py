@@ -31,8 +31,6 @@ from typing import Any, Final, Generic, TypeVar
 from gdp.exchange.sync_message import ASKED_MAX, CAPACITY_BYTES, LACKING_MAX, SyncMessage, pages
 from gdp.exchange.sync_set import FANOUT, HASH_BYTES, LINE_BYTES, PREFIX_MAX_BYTES, SyncSet
 
-__all__ = ["AntiEntropy", "SyncPace"]
-
 _HASHES_BYTES: Final = FANOUT * HASH_BYTES
 _FEW: Final = _HASHES_BYTES // LINE_BYTES  # items below a prefix that are listed, or sent; for more, hashes are shorter
 _LINES_MAX: Final = 512  # of one prefix in a request

@@ -15,8 +15,6 @@ from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_set import FANOUT, HASH_BYTES, LINE_BYTES, PREFIX_MAX_BYTES
 from gdp.names import NAME_BYTES
 
-__all__ = ["ASKED_MAX", "CAPACITY_BYTES", "ITEMS_MAX", "LACKING_MAX", "SETS_MAX", "SyncMessage", "pages"]
-
 SETS_MAX: Final = 128
 ASKED_MAX: Final = 16  # prefixes in one request, each of which brings 2 KiB
 LACKING_MAX: Final = 400

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Final, Generic, TypeVar
 
-__all__ = ["FANOUT", "HASH_BYTES", "LINE_BYTES", "PREFIX_MAX_BYTES", "SyncSet", "line_of", "rank_in"]
-
 FANOUT: Final = 256
 HASH_BYTES: Final = 8
 PREFIX_MAX_BYTES: Final = 2  # of a prefix that has hashes below it, or is a leaf

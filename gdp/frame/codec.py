@@ -19,35 +19,6 @@ from gdp.limits import PARTS_MAX
 from gdp.names import NAME_BYTES
 from gdp.sansio import new_tuple
 
-__all__ = [
-    "DESTINATION_AT",
-    "ETHER_BYTES",
-    "FLAGS_AT",
-    "HEADER_BYTES",
-    "HOPS_AT",
-    "HOPS_MASK",
-    "INCARNATION_AT",
-    "KIND_AT",
-    "LENGTH_AT",
-    "NUMBER_AND_PART",
-    "NUMBER_AT",
-    "OVERHEAD_BYTES",
-    "PACE_AT",
-    "PARTS_AT",
-    "PARTS_MASK",
-    "PART_AT",
-    "SECOND_PATH",
-    "SOURCE_AT",
-    "Header",
-    "authenticated",
-    "decode",
-    "encode",
-    "ethernet",
-    "layout",
-    "second_path_copy",
-    "second_path_key",
-]
-
 ETHER_BYTES: Final = 14
 HEADER_BYTES: Final = 96
 OVERHEAD_BYTES: Final = ETHER_BYTES + HEADER_BYTES

@@ -13,8 +13,6 @@ from typing import Final
 
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES
 
-__all__ = ["SHOWN_BYTES", "byte_string", "diagnose"]
-
 SHOWN_BYTES: Final = 32  # a name is shown completely, a longer string by its beginning and its size
 _SIMPLE: Final = {20: "false", 21: "true", 22: "null"}
 _FLOATS: Final = {2: struct.Struct("!e"), 4: struct.Struct("!f"), 8: struct.Struct("!d")}

@@ -9,8 +9,6 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import Final
 
-__all__ = ["CONTROL_FROM", "ETHERTYPE", "VERSION", "Flag", "KeepaliveFlag", "Kind"]
-
 ETHERTYPE: Final = 0x88B5  # IEEE 802 local experimental EtherType 1; IEEE 802-2014, clause 9.2.4
 VERSION: Final = 1
 CONTROL_FROM: Final = 0x80

@@ -39,27 +39,6 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = [
-    "FLAG_NAMES",
-    "GDP",
-    "KIND_NAMES",
-    "PAYLOADS",
-    "STATEMENTS",
-    "CborBytesField",
-    "Cookie",
-    "HopsField",
-    "Keepalive",
-    "LastPart",
-    "NameField",
-    "Note",
-    "ParityFrame",
-    "Part",
-    "RestField",
-    "Statement",
-    "layout",
-    "least_bytes",
-]
-
 KIND_NAMES: Final = {int(kind): kind.name.lower().replace("_", "-") for kind in Kind}
 FLAG_NAMES: Final = [next((f.name.lower() for f in Flag if f.name and f == 1 << bit), f"bit{bit}") for bit in range(8)]
 _NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE, Kind.COOKIE})  # of the kinds for the neighbour itself

@@ -21,8 +21,6 @@ from gdp.errors import LocalError
 from gdp.host.mounts import roots
 from gdp.intervals import LOOK_S, STOP_S
 
-__all__ = ["Cgroup"]
-
 _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
 _PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow machine runs evenly
 _LEAST_US: Final = 1_000  # the kernel accepts no quota below this

@@ -10,8 +10,6 @@ import signal
 from collections.abc import Coroutine
 from typing import Final, TypeVar
 
-__all__ = ["Interrupted", "interruptible", "let_nothing_interrupt"]
-
 T = TypeVar("T")
 
 _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -17,8 +17,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["mount_tmpfs", "roots", "unmount"]
-
 _MNT_DETACH: Final = 2
 _NOTHING_THERE: Final = (errno.EINVAL, errno.ENOENT)
 

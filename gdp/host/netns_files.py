@@ -24,8 +24,6 @@ from gdp.host.mounts import roots, unmount
 from gdp.host.processes import Process
 from gdp.ports.sockets import AS_ROOT
 
-__all__ = ["IP_NETNS_DIRECTORY", "create", "disable_ipv6", "inside", "processes_inside", "reach", "release"]
-
 IP_NETNS_DIRECTORY: Final = Path("/run/netns")
 _NO_IPV6: Final = ("all", "default")
 _OWN: Final = Path("/proc/self/ns/net")

@@ -15,8 +15,6 @@ from pathlib import Path
 
 from gdp.ports.readiness import readable
 
-__all__ = ["Process", "boot_id", "end_all"]
-
 
 @dataclass(frozen=True, slots=True)
 class Process:

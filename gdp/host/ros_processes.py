@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.diagnosis.facts import RosProcess
 
-__all__ = ["ros_processes"]
-
 _LIBRARIES: Final = ("librcl.so", "librmw", "libfastrtps", "libfastdds", "libddsc.so")
 _COMMAND_CHARS: Final = 60
 _FOUND_MAX: Final = 64

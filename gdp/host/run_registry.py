@@ -26,8 +26,6 @@ from gdp.host.processes import Process, boot_id, end_all
 from gdp.intervals import FORGET_S
 from gdp.stores.ownership import refuse_foreign_folder
 
-__all__ = ["Record", "Run", "RunRegistry", "in_first_user_namespace", "outer_uid"]
-
 log = logging.getLogger(__name__)
 
 _ID_BYTES: Final = 3

@@ -16,8 +16,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.intervals import HOUR_S
 
-__all__ = ["ServiceNotifier", "service_notifier"]
-
 log = logging.getLogger(__name__)
 
 _SOCKET, _TIMEOUT, _PROCESS = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"

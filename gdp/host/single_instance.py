@@ -29,8 +29,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.names import Name
 
-__all__ = ["lock_directories", "lock_directory", "own_devices", "run_alone"]
-
 log = logging.getLogger(__name__)
 
 _ROOT_DIRECTORY: Final = Path("/run/gdp-locks")

@@ -23,8 +23,6 @@ from gdp.crypto.kem import KemPrivateKey, KemPublicKey
 from gdp.errors import LocalError, RemoteError
 from gdp.journal.journal import LENGTH
 
-__all__ = ["Incident", "well_formed"]
-
 _MAGIC: Final = b"GDPI"
 _VERSION: Final = 1
 _DIGEST_BYTES: Final = 32

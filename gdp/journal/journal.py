@@ -42,8 +42,6 @@ from gdp.rib.state import RibSettings
 from gdp.sansio import KeepaliveRun, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["CALLS", "LENGTH", "Journal", "JournalKey"]
-
 
 def _moment(value: Any) -> Timestamps:
     return Timestamps(*map(float, value))

@@ -34,8 +34,6 @@ from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.domain import Policy
 
-__all__ = ["Replay", "kind_of"]
-
 Core = SwitchCore | RibHost
 
 

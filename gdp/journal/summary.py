@@ -16,8 +16,6 @@ from gdp.journal.incident import Incident, well_formed
 from gdp.journal.replay import kind_of
 from gdp.names import Name
 
-__all__ = ["summary"]
-
 _LINES: Final = 20  # of the timeline
 _FRAMES: Final = ("in", "out", "bytes in", "bytes out")
 _Row = dict[str, object]

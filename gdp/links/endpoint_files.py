@@ -16,8 +16,6 @@ from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 
-__all__ = ["RECORD_SUFFIX", "own_record", "public_candidates", "record_files"]
-
 RECORD_SUFFIX: Final = ".endpoints"
 
 

@@ -34,8 +34,6 @@ from gdp.switch.core import SwitchCore
 from gdp.switch.direct_tunnels import Close, Open, Retry, Silence
 from gdp.trust.domain import Policy
 
-__all__ = ["TunnelLinks"]
-
 log = logging.getLogger(__name__)
 
 _RECORDS_PERIOD_S: Final = 0.3

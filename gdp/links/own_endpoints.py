@@ -21,8 +21,6 @@ from gdp.ports.host_addresses import AddressMonitor, host_addresses
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["OwnEndpoints", "listed_candidates"]
-
 log = logging.getLogger(__name__)
 
 _ADDRESSES_PERIOD_S: Final = 10.0  # where no notification comes, such as for a device that moves between namespaces

@@ -22,8 +22,6 @@ from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 from gdp.trust.revocations import OPERATOR
 
-__all__ = ["RelayContext"]
-
 log = logging.getLogger(__name__)
 
 

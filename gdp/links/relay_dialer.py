@@ -35,8 +35,6 @@ from gdp.relay.connection import ConnectionCounters, RelayConnection
 from gdp.requests import Backoff
 from gdp.sansio import Timestamps
 
-__all__ = ["BorderDialer"]
-
 log = logging.getLogger(__name__)
 
 _REDIALS: Final = Backoff(0.1, 5.0)

@@ -18,8 +18,6 @@ from typing import Final
 from gdp.links.relay_loop import RelayLoop
 from gdp.relay.client_hello import ENROLMENT_ALPN, HELLO_MAX_BYTES, read_client_hello
 
-__all__ = ["HelloWait", "hand_over"]
-
 log = logging.getLogger(__name__)
 
 _OVER: Final = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR  # no more bytes come

@@ -22,8 +22,6 @@ from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionCounters, ConnectionState, RelayConnection
 from gdp.runtime.runtime import now
 
-__all__ = ["RelayLink", "RelayPort", "prepare_socket"]
-
 log = logging.getLogger(__name__)
 
 _SIOCOUTQNSD: Final = 0x894B

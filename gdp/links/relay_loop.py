@@ -19,8 +19,6 @@ from gdp.runtime.runtime import Periodic, now
 from gdp.runtime.signals import handled_signals
 from gdp.sansio import Timestamps
 
-__all__ = ["RelayLoop", "Timed"]
-
 
 class Timed(Protocol):
     """A part of the relay with timers."""

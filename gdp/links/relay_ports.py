@@ -22,8 +22,6 @@ from gdp.sansio import Timestamps
 if TYPE_CHECKING:  # a relay, which knows the devices by their mark, loads no switch
     from gdp.switch.core import SwitchCore
 
-__all__ = ["RELAY_COST", "VIA", "RelayPorts"]
-
 log = logging.getLogger(__name__)
 
 RELAY_COST: Final = 1_000

@@ -32,8 +32,6 @@ from gdp.relay.connection import ConnectionCounters, Limits, RelayConnection
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket, TokenBuckets
 
-__all__ = ["BorderServer", "listen_tls", "port_status"]
-
 log = logging.getLogger(__name__)
 
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once

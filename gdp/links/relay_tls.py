@@ -16,8 +16,6 @@ from gdp.errors import LocalError
 from gdp.relay.tls_channel import ALPN
 from gdp.trust.domain import Policy
 
-__all__ = ["tls_context"]
-
 _NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME: ``Policy`` checks it, with the project's tolerance of clocks
 _PARTIAL_CHAIN = ssl.VERIFY_X509_PARTIAL_CHAIN  # a root that succeeds another is an anchor by itself
 

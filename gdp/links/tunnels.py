@@ -36,8 +36,6 @@ from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["Tunnel", "Tunnels", "open_underlays"]
-
 log = logging.getLogger(__name__)
 
 _OUTER_MTU: Final = 1_500  # until a route to an endpoint is known

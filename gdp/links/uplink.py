@@ -19,8 +19,6 @@ from gdp.ports.raw import RawPlane
 from gdp.ports.readiness import readable
 from gdp.ports.rtnetlink import LinkMonitor
 
-__all__ = ["load_plane", "open_uplink", "refuse_loopback", "wait_for_device"]
-
 log = logging.getLogger(__name__)
 
 

@@ -25,8 +25,6 @@ from gdp.ports.tunnel.devices import (
     remove_own_device,
 )
 
-__all__ = ["attach_pairs", "switch_end"]
-
 log = logging.getLogger(__name__)
 
 

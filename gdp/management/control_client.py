@@ -30,18 +30,6 @@ from gdp.state.control_protocol import (
     encode_request,
 )
 
-__all__ = [
-    "NodeConnection",
-    "NodeEndedError",
-    "NotRunningError",
-    "ask_node",
-    "control_path",
-    "control_sockets",
-    "find_control_socket",
-    "find_control_socket_of",
-    "request_control",
-]
-
 _RECEIVE_BYTES: Final = 1 << 16
 _ABSENT: Final = (errno.ENOENT, errno.ECONNREFUSED, errno.ENOTDIR)
 

@@ -37,15 +37,6 @@ from gdp.state.control_protocol import (
     encode_response,
 )
 
-__all__ = [
-    "CONTROL_SOCKET",
-    "ControlHandlers",
-    "ControlServer",
-    "connect_control",
-    "serve_control_in_thread",
-    "short_path",
-]
-
 log = logging.getLogger(__name__)
 
 CONTROL_SOCKET: Final = "control.sock"  # in the folder of a process without an identity

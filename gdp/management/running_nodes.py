@@ -18,8 +18,6 @@ from gdp.names import Name
 from gdp.state.control_protocol import Command, Response
 from gdp.state.topic_rows import TopicRow, rows_from_fields
 
-__all__ = ["Found", "NodeTopics", "RunningNode", "find_running_nodes", "read_topics"]
-
 _ROLES: Final = frozenset({"switch", "leaf", "rib", "proxy"})  # as of a membership, without what reads one
 
 

@@ -14,8 +14,6 @@ from gdp.intervals import ANSWER_S, TICK_S
 from gdp.management.control_client import ask_node
 from gdp.state.control_protocol import Command
 
-__all__ = ["SwitchWatch", "peers_up"]
-
 
 class SwitchWatch:
     """The watch; it begins with ``start``, after the confinement of rights, which applies to threads started later.

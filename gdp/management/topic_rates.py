@@ -12,8 +12,6 @@ from gdp.management.running_nodes import NodeTopics, RunningNode
 from gdp.names import Name
 from gdp.state.topic_rows import Direction, TopicRow
 
-__all__ = ["RatedRow", "known_names", "rated_rows"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatedRow:

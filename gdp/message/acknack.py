@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 from gdp.errors import DropReason, FrameError
 from gdp.limits import NACKS_PER_REPORT
 
-__all__ = ["FRAMES_MASK", "AckNack", "AckNackFlag", "MissingRange"]
-
 _HEAD: Final = struct.Struct("!BBQIQQIQIIIQH")
 _HEAD_BYTES: Final = _HEAD.size
 _U32_MAX: Final = (1 << 32) - 1

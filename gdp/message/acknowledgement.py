@@ -15,8 +15,6 @@ from gdp.intervals import NEVER_S, READER
 from gdp.message.retransmission import repair_allowance
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["ReaderPosition", "ReaderPositions"]
-
 _BEYOND_ALL: Final = 1 << 64  # above every message number
 
 

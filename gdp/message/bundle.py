@@ -15,8 +15,6 @@ from typing import Final
 
 from gdp.errors import DropReason, FrameError
 
-__all__ = ["BUNDLE_BYTES", "BUNDLE_MAX_BYTES", "Gathered", "pack", "unpack"]
-
 # the largest bundle that a publisher makes; larger ones save hardly more, and the first message in it waits longer
 BUNDLE_BYTES: Final = 48 << 10
 # the largest bundle that a reader accepts: it bounds how many messages one frame may yield

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     _Rows = npt.NDArray[np.uint64]
     _Picks = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
-__all__ = ["DATA_MAX", "PARITY_MAX", "decode", "encode", "is_available"]
-
 DATA_MAX: Final = 128  # shards of a block
 PARITY_MAX: Final = 32  # ... and its parity
 _POLYNOMIAL: Final = 0x11D

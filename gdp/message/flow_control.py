@@ -11,8 +11,6 @@ from typing import Final
 from gdp.limits import FLIGHT_MAX_BYTES
 from gdp.requests import Backoff
 
-__all__ = ["PROBES", "FlowControl", "RoundTripEstimator"]
-
 PROBES: Final = Backoff(0.03, 0.25)  # of readers from which nothing comes
 
 

@@ -18,8 +18,6 @@ from gdp.frame.codec import NUMBER_AT
 from gdp.intervals import PACE_S
 from gdp.message.acknack import FRAMES_MASK
 
-__all__ = ["FrameLoss"]
-
 _MEMORY_FRAMES: Final = 1_000
 _LEAST_FRAMES: Final = 64  # before this many were reported, nothing is known
 _MARKS_MAX: Final = 16_384  # message numbers whose place among the sent frames is remembered

@@ -28,8 +28,6 @@ from gdp.message.parity import Block, Parity, blocks_of, frame_of, shard_of, spa
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["WAIT_MAX_S", "FrameRecovery"]
-
 WAIT_MAX_S: Final = 0.25  # for parity, from when a gap was found
 _QUIET_S, _QUIET_MAX_S = 0.020, 0.060  # a pause of the writer after which no more parity is awaited
 _QUIET_FRAMES: Final = 4  # ... or the usual time of so many frames

@@ -21,8 +21,6 @@ from gdp.limits import NUMBER_MAX
 from gdp.message.loss import GONE_MAX, LossReason, LostRange
 from gdp.message.renumbering import MOVES_MAX, Renumbering
 
-__all__ = ["PACES_MAX", "STARTS_MAX", "Heartbeat", "StreamStart"]
-
 STARTS_MAX: Final = 64  # readers whose start one Heartbeat carries; more get the next one
 PACES_MAX: Final = 32
 _HEAD: Final = struct.Struct("!QQQIQHBB")

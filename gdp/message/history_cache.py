@@ -10,8 +10,6 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["CachedMessage", "HistoryCache"]
-
 
 @dataclass(slots=True, kw_only=True)
 class CachedMessage:

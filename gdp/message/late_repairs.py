@@ -41,8 +41,6 @@ from gdp.message.flow_control import RoundTripEstimator
 from gdp.message.reassembly import SCAN_PARTS, Reassembler
 from gdp.requests import Backoff
 
-__all__ = ["HOLD_S", "LateRepairs"]
-
 HOLD_S: Final = 0.3  # for which a complete message waits for an older one
 _TRIES: Final = 6  # requests for the same fragments, if nothing comes
 _REPEATS: Final = Backoff(REPORT_DELAY_S, 32 * REPORT_DELAY_S)  # until a repair was measured

@@ -14,8 +14,6 @@ from typing import Final
 from gdp.message.loss import GONE_MAX, Losses, LossReason, LostRange, RangeSet, append
 from gdp.message.renumbering import Renumbering
 
-__all__ = ["Ledger"]
-
 _TIMES_MAX: Final = 64  # messages whose time of publication is remembered; every second one goes when they are more
 
 

@@ -12,8 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = ["GONE_MAX", "LossReason", "Losses", "LostRange", "RangeSet", "append", "by_label", "explain"]
-
 RANGES_MAX: Final = 64  # latest ranges that are kept; the counts go on
 GONE_MAX: Final = 16  # ranges that a publisher repeats to its readers with their reason
 _SET_MAX: Final = 1_024

@@ -19,18 +19,6 @@ from gdp.frame.codec import HEADER_BYTES, Header, encode
 from gdp.frame.kinds import Flag
 from gdp.message.erasure import DATA_MAX, PARITY_MAX
 
-__all__ = [
-    "OVERHEAD_BYTES",
-    "SHARD_OVERHEAD_BYTES",
-    "SPAN_PARTS",
-    "Block",
-    "Parity",
-    "blocks_of",
-    "frame_of",
-    "shard_of",
-    "span_of",
-]
-
 SPAN_PARTS: Final = 1_024  # what a reader keeps for a message of any size: 1.5 MB of frames of 1,500 bytes
 _LENGTH: Final = struct.Struct("!H")
 _FIELDS: Final = struct.Struct("!IBB")

@@ -33,8 +33,6 @@ from gdp.message.second_copies import REPEATED_PARTS_MAX, RepeatedFrames, Second
 from gdp.message.striping import StripedPaths
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["ALL_PARTS", "SCAN_PARTS", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
-
 ALL_PARTS = 0xFFFF_FFFF
 _URGENT = int(Flag.URGENT)  # a plain number: an IntFlag's operators cost a microsecond each
 _PREPAID_BYTES = 32 << 10  # memory is reserved ahead for this many bytes of a message whose fragments come in order

@@ -14,8 +14,6 @@ from weakref import WeakKeyDictionary
 from gdp.errors import LocalError
 from gdp.limits import JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES
 
-__all__ = ["QuotaHolder", "ReassemblyQuota"]
-
 
 class QuotaHolder(Protocol):
     """Holder of unfinished messages, some of which it can drop."""

@@ -13,8 +13,6 @@ from collections.abc import Iterable, Sequence
 from math import sqrt
 from typing import Final
 
-__all__ = ["RECEIPTS_MASK", "ReceiptCheck"]
-
 RECEIPTS_MASK: Final = (1 << 64) - 1  # of a sum
 _DUE_MAX: Final = 16  # samples of one report; of more nothing is concluded, because the sums of all sets are tried
 _SPARE_MAX: Final = 8  # samples that may come in addition: late ones, and repairs

@@ -15,8 +15,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["MOVES_MAX", "Renumbering"]
-
 MOVES_MAX = 16  # renumberings that a publisher repeats; a reader that missed more has been silent for long
 
 

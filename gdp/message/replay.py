@@ -9,8 +9,6 @@ from collections.abc import Iterator
 
 from gdp.limits import REPLAY_WINDOW_MESSAGES
 
-__all__ = ["ReplayWindow"]
-
 
 class ReplayWindow:
     """The last ``size`` message numbers of one incarnation; older ones count as finished.

@@ -18,8 +18,6 @@ from gdp.message.flow_control import PROBES
 from gdp.message.history_cache import HistoryCache
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["RetransmissionQueue", "repair_allowance"]
-
 # fragments examined for reports of one reader: in a second more than a process sends, and 2 % of a core; at once more
 # than a window of small frames has
 _SCAN_RATE: Final = Rate(131_072, burst=8_192)

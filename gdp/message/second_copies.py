@@ -14,8 +14,6 @@ from typing import Final
 from gdp.limits import PATH_LAG_MAX_S, SENDS_MAX
 from gdp.message.acknack import MissingRange
 
-__all__ = ["REPEATED_PARTS_MAX", "DeferredRequests", "RepeatedFrames", "SecondCopies"]
-
 REPEATED_PARTS_MAX: Final = 2  # fragments of a message whose frames may be repeated over one path
 _KEPT_MESSAGES, _KEPT_FRAMES = 256, 512  # that are remembered until their copies come
 _FORGET_S: Final = 1.0  # frames without a copy for this time: no copies are sent, or one path is broken

@@ -29,8 +29,6 @@ from gdp.message.history_cache import CachedMessage, HistoryCache
 from gdp.message.renumbering import Renumbering
 from gdp.message.retransmission import RetransmissionQueue
 
-__all__ = ["SendWindow"]
-
 
 class SendWindow:
     """The frames of a reliable topic, from the oldest that a reader may still lack to the newest.

@@ -7,8 +7,6 @@ much as one of them holds stays free for the next one, and no owner loses what i
 
 from __future__ import annotations
 
-__all__ = ["Shares"]
-
 
 class Shares:
     """Shares of a capacity, by owner."""

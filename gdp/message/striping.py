@@ -17,8 +17,6 @@ from typing import Final
 from gdp.frame.codec import INCARNATION_AT, PACE_AT, PART_AT, PARTS_AT, second_path_copy
 from gdp.limits import PATH_LAG_MAX_S, STRIPES_FROM_PARTS
 
-__all__ = ["SHARE_WHOLE", "StripedPaths", "Striper"]
-
 SHARE_WHOLE: Final = 255
 _START: Final = 0.5
 _KEPT: Final = 64  # messages under way whose paths are compared

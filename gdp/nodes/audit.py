@@ -17,8 +17,6 @@ from gdp.sansio import Timestamps
 from gdp.stores.audit_log import AuditLog
 from gdp.trust.audit import Action, AuditTrail
 
-__all__ = ["NodeAudit", "audit_folder"]
-
 log = logging.getLogger(__name__)
 
 _STATE: Final = "STATE_DIRECTORY"

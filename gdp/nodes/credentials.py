@@ -22,8 +22,6 @@ from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed
 from gdp.trust.domain import Policy
 
-__all__ = ["Credentials", "NodeConfig", "watched_folders"]
-
 log = logging.getLogger(__name__)
 
 _PUBLIC: Final = (".crt", ".pem", ".cer")

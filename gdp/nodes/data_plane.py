@@ -16,8 +16,6 @@ from gdp.ports.netdev import NetdevPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
 
-__all__ = ["Chosen", "choose_plane"]
-
 log = logging.getLogger(__name__)
 
 _BEST: Final = "kernel"

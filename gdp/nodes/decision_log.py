@@ -17,8 +17,6 @@ from gdp.sansio import Timestamps
 from gdp.state.node_state import NodeState, SwitchState
 from gdp.switch.table import Hops, Table
 
-__all__ = ["DecisionLog", "log_decisions"]
-
 log = logging.getLogger(__name__)
 
 _LINES_MAX: Final = 64  # of each kind in one look

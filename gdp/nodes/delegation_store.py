@@ -22,8 +22,6 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.grants import EPOCH_S, begun_epochs
 from gdp.trust.right import Right
 
-__all__ = ["DelegationStore", "EpochTimer", "open_delegation"]
-
 log = logging.getLogger(__name__)
 
 

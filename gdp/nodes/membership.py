@@ -23,8 +23,6 @@ from gdp.intervals import ADVERTISEMENT
 from gdp.stores.keyring import load_identity, load_root, storage
 from gdp.trust.domain import Policy
 
-__all__ = ["fresh_bytes", "fresh_settings", "incarnation", "load_member", "load_policy", "wall_clock_ms"]
-
 _CLOCKS: Final = struct.Struct("!qq")
 _MACHINE_IDS: Final = (Path("/proc/sys/kernel/random/boot_id"), Path("/sys/class/dmi/id/product_uuid"))
 

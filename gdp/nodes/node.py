@@ -52,8 +52,6 @@ if TYPE_CHECKING:
     from gdp.journal.journal import Journal
     from gdp.rib.state import RibSettings
 
-__all__ = ["Loop", "Node", "common_handlers", "common_sources"]
-
 log = logging.getLogger(__name__)
 
 

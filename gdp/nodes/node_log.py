@@ -18,8 +18,6 @@ from gdp.state.node_state import NodeState, SwitchState
 from gdp.telemetry.health import Health
 from gdp.trust.audit import Action
 
-__all__ = ["NodeLog", "OnWait"]
-
 log = logging.getLogger(__name__)
 
 

@@ -38,8 +38,6 @@ from gdp.state.control_status import node_status
 from gdp.telemetry.health import Health
 from gdp.telemetry.sources import Sources
 
-__all__ = ["Relay", "relay_control_path", "run_relay"]
-
 log = logging.getLogger(__name__)
 
 

@@ -18,8 +18,6 @@ from gdp.trust.revocations import Revocations
 if TYPE_CHECKING:
     from gdp.stores.revocation_file import RevocationFile
 
-__all__ = ["RevocationUpkeep"]
-
 log = logging.getLogger(__name__)
 
 

@@ -36,8 +36,6 @@ from gdp.state.state_answers import answer_for_rib
 from gdp.telemetry.sources import Sources
 from gdp.trust.domain import Policy
 
-__all__ = ["rib_handlers", "rib_sources", "run_rib"]
-
 log = logging.getLogger(__name__)
 
 

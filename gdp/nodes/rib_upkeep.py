@@ -18,8 +18,6 @@ from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
 from gdp.stores.snapshot import SLICE, Snapshot
 
-__all__ = ["MemoryUpkeep", "Upkeep"]
-
 log = logging.getLogger(__name__)
 
 CHANGES_MAX: Final = 65_536  # that wait for disk space, or twice the number of kept routes

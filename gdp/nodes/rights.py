@@ -30,8 +30,6 @@ if TYPE_CHECKING:  # a node loads its own configuration alone
     from gdp.config.relay_config import RelayConfig, RelayServer
     from gdp.config.schema import Metrics
 
-__all__ = ["confine_proxy", "confine_relay", "confine_rib", "confine_switch"]
-
 log = logging.getLogger(__name__)
 
 _DEVICE: Final = frozenset({Capability.NET_RAW, Capability.NET_ADMIN})

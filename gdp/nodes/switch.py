@@ -48,8 +48,6 @@ if TYPE_CHECKING:  # a switch without tunnels loads nothing of them
     from gdp.links.relay_ports import RelayPorts
     from gdp.ports.tunnel.wireguard import WireGuardDevice
 
-__all__ = ["run_switch", "switch_handlers", "switch_sources"]
-
 log = logging.getLogger(__name__)
 
 _MTU_FALLBACK = 1_500

@@ -30,8 +30,6 @@ from typing import BinaryIO, Final
 from gdp.errors import LocalError
 from gdp.ports.sockets import NO_RAW_SOCKETS, kernel_drops, large_buffers
 
-__all__ = ["Capture", "main"]
-
 _ETH_P_ALL: Final = 0x0003
 _SO_TIMESTAMPNS: Final = 35
 _STAMP: Final = struct.Struct("@qq")

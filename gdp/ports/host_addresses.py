@@ -24,8 +24,6 @@ from gdp.ports.netlink import (
     nested,
 )
 
-__all__ = ["AddressMonitor", "host_addresses", "source_address"]
-
 _ADDRESS: Final = struct.Struct("=BBBBI")  # family, prefix length, flags, scope, device
 _IFA_ADDRESS, _IFA_LOCAL, _IFA_FLAGS = 1, 2, 8
 _UNIVERSE: Final = 0  # RT_SCOPE_UNIVERSE: neither of a link nor of the host alone

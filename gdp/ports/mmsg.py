@@ -27,8 +27,6 @@ from gdp.frame.kinds import ETHERTYPE
 from gdp.ports.sockets import waited_s
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["SLOTS", "CompiledBatch", "MmsgBatch", "make_batch", "put_one", "send_failure"]
-
 SLOTS: Final = 64
 _TAKE_BYTES: Final = 128 << 10  # approximate size of one batch, so that urgent frames wait only briefly
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")

@@ -30,8 +30,6 @@ from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, Keepalives, LinkCall
 from gdp.ports.rtnetlink import Link, LinkMonitor
 from gdp.switch.table import Hops, Paces, Table
 
-__all__ = ["NetdevPlane", "NoDeviceError"]
-
 log = logging.getLogger(__name__)
 
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES

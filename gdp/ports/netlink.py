@@ -23,30 +23,6 @@ from typing import Final, NamedTuple
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "ADDRESS_GROUPS",
-    "CLSACT_EGRESS",
-    "CLSACT_INGRESS",
-    "LINK_GROUP",
-    "NUMBER",
-    "ROOT",
-    "ROUTE",
-    "ROUTE_GROUPS",
-    "TRAFFIC",
-    "TRAFFIC_GROUP",
-    "Change",
-    "DeviceInfo",
-    "LinkAttribute",
-    "Message",
-    "NetlinkSocket",
-    "Notifications",
-    "RefusedError",
-    "Rtm",
-    "attribute",
-    "messages",
-    "nested",
-]
-
 CLSACT_INGRESS: Final = 0xFFFFFFF2  # TC_H_MAKE(TC_H_CLSACT, TC_H_MIN_INGRESS)
 CLSACT_EGRESS: Final = 0xFFFFFFF3
 ROOT: Final = 0xFFFFFFFF

@@ -10,8 +10,6 @@ import os
 from pathlib import Path
 from typing import Final
 
-__all__ = ["PortCounters"]
-
 _FILE: Final = Path("/proc/self/net/dev")
 _READ_BYTES: Final = 1 << 18  # about 2,000 devices
 _COLUMNS: Final = (1, 9, 0, 8, 2, 10, 3, 11)  # of packets, bytes, errors and drops, each received and sent

@@ -49,8 +49,6 @@ from gdp.token_bucket import TokenBucket
 if TYPE_CHECKING:  # a plane that leaves keepalives to its node loads nothing of them
     from gdp.ports.kernel.keepalives import KeepaliveSessions
 
-__all__ = ["RawPlane"]
-
 _ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
 _URGENT: Final = int(Flag.URGENT)
 _CLASSES: Final = (

@@ -9,8 +9,6 @@ import select
 from collections.abc import Iterable
 from typing import Final, Protocol, TypeVar
 
-__all__ = ["readable"]
-
 
 class _HasFileno(Protocol):
     def fileno(self) -> int: ...

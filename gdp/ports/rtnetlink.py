@@ -11,8 +11,6 @@ from typing import Final, NamedTuple
 
 from gdp.ports.netlink import LINK_GROUP, DeviceInfo, LinkAttribute, NetlinkSocket, Notifications, Rtm, messages
 
-__all__ = ["Link", "LinkMonitor"]
-
 _IFF_UP, _IFF_LOWER_UP = 0x1, 0x10000
 _BUFFER_BYTES: Final = 1 << 20
 

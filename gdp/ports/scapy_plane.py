@@ -32,8 +32,6 @@ from gdp.ports.sockets import NO_RAW_SOCKETS, attach_ethertype_filter, kernel_dr
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import Table
 
-__all__ = ["ScapyPlane"]
-
 _BURST: Final = 64  # frames of one port before the next port is read
 
 

@@ -11,8 +11,6 @@ import sys
 from contextlib import ExitStack
 from typing import BinaryIO, Final, TypeAlias
 
-__all__ = ["SocketOwners"]
-
 Address: TypeAlias = "tuple[str, int]"
 
 _TABLES: Final = ("/proc/self/net/tcp", "/proc/self/net/tcp6")

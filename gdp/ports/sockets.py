@@ -33,21 +33,6 @@ from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag, Kind
 
-__all__ = [
-    "AS_ROOT",
-    "NO_RAW_SOCKETS",
-    "TrafficClass",
-    "attach_drop_all_filter",
-    "attach_ethertype_filter",
-    "keep_arrival_times",
-    "kernel_drops",
-    "large_buffers",
-    "open_port",
-    "steps_of",
-    "tell_neighbours",
-    "waited_s",
-]
-
 AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
 NO_RAW_SOCKETS: Final = f"raw sockets need root or CAP_NET_RAW; {AS_ROOT}"
 

@@ -22,8 +22,6 @@ from gdp.ports.netlink import LinkAttribute, RefusedError
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tunnel.devices import bring_up, refusal_text, set_mtu
 
-__all__ = ["TapDevice", "relay_alias", "tap_name"]
-
 _TUN: Final = "/dev/net/tun"
 _TUNSETIFF: Final = 0x400454CA
 _TUNSETCARRIER: Final = 0x400454E2  # Linux 5.0

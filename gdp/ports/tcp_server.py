@@ -10,8 +10,6 @@ import ipaddress
 import socket
 from typing import Final
 
-__all__ = ["client_network", "listen_tcp"]
-
 _BACKLOG: Final = 128
 _SUBNET_BYTES: Final = 8
 

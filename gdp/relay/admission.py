@@ -12,8 +12,6 @@ from gdp.crypto.certificates import Membership
 from gdp.errors import DropReason, GdpError, StatementError
 from gdp.names import Name
 
-__all__ = ["ClientAdmission", "RelayRefusedError", "verified_border", "verified_switch"]
-
 Verify = Callable[[bytes, float], Membership]  # certificate, DER, and unix second; raises StatementError
 
 _SENTENCES = {

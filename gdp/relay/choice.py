@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["RelayChoice"]
-
 
 @dataclass(slots=True, kw_only=True)
 class RelayChoice:

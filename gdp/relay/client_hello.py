@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-__all__ = ["ENROLMENT_ALPN", "HELLO_MAX_BYTES", "ClientHello", "read_client_hello"]
-
 ENROLMENT_ALPN: Final = "gdp-enrolment/1"
 HELLO_MAX_BYTES: Final = 5 + (1 << 14)  # one record; a longer hello counts as one without protocols
 _HANDSHAKE, _CLIENT_HELLO, _ALPN_EXTENSION = 22, 1, 16

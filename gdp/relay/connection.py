@@ -30,8 +30,6 @@ from gdp.relay.tls_channel import RECORD_BYTES, TlsChannel, TlsError
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["ConnectionCounters", "ConnectionSettings", "ConnectionState", "Limits", "RelayConnection"]
-
 _BATCH_RECORDS: Final = 4  # of one call of ``data_to_send``
 _WAITING_MAX_BYTES: Final = 2 * _BATCH_RECORDS * RECORD_BYTES  # frames leave in batches of half of it
 _BURST_S: Final = 0.25

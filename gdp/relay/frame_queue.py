@@ -15,8 +15,6 @@ from typing import Final
 from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
 from gdp.frame.kinds import CONTROL_FROM, Flag
 
-__all__ = ["FrameQueue"]
-
 _KIND: Final = ETHER_BYTES + KIND_AT
 _FLAGS: Final = ETHER_BYTES + FLAGS_AT
 _RELIABLE: Final = int(Flag.RELIABLE)

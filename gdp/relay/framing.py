@@ -22,19 +22,6 @@ from gdp.errors import DropReason, FrameError
 from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES
 from gdp.frame.kinds import ETHERTYPE
 
-__all__ = [
-    "FRAME_MIN_BYTES",
-    "KEEPALIVE",
-    "MTU_MAX",
-    "MTU_MIN",
-    "PREFIX",
-    "ControlMessage",
-    "ControlType",
-    "Deframer",
-    "is_gdp_frame",
-    "mtu_of",
-]
-
 MTU_MIN: Final = 576
 MTU_MAX: Final = 9_000
 FRAME_MIN_BYTES: Final = ETHER_BYTES + HEADER_BYTES

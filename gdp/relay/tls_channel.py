@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.errors import GdpError
 
-__all__ = ["ALPN", "RECORD_BYTES", "TlsChannel", "TlsError"]
-
 ALPN: Final = "gdp-relay/1"
 RECORD_BYTES: Final = 16_384  # plaintext of one record at most; RFC 8446, section 5.1
 _SENTENCES: Final = {

@@ -28,8 +28,6 @@ from gdp.trust.audit import Action
 from gdp.trust.right import Right
 from gdp.trust.withdrawal import Withdrawal
 
-__all__ = ["forward_due", "receive_ack", "receive_advertisement", "receive_presence", "receive_withdrawal"]
-
 
 def receive_advertisement(
     state: RibCoreState, statement: Statement, relayed: RelayedStatement, member: Membership, now: Timestamps

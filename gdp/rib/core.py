@@ -32,8 +32,6 @@ from gdp.rib.store import Store
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["RibCore"]
-
 
 class RibCore:
     """Sans-I/O core of one RIB."""

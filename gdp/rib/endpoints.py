@@ -40,8 +40,6 @@ from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
 
-__all__ = ["RibEndpoints"]
-
 _CHANGES: Final = Backoff(0.3, 0.6)
 _CHANGE_TRIES: Final = 3  # nothing acknowledges a change
 

@@ -15,8 +15,6 @@ from gdp.trust.lru import Lru
 if TYPE_CHECKING:
     from gdp.diagnosis.facts import GoneFact
 
-__all__ = ["FormerAdvertisers"]
-
 _NAMES_MAX: Final = 4_096
 _ADVERTISERS_MAX: Final = 16  # of one name
 _LAPSED: Final = "lapsed"

@@ -13,8 +13,6 @@ from gdp.intervals import ADVERTISEMENT, NEVER_S
 from gdp.names import Name
 from gdp.rib.upstream_advertisements import QUIET_S
 
-__all__ = ["LowerRibs"]
-
 
 @dataclass(slots=True)
 class _Rib:

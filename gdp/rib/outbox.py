@@ -22,8 +22,6 @@ from gdp.rib.store import Store
 from gdp.rib.watches import WATCHED_S, Asker, Watches
 from gdp.trust.domain import Policy
 
-__all__ = ["OutgoingStatement", "RibOutbox"]
-
 
 class OutgoingStatement(NamedTuple):
     """A statement to send to a name."""

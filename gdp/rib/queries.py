@@ -25,8 +25,6 @@ from gdp.rib.upstream_queries import WATCH
 from gdp.rib.watches import Asker
 from gdp.sansio import Timestamps
 
-__all__ = ["handle_query_timer", "keep_of_silent_rib", "receive_query", "receive_response"]
-
 _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answered in the negative
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
 _DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query

@@ -24,8 +24,6 @@ from gdp.sansio import Timestamps
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.withdrawal import Withdrawal
 
-__all__ = ["is_cold", "poll_replication", "receive_entry", "receive_sync"]
-
 COLD_S: Final = 3.0  # a RIB that just started denies no name before it compared with a peer, for so long at most
 
 

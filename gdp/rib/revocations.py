@@ -26,8 +26,6 @@ from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 
-__all__ = ["receive_revocation", "send_lacked", "send_revoking"]
-
 _SENT_ABOUT_MAX: Final = 1_024  # in one response
 _NAMES_OF_ISSUER_MAX: Final = 256  # names whose watchers receive a revocation by an issuer that is not the names' owner
 

@@ -13,8 +13,6 @@ from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["Route", "Withdrawn"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:

@@ -33,8 +33,6 @@ from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
 from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["ROUTES", "RibCoreState", "RibSettings"]
-
 PEERS_MAX: Final = 16
 ROUTES: Final = b"routes"  # without it, several RIBs share the store itself
 _PACE: Final = SyncPace(total_s=1.0, soon_s=0.2, fetch_s=0.5, reply_s=0.005, reply_bytes=128 << 10, draws=64)

@@ -18,8 +18,6 @@ from gdp.rib.route import Route, Withdrawn
 from gdp.sansio import Timestamps
 from gdp.trust.evidence_index import EvidenceIndex
 
-__all__ = ["MemoryStore", "Store", "check_quota"]
-
 
 class Store(Protocol):
     """Routes by name and advertiser.

@@ -15,8 +15,6 @@ from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.route import Route
 
-__all__ = ["Passed", "UpstreamAdvertisements"]
-
 _REPEATS: Final = Backoff(0.3, 5.0)
 # without an answer to a probe for this and three round trips, at most PROBE_S, the next RIB above replaces this one
 SILENT_MIN_S: Final = 0.12

@@ -15,8 +15,6 @@ from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.rib.watches import Asker
 
-__all__ = ["RETRY_S", "WATCH", "DueQuery", "UpstreamQueries"]
-
 RETRY_S: Final = 0.3
 WATCH: Final = SoftState(6.0, periods=3)  # a query for changes
 _QUERIES: Final = Backoff(RETRY_S, RETRY_S)  # four of them, until no RIB above counts as able to answer

@@ -15,8 +15,6 @@ from gdp.limits import RIB_WATCHES_MAX
 from gdp.message.shares import Shares
 from gdp.names import Name
 
-__all__ = ["WATCHED_S", "Asker", "Watches"]
-
 WATCHED_S: Final = 30.0  # for which who received a response receives changes, too
 
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["SPIN_MAX_US", "SPIN_US", "BusyPoll"]
-
 SPIN_US: Final = 300
 SPIN_MAX_US: Final = 10_000
 _WEIGHT: Final = 1 / 8  # of the newest wait

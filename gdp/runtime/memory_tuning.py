@@ -11,8 +11,6 @@ import ctypes
 import gc
 from typing import Final
 
-__all__ = ["tune_memory"]
-
 _M_TRIM_THRESHOLD: Final = -1
 _M_TOP_PAD: Final = -2
 _M_MMAP_THRESHOLD: Final = -3

@@ -22,8 +22,6 @@ from gdp.runtime.memory_tuning import tune_memory
 from gdp.runtime.signals import handled_signals
 from gdp.sansio import KeepaliveRun, NodeCore, ReceivedFrame, Timestamps
 
-__all__ = ["DRAIN_MAX_S", "Periodic", "Runtime", "now"]
-
 log = logging.getLogger(__name__)
 
 DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not

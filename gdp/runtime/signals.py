@@ -12,8 +12,6 @@ import socket
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-__all__ = ["handled_signals"]
-
 log = logging.getLogger(__name__)
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["HedgeBudget"]
-
 SAVED_MAX: Final = 10.0  # second copies that quiet times save for a burst
 
 

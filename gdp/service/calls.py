@@ -13,8 +13,6 @@ from typing import Final, Generic, TypeVar
 from gdp.due_queue import DueQueue
 from gdp.errors import LocalError
 
-__all__ = ["Calls"]
-
 T = TypeVar("T")
 
 _NUMBERS: Final = 1 << 64

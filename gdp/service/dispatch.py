@@ -28,8 +28,6 @@ from gdp.service.calls import Calls
 from gdp.service.latency import Latencies
 from gdp.service.replication import ALL, Mode, Replication
 
-__all__ = ["STOP_MAX", "Ask", "Dispatch", "Effect", "End", "Failure", "Stop"]
-
 A = TypeVar("A")
 
 CALLS_MAX: Final = 65_536  # under way at once

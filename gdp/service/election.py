@@ -14,8 +14,6 @@ from gdp.names import Name
 from gdp.service.replicas import Replicas
 from gdp.service.replication_messages import LogId, ReplicaStatus
 
-__all__ = ["Elected", "Election"]
-
 COLLECT_S: Final = 1.0  # after the last replica joined, before the log begins without silent replicas
 _UNKNOWN: Final = "what state its server is in is not known; restart it"
 

@@ -24,8 +24,6 @@ from gdp.service.replication_messages import (
     place_of,
 )
 
-__all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
-
 HELD_MAX: Final = 1_024  # how far ahead of its server it accepts entries
 HELD_MAX_BYTES: Final = 64 << 20
 UNKEPT: Final = "this service takes requests in order, and follows no sequencer yet"

@@ -20,19 +20,6 @@ from typing import Final, NamedTuple
 from gdp.errors import DropReason, RemoteError
 from gdp.service.dispatch import STOP_MAX
 
-__all__ = [
-    "HEAD_MAX_BYTES",
-    "PATIENCE_MAX_MS",
-    "VERSION",
-    "Answer",
-    "Outcome",
-    "Request",
-    "Stop",
-    "calls_to_wire",
-    "read_calls",
-    "read_head",
-]
-
 VERSION: Final = 1
 PATIENCE_MAX_MS: Final = (1 << 32) - 1
 _STOPS: Final = 0x80  # in the position of a part

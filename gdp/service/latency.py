@@ -14,8 +14,6 @@ from typing import Final
 from gdp.intervals import REFUSED_S
 from gdp.names import Name
 
-__all__ = ["Latencies"]
-
 RECENT: Final = 512  # responses in the percentiles
 ENOUGH: Final = 32  # of them; fewer give no tail
 _WEIGHT: Final = 0.2  # of the newest response in a server's average

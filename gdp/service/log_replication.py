@@ -13,8 +13,6 @@ from gdp.service.replicas import Replica, Replicas
 from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import LogId, ReplicaCommand, call_of
 
-__all__ = ["STALL_S", "LogReplication"]
-
 WINDOW: Final = 256  # entries sent to one replica ahead of what it has applied
 STALL_S: Final = 1.0  # without progress of a follower, before it receives a probe
 

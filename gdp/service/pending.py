@@ -13,8 +13,6 @@ from gdp.names import Name
 from gdp.service.calls import Calls
 from gdp.service.dispatch import Failure
 
-__all__ = ["Pending"]
-
 A = TypeVar("A")
 
 CALLS_MAX: Final = 65_536

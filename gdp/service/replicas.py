@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from gdp.names import Name
 from gdp.service.replication_messages import ReplicaStatus
 
-__all__ = ["Replica", "Replicas"]
-
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Replica:

@@ -10,8 +10,6 @@ from typing import Final
 
 from gdp.service.replication_messages import Snapshot
 
-__all__ = ["ReplicatedLog"]
-
 ENTRIES_MAX: Final = 65_536
 LOG_MAX_BYTES: Final = 64 << 20
 STATE_EVERY: Final = 1_024  # entries after which another snapshot is due

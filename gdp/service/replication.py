@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-__all__ = ["ALL", "Mode", "Replication"]
-
 
 class Mode(Enum):
     """Which replicas get a request at first."""

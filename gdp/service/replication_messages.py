@@ -23,22 +23,6 @@ from typing import Final, NamedTuple, TypeAlias
 
 from gdp.names import Name
 
-__all__ = [
-    "INCARNATION_BITS",
-    "NO_LOG",
-    "AttachReplica",
-    "FollowerMessage",
-    "LogId",
-    "ReplicaCommand",
-    "ReplicaProbe",
-    "ReplicaStatus",
-    "SequencerMessage",
-    "Snapshot",
-    "SnapshotRequest",
-    "call_of",
-    "place_of",
-]
-
 INCARNATION_BITS: Final = 32  # the upper half of a call's number is the log, the lower half the entry
 
 

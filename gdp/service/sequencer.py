@@ -41,8 +41,6 @@ from gdp.service.replication_messages import (
 )
 from gdp.service.snapshots import LOAD_S, SnapshotRequests
 
-__all__ = ["Effect", "Sequencer"]
-
 A = TypeVar("A")
 
 GENERATION_MAX: Final = 1 << 63  # no log gets this far; the next generation must still fit into 64 bits

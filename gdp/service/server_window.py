@@ -17,8 +17,6 @@ from typing import Final
 
 from gdp.intervals import NEVER_S
 
-__all__ = ["ServerWindow"]
-
 _STALL_S: Final = 0.5  # without any answer
 _PATIENCE_S: Final = 2.0  # of requests that wait, while others are answered
 _AGAIN_S: Final = 0.25  # until the window doubles again

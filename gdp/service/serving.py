@@ -24,8 +24,6 @@ from gdp.names import Name
 from gdp.service.calls import Calls
 from gdp.service.server_window import ServerWindow
 
-__all__ = ["Asked", "Expired", "Serving", "Turn"]
-
 R = TypeVar("R", bound=Sized)
 
 CALLS_MAX: Final = 65_536

@@ -13,8 +13,6 @@ from gdp.service.replicas import Replicas
 from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import LogId, ReplicaCommand, Snapshot, SnapshotRequest
 
-__all__ = ["LOAD_S", "SnapshotRequests"]
-
 LOAD_S: Final = 10.0  # until a replica counts as silent that has a snapshot to send, or to load
 
 

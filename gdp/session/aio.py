@@ -26,8 +26,6 @@ from gdp.session.session import CALL_TIMEOUT_S, checked_response
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
 
-__all__ = ["AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription", "open_session_async"]
-
 log = logging.getLogger(__name__)
 
 _C = TypeVar("_C")

@@ -30,8 +30,6 @@ from gdp.runtime.runtime import Runtime
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import ClosedError
 
-__all__ = ["Driver", "ThreadDriver"]
-
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")

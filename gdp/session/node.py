@@ -28,8 +28,6 @@ from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
 from gdp.state.node_state import MemberState
 
-__all__ = ["SessionNode"]
-
 log = logging.getLogger(__name__)
 
 _open_names: Final = set[Name]()  # identities in use by this process: record locks do not see its own

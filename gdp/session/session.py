@@ -26,8 +26,6 @@ from gdp.session.protocol.wire import message_to_wire
 from gdp.session.settings import settings_of
 from gdp.trust.advertisement import paths_value, session_value
 
-__all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
-
 log = logging.getLogger(__name__)
 
 CALL_TIMEOUT_S: Final = 10.0

@@ -22,8 +22,6 @@ from gdp.intervals import ADVERTISEMENT
 from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
 
-__all__ = ["MEMBER_KEYS", "SessionConfig", "settings_of"]
-
 MEMBER_KEYS: Final = {"identity", "domain", "iface", "delegations", "state", "lease_s", "busy_poll_us"}
 _SUFFIXES: Final = (".yaml", ".yml")
 

@@ -20,8 +20,6 @@ from gdp.names import Name
 from gdp.trust.delegation import DELEGATION_MAX_BYTES
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["Exchange", "Exposure", "Mail", "MailKind", "load_groups", "proxies_of", "resolve_recipients"]
-
 
 class MailKind(str, Enum):
     """Kind of a mail between the parties of a delegation; QoS and exposure come after the delegation of their name."""

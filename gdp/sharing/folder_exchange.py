@@ -22,8 +22,6 @@ from gdp.stores.files import private, public, read_public, write_all
 from gdp.stores.keyring import load_card
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["FolderExchange"]
-
 log = logging.getLogger(__name__)
 
 _NODES: Final = "nodes"

@@ -25,8 +25,6 @@ from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["GIVING", "TAKING", "Grants", "ShareReport", "described"]
-
 GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
 _GIVES: Final = frozenset(GIVING.values())
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}

@@ -29,8 +29,6 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-__all__ = ["RENEW_SHARE", "IssuedDelegation", "IssuedStore"]
-
 RENEW_SHARE: Final = 2 / 3  # of its life, after which a delegation is renewed
 _ISSUED: Final = "issued"
 

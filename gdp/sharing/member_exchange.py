@@ -22,8 +22,6 @@ from gdp.stores.keyring import CARD, load_card
 from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["MemberExchange"]
-
 _KINDS: Final = frozenset(each.value for each in MailKind)
 _T = TypeVar("_T")
 

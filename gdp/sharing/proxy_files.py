@@ -21,8 +21,6 @@ from gdp.names import Name
 from gdp.ros_names import is_name, matches
 from gdp.state.control_protocol import Command
 
-__all__ = ["LiveNames", "ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
-
 Side: TypeAlias = Literal["expose", "import"]
 
 DROP_IN: Final = "gdp-share.yaml"

@@ -16,8 +16,6 @@ from gdp.management.control_client import NotRunningError, ask_node, find_contro
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
 
-__all__ = ["publish_revocations"]
-
 
 def publish_revocations(path: Path, statements: Sequence[bytes]) -> bool:
     """Give revocations to the switch that ``switch.yaml`` describes; return whether it runs.

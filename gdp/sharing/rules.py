@@ -18,8 +18,6 @@ from gdp.ros_names import TYPE_FORMS, Kind, fits_kind, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles, Side
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder
 
-__all__ = ["check_accepted", "check_exposed", "check_name", "kind_from_text", "render", "usable"]
-
 _HEAD: Final = "# Rules of shared names; gdp expose, gdp import and gdp share write this file.\n"
 _OTHER_SIDE: Final[dict[Side, Side]] = {"expose": "import", "import": "expose"}
 

@@ -31,8 +31,6 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["GROUPS", "NOT_USED", "WITHDRAWN", "RevocationsSink", "Sharing"]
-
 GROUPS: Final = "groups.yaml"
 NOT_USED: Final = "not used"  # begins the state of an accepted offer that conflicts
 WITHDRAWN: Final = "withdrawn"  # begins the state of an offer whose name the other machine no longer exposes

@@ -30,8 +30,6 @@ from gdp.trust.adcert import AdCert
 from gdp.trust.delegation import Delegation
 from gdp.trust.right import Right
 
-__all__ = ["OFFERS_MAX", "AcceptedName", "ExposedName", "Offer", "ShareState", "StateFolder", "links_of"]
-
 _SUFFIX: Final = ".shares"
 OFFERS_MAX: Final = 1_000
 _RULES: Final = "rules.json"

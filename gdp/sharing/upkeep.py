@@ -17,8 +17,6 @@ from gdp.sharing.exchange import Exchange
 from gdp.sharing.sharing import Sharing
 from gdp.stores.keyring import OWNER_KEY
 
-__all__ = ["ShareUpkeep"]
-
 log = logging.getLogger(__name__)
 
 

@@ -29,21 +29,6 @@ from typing import Final
 from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 
-__all__ = [
-    "LINE_MAX_BYTES",
-    "RESPONSE_MAX_BYTES",
-    "Command",
-    "ControlRequestError",
-    "LineBuffer",
-    "Request",
-    "Respond",
-    "Response",
-    "decode_request",
-    "decode_response",
-    "encode_request",
-    "encode_response",
-]
-
 LINE_MAX_BYTES: Final = 4_096  # of a request, its line feed included
 RESPONSE_MAX_BYTES: Final = 1 << 18
 _QUOTED_CHARS: Final = 40

@@ -12,8 +12,6 @@ from gdp.crypto.identity import Identity
 from gdp.state.tables import rounded_ms
 from gdp.telemetry.sources import NeighbourRow, Sources
 
-__all__ = ["link_status", "node_status"]
-
 _ROWS: Final = ("entries", "latency", "links", "ports", "topics", "health")  # no counters
 
 

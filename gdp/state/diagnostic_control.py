@@ -19,8 +19,6 @@ from gdp.sansio import Timestamps
 from gdp.state.control_protocol import Respond, Response
 from gdp.state.node_state import NodeState
 
-__all__ = ["DiagnosticCommands", "Row", "TableSource", "as_json"]
-
 Row = Mapping[str, object]
 TableSource = Callable[[Timestamps], Sequence[Row]]
 

@@ -18,8 +18,6 @@ from gdp.trust.right import Right
 if TYPE_CHECKING:  # a node loads its own core alone
     from gdp.rib.store import Store
 
-__all__ = ["participant_tables", "rib_tables"]
-
 
 def participant_tables(state: MemberState) -> dict[str, TableSource]:
     """Return the sources of the tables of a proxy."""

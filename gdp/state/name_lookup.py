@@ -28,8 +28,6 @@ if TYPE_CHECKING:  # a node loads its own core alone
     from gdp.rib.core import RibCore
     from gdp.switch.core import SwitchCore
 
-__all__ = ["ADVERTISERS_MAX", "SwitchLookups", "rib_lookup"]
-
 ADVERTISERS_MAX: Final = 64  # in one answer
 _SETTLE_S: Final = 0.2  # further advertisers may follow the first response
 _LOOKUPS_MAX: Final = 64  # at once

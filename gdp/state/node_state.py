@@ -31,8 +31,6 @@ if TYPE_CHECKING:  # a node loads its own core alone, which makes the start of a
     from gdp.diagnosis.facts import WaitFact
     from gdp.switch.core import SwitchCore
 
-__all__ = ["MemberState", "NodeState", "RibState", "SwitchState"]
-
 
 class Core(Protocol):
     """What every protocol core has."""

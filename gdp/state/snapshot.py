@@ -27,16 +27,6 @@ if TYPE_CHECKING:  # a node loads its own core alone
     from gdp.rib.core import RibCore
     from gdp.switch.core import SwitchCore
 
-__all__ = [
-    "ID_CHARS",
-    "member_snapshot",
-    "node_snapshot",
-    "rib_snapshot",
-    "short_id",
-    "switch_snapshot",
-    "topology_snapshot",
-]
-
 ID_CHARS: Final = 16  # 64 bits: no two names of one picture share them by accident
 NAMES_MAX: Final = 1_000
 TREES_MAX: Final = 400

@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # a node loads its own core alone, and facts when somebody as
     from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact
     from gdp.rib.state import RibCoreState
 
-__all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state", "rib_facts"]
-
 ASK: Final = "state"
 _ROUTES_MAX: Final = 32
 _TUNNELS_MAX: Final = 32

@@ -13,8 +13,6 @@ from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.state.node_state import SwitchState
 
-__all__ = ["switch_facts"]
-
 _LOCATIONS_MAX: Final = 32
 _SWITCHES_MAX: Final = 64
 

@@ -17,8 +17,6 @@ from gdp.switch.paths import Path
 from gdp.switch.trees import Downstream
 from gdp.trust.right import Right
 
-__all__ = ["switch_tables"]
-
 
 def switch_tables(
     state: SwitchState, tunnels: Callable[[Timestamps], Sequence[Row]] | None = None

@@ -13,8 +13,6 @@ from gdp.state.topic_rows import Direction, TopicRow
 from gdp.switch.local_advertisements import LocalAdvertisement
 from gdp.trust.right import Right
 
-__all__ = ["switch_rows"]
-
 _OFFERS = (Right.PUBLISH, Right.SERVE)
 _USES = (Right.READ, Right.CALL)
 

@@ -12,8 +12,6 @@ from gdp.state.diagnostic_control import Row, TableSource
 from gdp.state.node_state import NodeState
 from gdp.telemetry.sources import NeighbourRow
 
-__all__ = ["common_tables", "rounded_ms", "seconds_left"]
-
 
 def common_tables(state: NodeState) -> dict[str, TableSource]:
     """Return the sources of the tables ``neighbors``, ``links`` and ``drops``."""

@@ -16,8 +16,6 @@ from gdp.errors import DropReason, RemoteError
 if TYPE_CHECKING:  # a client reads rows, and needs no core
     from gdp.client.participant import Topic
 
-__all__ = ["ROWS_MAX", "Direction", "TopicRow", "held_row", "rows_from_fields", "rows_to_fields"]
-
 ROWS_MAX: Final = 400  # in one response; each has less than 600 of its 256 Ki bytes
 
 

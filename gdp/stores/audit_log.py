@@ -23,8 +23,6 @@ from gdp.stores.files import cut_unfinished_line, open_locked
 from gdp.stores.ownership import refuse_shared_folder
 from gdp.trust.audit import BEGIN, Action, AuditLine, AuditTrail
 
-__all__ = ["FILES_MAX", "FILE_MAX_BYTES", "AuditLog", "Verified", "note_once", "verify_audit"]
-
 FILE_MAX_BYTES: Final = 4 << 20
 FILES_MAX: Final = 8  # 32 MiB: more than a day at the highest rate of a flood
 _CURRENT: Final = "audit.jsonl"

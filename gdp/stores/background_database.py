@@ -19,8 +19,6 @@ from typing import Final, Generic, TypeVar
 
 from gdp.intervals import TICK_S
 
-__all__ = ["BackgroundDatabase"]
-
 log = logging.getLogger(__name__)
 
 _SLICES_WAITING_MAX: Final = 4

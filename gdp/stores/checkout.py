@@ -12,8 +12,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.files import public, write_all
 
-__all__ = ["ignore_folder", "refuse_work_tree", "work_tree_of"]
-
 _FILE: Final = ".gitignore"
 _TEXT: Final = "# private keys; git must not take any file of this folder\n*\n"
 

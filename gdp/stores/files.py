@@ -22,20 +22,6 @@ from typing import BinaryIO, Final
 from gdp.errors import LocalError
 from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
-__all__ = [
-    "FILE_MAX_BYTES",
-    "NewFile",
-    "cut_unfinished_line",
-    "open_locked",
-    "private",
-    "public",
-    "read_at_most",
-    "read_private",
-    "read_public",
-    "refuse_existing",
-    "write_all",
-]
-
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
 _PUBLIC_MODE: Final = 0o644  # minus the umask

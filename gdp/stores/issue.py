@@ -59,24 +59,6 @@ from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = [
-    "admit",
-    "admit_node",
-    "delegate",
-    "delegate_route",
-    "install_delegation",
-    "install_membership",
-    "make_domain",
-    "make_node",
-    "make_node_keys",
-    "make_owner",
-    "renew",
-    "renew_node",
-    "succeed_owner",
-    "valid_delegation",
-    "widened",
-]
-
 ROOT_DAYS: Final = 3_650.0
 MEMBER_DAYS: Final = 365.0
 DELEGATION_DAYS: Final = 365.0

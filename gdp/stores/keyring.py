@@ -39,39 +39,6 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 
-__all__ = [
-    "CARD",
-    "DELEGATIONS",
-    "NODE_CERTIFICATE",
-    "OWNER_KEY",
-    "OWNER_PUBLIC",
-    "OWNER_SALT",
-    "REQUEST",
-    "ROOT_CERTIFICATE",
-    "ROOT_KEY",
-    "SUCCESSION",
-    "delegation_file",
-    "load_card",
-    "load_delegation",
-    "load_delegations",
-    "load_domain",
-    "load_identity",
-    "load_node_keys",
-    "load_owner",
-    "load_public_key",
-    "load_root",
-    "load_salt",
-    "parsed",
-    "save_delegation",
-    "save_domain",
-    "save_identity",
-    "save_membership",
-    "save_node_keys",
-    "save_owner",
-    "storage",
-    "store_again",
-]
-
 ROOT_KEY: Final = "root.key"
 ROOT_CERTIFICATE: Final = "root.crt"
 OWNER_KEY: Final = "owner.key"

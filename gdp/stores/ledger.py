@@ -21,8 +21,6 @@ from gdp.errors import LocalError
 from gdp.stores.files import cut_unfinished_line, open_locked
 from gdp.stores.ownership import refuse_shared_folder
 
-__all__ = ["LEDGER", "Issued", "append_issued", "read_ledger"]
-
 LEDGER: Final = "issued.jsonl"
 _BEGIN: Final = "0" * 64  # the previous hash of the first line
 _LINE_MAX_BYTES: Final = 16 * 1024

@@ -16,8 +16,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["refuse_foreign_file", "refuse_foreign_folder", "refuse_shared_folder"]
-
 _ROOT: Final = 0
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 _OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH

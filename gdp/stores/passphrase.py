@@ -16,8 +16,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.stores.files import read_private
 
-__all__ = ["CREDENTIAL", "FILE_VARIABLE", "VARIABLE", "new_passphrase", "passphrase_for"]
-
 FILE_VARIABLE: Final = "GDP_PASSPHRASE_FILE"
 VARIABLE: Final = "GDP_PASSPHRASE"
 CREDENTIAL: Final = "gdp.passphrase"  # systemd.exec(5), LoadCredentialEncrypted=

@@ -26,18 +26,6 @@ from gdp.extras import Seam
 from gdp.stores.files import NewFile, private, read_private
 from gdp.stores.passphrase import passphrase_for
 
-__all__ = [
-    "SCHEME",
-    "TOKEN_KEYS",
-    "Storage",
-    "TokenKeys",
-    "key_file",
-    "read_secret",
-    "read_signing_key",
-    "secret_file",
-    "storage_of",
-]
-
 SCHEME: Final = "pkcs11:"  # RFC 7512
 
 

@@ -19,8 +19,6 @@ from gdp.stores.background_database import BackgroundDatabase
 from gdp.stores.ownership import refuse_shared_folder
 from gdp.trust.revocations import Kept, KeptKey
 
-__all__ = ["SLICE", "RevocationFile", "Row"]
-
 SLICE: Final = 1_024  # rows at once
 _NAME: Final = "revocations"
 _SCHEMA: Final = """

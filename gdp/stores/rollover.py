@@ -24,8 +24,6 @@ from gdp.stores.files import private, public, read_private, read_public, refuse_
 from gdp.stores.keyring import ROOT_CERTIFICATE, ROOT_KEY, load_domain, load_root, save_domain
 from gdp.trust.audit import Action
 
-__all__ = ["NEXT", "RETIRED", "begin_rollover", "finish_rollover", "trust_successor"]
-
 NEXT: Final = "next"
 RETIRED: Final = "retired"
 

@@ -17,8 +17,6 @@ from gdp.control.rib_replication import Entry, Key
 from gdp.errors import RemoteError
 from gdp.stores.background_database import BackgroundDatabase
 
-__all__ = ["SLICE", "Snapshot"]
-
 SLICE: Final = 512  # entries at once
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, end_unix_s REAL NOT NULL) WITHOUT ROWID

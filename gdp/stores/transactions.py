@@ -15,8 +15,6 @@ from typing import Final, Literal
 from gdp.closing import ClosedOnExit
 from gdp.errors import StoreError
 
-__all__ = ["TransactionFile"]
-
 _LOCKED_S: Final = 10.0  # wait for another writing process
 
 

@@ -35,8 +35,6 @@ from gdp.trust.audit import Action
 from gdp.trust.right import HEARS, Right
 from gdp.trust.withdrawal import Withdrawal
 
-__all__ = ["AdvertisementHandler"]
-
 _SESSIONS_MAX: Final = 4_096  # more than the neighbours that a switch has
 _INCARNATION_BYTES: Final = 8  # at the end of an instance id
 _REPORT_INTERVAL_S: Final = 1.0

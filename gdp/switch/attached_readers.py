@@ -15,8 +15,6 @@ from gdp.names import Name
 from gdp.switch.trees import Downstream, owner_of
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["AttachedReader", "AttachedReaders"]
-
 
 @dataclass(slots=True)
 class AttachedReader:

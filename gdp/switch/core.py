@@ -54,8 +54,6 @@ from gdp.switch.tunnel_planner import TunnelPlanner
 from gdp.switch.unicast import Unicast
 from gdp.trust.domain import Policy
 
-__all__ = ["SwitchCore"]
-
 _CONTROL: Final = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 StatementHandler = Callable[[Neighbour, Statement, Timestamps], object]

@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.names import Name
 
-__all__ = ["Damping"]
-
 HALF_LIFE_S: Final = 5.0
 SUPPRESS_ABOVE: Final = 3.5  # losses of the link; older ones count less
 REUSE_BELOW: Final = 1.5

@@ -15,8 +15,6 @@ from gdp.switch.name_cache import NameCache
 from gdp.switch.trees import Downstream, Trees
 from gdp.trust.evidence_index import Holdings
 
-__all__ = ["AttachedAdvertisement", "Dependents", "JoinedBranch", "KnownLocation"]
-
 
 class AttachedAdvertisement(NamedTuple):
     """An advertisement of a node that is attached at ``at``."""

@@ -18,8 +18,6 @@ from gdp.sansio import Timestamps
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.trust.right import Right
 
-__all__ = ["DiagnosticAnswers"]
-
 _MAC_BYTES: Final = 6
 _END: Final = Keyed("t", NAME_OR_ZERO, absent=None)
 _PUBLISHER: Final = Keyed("p", NAME_OR_ZERO, absent=ZERO)

@@ -39,8 +39,6 @@ from gdp.names import Name
 from gdp.requests import Backoff
 from gdp.token_bucket import TokenBuckets
 
-__all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Silence", "Slot", "slots_between"]
-
 _PAIRS_MAX: Final = 4  # of one type
 _ROUNDS_AT_ONCE: Final = 3  # before the first pause: the first packet of one end opens its NAT for the other's second
 _PAUSES: Final = Backoff(2.0, 60.0)  # by rounds

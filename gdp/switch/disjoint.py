@@ -15,8 +15,6 @@ from typing import NamedTuple, TypeAlias
 from gdp.names import Name
 from gdp.shortest_paths import add_edge, shortest_paths
 
-__all__ = ["DirectedLink", "DirectedPath", "disjoint_paths"]
-
 
 class DirectedLink(NamedTuple):
     """A link in one direction; ``key`` tells links between the same two switches apart."""

@@ -24,8 +24,6 @@ from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 
-__all__ = ["EndpointExchange", "Refusal"]
-
 _REPEATS: Final = Backoff(0.3, 4.8)
 _RECORD, _QUERY = StatementType.ENDPOINTS, StatementType.SYNC  # what is sent
 

@@ -31,8 +31,6 @@ from gdp.switch.forwarding_state import ForwardingState
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["Flooding"]
-
 _INCARNATIONS_MAX: Final = 64
 _RTCERTS_REMEMBERED: Final = 1_024
 # of another incarnation of ours to our link states; a few old ones of a dead incarnation may remain

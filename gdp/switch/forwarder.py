@@ -36,8 +36,6 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Kind
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hop, Hops, Paces, is_side
 
-__all__ = ["PUNT", "Decision", "Drop", "Forward", "Punt", "decide", "rewrite"]
-
 _NO_SIDES: Final[Mapping[bytes, int]] = {}
 _NO_PACES: Final[Mapping[bytes, Paces]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")

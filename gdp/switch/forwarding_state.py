@@ -20,8 +20,6 @@ from gdp.switch.trees import Trees
 from gdp.trust.domain import Policy
 from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["ForwardingState"]
-
 
 class ForwardingState:
     """State of one switch that its parts share.

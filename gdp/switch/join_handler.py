@@ -26,8 +26,6 @@ from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import HEARS
 from gdp.trust.verifier import AdvertisementVerifier
 
-__all__ = ["JoinHandler", "reader_of"]
-
 _REFRESH_TOKENS: Final = 4.0  # of joins: it renews up to 128 of them, and may cost a reply
 
 

@@ -19,8 +19,6 @@ from gdp.sansio import OutgoingFrames
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey
 
-__all__ = ["JoinSender", "ReceivedJoins"]
-
 _SPACED: Final = Backoff(0.008, 0.064)  # 0.2 Mbit/s is a full frame in 0.06 s
 
 

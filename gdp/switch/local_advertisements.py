@@ -18,8 +18,6 @@ from gdp.requests import Backoff, Requests
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import Right
 
-__all__ = ["LocalAdvertisement", "LocalAdvertisements"]
-
 # many attempts in a lease, for a relay over a lossy path often fails; fewer over a slow link
 _RELAYS: Final = Backoff(0.4, 3.2)
 _ROUND_TRIPS: Final = 2.0

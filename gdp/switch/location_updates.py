@@ -30,8 +30,6 @@ from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import HEARS, Right
 
-__all__ = ["LocationUpdates"]
-
 PROOFS_MAX: Final = 8  # statements in one reply to a neighbour
 
 

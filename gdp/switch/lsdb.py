@@ -21,8 +21,6 @@ from gdp.intervals import LINK_STATE
 from gdp.limits import LINK_STATE_AGE_MAX_S
 from gdp.names import Name
 
-__all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStateDatabase"]
-
 LINK_STATES_MAX = 8_192
 PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # a state signed by a fast clock stays valid this long at slow clocks
 _INCARNATIONS_MAX: Final = (

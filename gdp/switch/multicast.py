@@ -42,8 +42,6 @@ from gdp.switch.upstream_joins import OVERLAP_S, UpstreamJoins
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import HEARS
 
-__all__ = ["MulticastTrees"]
-
 _ACTIVE_S: Final = 1.0  # for which a backup replaces a branch that was lost
 
 

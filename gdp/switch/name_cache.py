@@ -14,8 +14,6 @@ from gdp.names import Name
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.right import Right
 
-__all__ = ["Location", "NameCache"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Location:

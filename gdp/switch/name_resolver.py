@@ -45,11 +45,6 @@ from gdp.switch.name_cache import Location, NameCache
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.right import Right
 
-__all__ = [
-    "BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX", "WINDOW", "NameQuery", "NameResolver",
-    "PendingFrames", "Resolution", "owner_of",
-]  # fmt: skip
-
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
 _QUERIES: Final = Backoff(RETRY_S, 2.0, equal=TRIES_MAX)

@@ -10,8 +10,6 @@ from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.sansio import OutgoingFrames
 
-__all__ = ["Outbox"]
-
 
 class Outbox:
     """Frames that a switch has to send.

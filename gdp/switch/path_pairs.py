@@ -15,8 +15,6 @@ from gdp.names import Name
 from gdp.switch.disjoint import DirectedPath
 from gdp.switch.paths import Paths
 
-__all__ = ["SETTLE_S", "PathPair", "PathPairs"]
-
 SETTLE_S: Final = 2.0  # between two changes of one pair, in which the trees settle
 _WORTHWHILE: Final = 0.75  # of the present cost: a dearer pair is no reason to move a path that works
 _TARGETS_MAX: Final = 1_024

@@ -19,8 +19,6 @@ from gdp.switch.rib_client import RibClient
 from gdp.switch.spf_delay import SpfDelay
 from gdp.switch.unicast import Unicast
 
-__all__ = ["PathUpdates"]
-
 _PROTECT_S: Final = 0.1  # from new paths to their alternates
 
 

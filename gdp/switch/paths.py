@@ -20,8 +20,6 @@ from gdp.shortest_paths import add_edge, shortest_paths
 from gdp.switch.disjoint import DirectedLink, DirectedPath, disjoint_paths
 from gdp.switch.lsdb import LinkStateDatabase
 
-__all__ = ["Path", "Paths"]
-
 _CACHE_MAX = 64
 _ALTERNATES_CACHE_MAX = 4_096
 _PAIRS_CACHE_MAX = 1_024

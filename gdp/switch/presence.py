@@ -15,8 +15,6 @@ from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.unicast import Unicast
 
-__all__ = ["PresenceAnswers"]
-
 _OPEN_MAX: Final = 256
 
 

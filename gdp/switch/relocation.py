@@ -34,8 +34,6 @@ from gdp.switch.name_cache import Location
 from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["GRACE_S", "Relocations"]
-
 GRACE_S: Final = 4.0  # for which the former switch handles frames for a moved node, redirects senders, and responds
 _REMEMBERED_MAX: Final = 4_096
 _NOTICES: Final = Backoff(0.1, 0.8)  # until the former switch answers; one datagram may be lost

@@ -35,8 +35,6 @@ from gdp.trust.audit import Action
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR
 
-__all__ = ["RevocationHandler"]
-
 GRACE_S: Final = 0.5
 _SUBMITTED: Final = Backoff(0.3, 60.0)  # of a revocation that the operator submitted
 _PER_TICK: Final = 4

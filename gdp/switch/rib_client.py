@@ -42,8 +42,6 @@ from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.unicast import Unicast
 
-__all__ = ["SILENT_S", "RibClient"]
-
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
 _REFILL_S: Final = 10.0  # how long negative responses of a RIB that is new here do not override known locations
 

@@ -16,8 +16,6 @@ from typing import Final
 
 from gdp.due_queue import earliest
 
-__all__ = ["TRANSITIONS", "SpfDelay", "SpfEvent", "SpfState"]
-
 TIME_TO_LEARN_S: Final = 0.5
 HOLD_DOWN_S: Final = 2.0
 

@@ -32,22 +32,6 @@ from gdp.errors import LocalError
 from gdp.limits import PACE_MAX, TABLE_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = [
-    "EVERY_SIDE",
-    "EXPIRE_MAX",
-    "MACS_BYTES",
-    "NOWHERE",
-    "SHARED_SIDE",
-    "Hop",
-    "Hops",
-    "Observer",
-    "Paces",
-    "ProtectedHop",
-    "Table",
-    "is_side",
-    "sides_of",
-]
-
 MACS_BYTES: Final = 12  # destination MAC, source MAC: the first bytes of the frame that goes out
 
 Hop = tuple[int, bytes]  # port index, the 12 bytes of addresses

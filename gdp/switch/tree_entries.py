@@ -14,8 +14,6 @@ from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.trees import Downstream, Tree
 
-__all__ = ["TreeEntries"]
-
 
 class TreeEntries:
     """The forwarding entries of one switch's multicast trees."""

@@ -24,8 +24,6 @@ from gdp.limits import FRAME_MAX_BYTES, PACE_MAX
 from gdp.names import Name
 from gdp.switch.table import MACS_BYTES, Hop, Hops, Paces, ProtectedHop, sides_of
 
-__all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees", "owner_of"]
-
 Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
 TreeKey = tuple[Name, Name, int]  # topic, publisher and path
 

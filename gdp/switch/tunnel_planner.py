@@ -14,8 +14,6 @@ from gdp.switch.direct_tunnels import Action, DirectTunnels
 from gdp.switch.endpoint_exchange import EndpointExchange
 from gdp.switch.forwarding_state import ForwardingState
 
-__all__ = ["TunnelPlanner"]
-
 
 class TunnelPlanner:
     """Plans the direct tunnels of one switch.

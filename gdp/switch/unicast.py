@@ -25,8 +25,6 @@ from gdp.switch.name_cache import Location
 from gdp.switch.paths import Path
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
-__all__ = ["Unicast"]
-
 STALE_S: Final = 5.0  # an entry for a location whose lease has ended, while no RIB responds
 _REFRESH_AT_ONCE: Final = 4_096  # paths; about 50 ms
 

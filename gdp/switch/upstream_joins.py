@@ -34,8 +34,6 @@ from gdp.switch.joins import JoinSender
 from gdp.switch.tree_entries import TreeEntries
 from gdp.switch.trees import Downstream, JoinTerms, Tree
 
-__all__ = ["OVERLAP_S", "UpstreamJoins"]
-
 OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
 
 _NEW_JOINS: Final = Backoff(0.1, JOIN.refresh_s)

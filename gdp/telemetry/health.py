@@ -11,8 +11,6 @@ import json
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["LIVE_S", "PROBES", "Health", "probe"]
-
 LIVE_S: Final = 10.0  # a loop that has not turned for so long hangs; it turns twice a second
 PROBES: Final = ("/healthz", "/livez", "/readyz")
 

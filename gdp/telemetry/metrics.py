@@ -34,8 +34,6 @@ from gdp.telemetry.sources import (
 )
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["Metrics", "scrape_server"]
-
 _CONNECTIONS_MAX: Final = 4
 _BACKLOG: Final = 128
 _ANSWERS_RATE: Final = Rate(20.0, burst=20.0)  # a few ms each; a scraper polls every few seconds

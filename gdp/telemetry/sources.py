@@ -14,19 +14,6 @@ from gdp.errors import DropReason
 from gdp.names import ZERO, Name
 from gdp.telemetry.health import Health
 
-__all__ = [
-    "LATENCY_BOUNDS_S",
-    "Counts",
-    "DeviceCounts",
-    "EntryCounts",
-    "Gauge",
-    "Histogram",
-    "NeighbourRow",
-    "PortRow",
-    "Sources",
-    "TopicCounts",
-]
-
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 

@@ -28,8 +28,6 @@ from gdp.trust.lru import Lru
 from gdp.trust.revocations import Revocations
 from gdp.trust.right import RIGHTS, Right
 
-__all__ = ["CHAIN", "AdCert", "AdCertCache", "Chain"]
-
 CHAIN: Final = many(STATEMENT, CHAIN_MAX, is_cut=False)  # AdCerts from the owner on, signed statements
 
 

@@ -28,8 +28,6 @@ from gdp.trust.adcert import CHAIN, Chain
 from gdp.trust.right import RIGHT, Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["MS", "Advertisement", "UnverifiedAdvertisement", "paths_value", "session_value"]
-
 MS: Final = 1_000
 
 

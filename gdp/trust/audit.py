@@ -19,8 +19,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.intervals import MINUTE_S
 
-__all__ = ["BEGIN", "Action", "AuditLine", "AuditTrail"]
-
 BEGIN: Final = "0" * 64  # replaces the hash in the first line
 _LINES_MAX: Final = 200
 _LINE_EACH_S: Final = 10.0

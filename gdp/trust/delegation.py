@@ -24,8 +24,6 @@ from gdp.trust.adcert import CHAIN, AdCertCache, Chain
 from gdp.trust.grants import EPOCH_MAX, Grant, open_grant
 from gdp.trust.right import RIGHTS, Right
 
-__all__ = ["DELEGATION_MAX_BYTES", "EPOCHS_MAX", "Delegation"]
-
 DELEGATION_MAX_BYTES: Final = 512 << 10
 EPOCHS_MAX: Final = 256  # in one file
 

@@ -20,8 +20,6 @@ from gdp.trust.audit import AuditTrail
 from gdp.trust.lru import Lru
 from gdp.trust.revocations import Revocations
 
-__all__ = ["MEMBERS_REMEMBERED", "Policy"]
-
 MEMBERS_REMEMBERED: Final = 4_096
 
 

@@ -34,39 +34,6 @@ from gdp.crypto.schema import CERT, FLAG, OCTETS, STATEMENT, FieldSet, Keyed, ma
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.trust.join_token import SERVERS_MAX
 
-__all__ = [
-    "CLOCKS_APART_MAX_S",
-    "DELEGATIONS",
-    "DELEGATIONS_MAX",
-    "INSTANCE_BYTES",
-    "LENGTH_BYTES",
-    "MEMBERS",
-    "MEMBERS_MAX",
-    "NONCE_BYTES",
-    "PAGE",
-    "REQUEST_MAX_BYTES",
-    "RESPONSE_MAX_BYTES",
-    "STRANGER_MAX_BYTES",
-    "TEXT",
-    "Application",
-    "DomainNews",
-    "EnrolmentError",
-    "Greeting",
-    "InstallRequest",
-    "ListedMachine",
-    "ListedMail",
-    "MemberProof",
-    "Message",
-    "Refusal",
-    "UnreachableError",
-    "apply",
-    "encode_message",
-    "message_bytes",
-    "prove_member",
-    "read_message",
-    "verify_member_proof",
-]
-
 Message: TypeAlias = "Mapping[str, Value]"  # as it was received
 
 VERSION: Final = 1

@@ -11,8 +11,6 @@ from typing import Final, Generic, TypeVar
 
 from gdp.trust.advertisement import Advertisement
 
-__all__ = ["EvidenceIndex", "Holdings"]
-
 _H = TypeVar("_H", bound=Hashable)
 _SWEEP_MIN: Final = 1_024
 

@@ -29,19 +29,6 @@ from gdp.crypto.subject import SUBJECT, Subject
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 
-__all__ = [
-    "DAILY_FROM",
-    "EPOCH_MAX",
-    "EPOCH_S",
-    "SECRET_BYTES",
-    "Grant",
-    "begun_epochs",
-    "daily_epochs",
-    "make_grant",
-    "open_grant",
-    "topic_secret",
-]
-
 EPOCH_MAX: Final = (1 << 16) - 1  # two bytes of the frame header
 EPOCH_S: Final = 86_400
 DAILY_FROM: Final = 10_000

@@ -28,19 +28,6 @@ from gdp.crypto.certificates import Role, Root
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port, split_host_port
 
-__all__ = [
-    "JOIN_ID_BYTES",
-    "JOIN_SECRET_BYTES",
-    "SERVERS_MAX",
-    "JoinRole",
-    "JoinToken",
-    "checked_server",
-    "fingerprint_of",
-    "join_id",
-    "join_key",
-    "join_proof",
-]
-
 JOIN_SECRET_BYTES: Final = 16
 JOIN_ID_BYTES: Final = 16
 SERVERS_MAX: Final = 8

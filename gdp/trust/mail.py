@@ -16,8 +16,6 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 
-__all__ = ["MAIL_BODY_MAX_BYTES", "MAIL_KIND_MAX_CHARS", "Mail"]
-
 MAIL_BODY_MAX_BYTES: Final = 12 << 10
 MAIL_KIND_MAX_CHARS: Final = 32
 

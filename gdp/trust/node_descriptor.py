@@ -17,8 +17,6 @@ from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.subject import Subject
 from gdp.names import Name
 
-__all__ = ["NodeDescriptor", "Recipient"]
-
 
 class Recipient(Protocol):
     """Recipient of a delegation: a node's name, and the key that secrets for it are sealed to."""

@@ -26,8 +26,6 @@ from gdp.trust.node_descriptor import Recipient
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 
-__all__ = ["Owner", "successor_subject"]
-
 _SUCCESSOR: Final = b"gdp-owner-successor-1"
 
 

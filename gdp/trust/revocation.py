@@ -16,8 +16,6 @@ from gdp.crypto.schema import Body, Keyed, octets, uint
 from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import SUBJECT, Subject
 
-__all__ = ["Revocation"]
-
 
 @dataclass(frozen=True, slots=True)
 class Revocation(Body):

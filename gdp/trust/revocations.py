@@ -36,8 +36,6 @@ from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocation import Revocation
 
-__all__ = ["ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
-
 ID_BYTES: Final = 8
 OPERATOR: Final = b""  # the origin of this node's own operator: without a rate, never displaced
 _ROOTS_RATE: Final = Rate(1_500.0, burst=4_096.0)  # of one origin; a verification costs about 80 us

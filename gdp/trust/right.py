@@ -14,8 +14,6 @@ from typing import Final
 from gdp.crypto.schema import many, mapped, one_of
 from gdp.errors import LocalError
 
-__all__ = ["DELEGABLE", "HEARS", "RIGHT", "RIGHTS", "Right"]
-
 
 class Right(str, Enum):
     """One right. ``ATTACH`` is the right of a node on its own name, and cannot be delegated."""

@@ -18,8 +18,6 @@ from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 from gdp.trust.lru import Lru
 
-__all__ = ["RtCert", "RtCertCache"]
-
 
 @dataclass(frozen=True, slots=True)
 class RtCert(Body):

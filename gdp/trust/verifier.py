@@ -23,8 +23,6 @@ from gdp.trust.revocations import Revocations
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["ADCERTS_REMEMBERED", "RTCERTS_REMEMBERED", "AdvertisementVerifier"]
-
 ADCERTS_REMEMBERED: Final = 16_384
 RTCERTS_REMEMBERED: Final = 4_096
 

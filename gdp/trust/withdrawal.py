@@ -15,8 +15,6 @@ from gdp.limits import WITHDRAWAL_MAX_BYTES
 from gdp.names import Name
 from gdp.trust.right import RIGHT, Right
 
-__all__ = ["Withdrawal"]
-
 
 @dataclass(frozen=True, slots=True)
 class Withdrawal(Body):

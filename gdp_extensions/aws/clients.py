@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
     from types_boto3_ec2.type_defs import FilterTypeDef
 
-__all__ = ["Clients", "filters"]
-
 _ATTEMPTS = 4
 _FIRST_REGION = "us-east-1"  # enabled in every account
 

@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.errors import LocalError, StoreError
 
-__all__ = ["asking", "is_code"]
-
 _TRY_AGAIN: Final = {
     "InsufficientInstanceCapacity": "there is no such machine to be had there now",
     "InsufficientHostCapacity": "there is no such machine to be had there now",

@@ -31,8 +31,6 @@ from gdp.intervals import ANSWER_S, DRAIN_S, HOUR_S, POLL_S
 from gdp.terminal import echo
 from gdp_extensions.aws.core.instances import DRAIN
 
-__all__ = ["Metadata", "Watch", "main"]
-
 METADATA_URL: Final = "http://169.254.169.254"
 _TOKEN_HEADER: Final = "X-aws-ec2-metadata-token"
 _NONE: Final = 404

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from types_boto3_ec2.literals import InstanceTypeType
     from types_boto3_ec2.type_defs import FilterTypeDef, InstanceTypeDef, SpotInstanceRequestTypeDef
 
-__all__ = ["WATCHER", "AwsProvider", "open_aws"]
-
 log = logging.getLogger(__name__)
 
 WATCHER: Final = Program("notice", ("{python}", "-m", "gdp_extensions.aws.notice", "--home", "{home}"))

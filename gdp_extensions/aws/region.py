@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
     from types_boto3_ec2.type_defs import ImageTypeDef, IpPermissionTypeDef
 
-__all__ = ["ground_of", "remove_groups"]
-
-
 log = logging.getLogger(__name__)
 
 _DESCRIPTION: Final = "machines of fog clusters"

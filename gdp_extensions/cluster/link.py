@@ -34,8 +34,6 @@ from gdp.host_port import split_host_port
 from gdp.intervals import PACE_S, PROMPT_S, UPKEEP_S
 from gdp.names import Name
 
-__all__ = ["CHANNELS", "ClusterLink", "Command", "tag_of"]
-
 _ALPHABET: Final = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 CHANNELS: Final = tuple(b"{%c}" % char for char in _ALPHABET)  # hash tags: names share 64 slots, and one channel each
 _REPLICA_MS: Final = 100  # a replica confirms within about a millisecond

@@ -31,8 +31,6 @@ from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.verifier import AdvertisementVerifier
 from gdp_extensions.cluster.link import ClusterLink, Command, tag_of
 
-__all__ = ["ClusterStore", "load_functions"]
-
 FUNCTIONS: Final = Path(__file__).with_name("functions.lua")
 CACHE_MAX: Final = 65_536  # names
 CONTEXTS_MAX: Final = 16_384

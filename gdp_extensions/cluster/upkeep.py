@@ -19,8 +19,6 @@ from gdp.trust.verifier import AdvertisementVerifier
 from gdp_extensions.cluster.link import ClusterLink
 from gdp_extensions.cluster.store import ClusterStore, load_functions
 
-__all__ = ["ClusterUpkeep"]
-
 log = logging.getLogger(__name__)
 
 KEEP_ALIVE_S: Final = 0.25

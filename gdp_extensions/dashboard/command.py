@@ -16,8 +16,6 @@ from gdp.cli import options
 from gdp.cli.node import failing_clearly, report
 from gdp.cli.program import Program
 
-__all__ = ["app"]
-
 app = Program("gdp dashboard")
 
 _PORT_MAX: Final = 65_535

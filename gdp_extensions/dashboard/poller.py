@@ -28,8 +28,6 @@ from gdp.management.control_socket import CONTROL_SOCKET
 from gdp.state.control_protocol import Command, Request
 from gdp_extensions.dashboard.core.readings import Fields, Reading, text_of
 
-__all__ = ["Poller", "found_sockets", "supervisor_state"]
-
 log = logging.getLogger(__name__)
 
 _TIMEOUT_S: Final = 1.0  # a node that hangs delays one poll

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["POLL_S", "DashboardServer"]
-
 log = logging.getLogger(__name__)
 
 POLL_S: Final = 0.75  # with the time of a poll, a change is on the page within a second

@@ -27,8 +27,6 @@ from gdp_extensions.dds.profile import requested
 from gdp_extensions.dds.wait_thread import News
 from proxy.endpoints.core.qos import default
 
-__all__ = ["Discovery"]
-
 _BATCH: Final = 64
 _INFO_DEPTH: Final = 1_000  # so many participants may exist before this one joins
 _HANDLES: Final = 1 << 64

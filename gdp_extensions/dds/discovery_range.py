@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["with_discovery_range"]
-
 _URI: Final = "CYCLONEDDS_URI"
 _RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _LOCALHOST_ONLY: Final = "ROS_LOCALHOST_ONLY"  # until Iron; the range takes precedence

@@ -22,8 +22,6 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 from proxy.serial.standard_types import standard_channel, type_hash
 
-__all__ = ["DdsEndpoint"]
-
 _Open = Subscription | Publication | Server | Client
 _T = TypeVar("_T", Subscription, Publication, Server, Client)
 

@@ -15,8 +15,6 @@ from gdp_extensions.dds.node_info import NodeInfo
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.serial.channel import Qos
 
-__all__ = ["GraphCache", "Peer"]
-
 _PREFIX: Final = 12  # bytes of a GID that identify its participant
 
 

@@ -14,17 +14,6 @@ from cyclonedds.__library__ import library_path
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "TIMED_OUT",
-    "WaitSet",
-    "count_readers",
-    "count_writers",
-    "matched_readers",
-    "matches",
-    "sertype_of",
-    "write",
-]
-
 TIMED_OUT: Final = -10  # DDS_RETCODE_TIMEOUT
 _TRIGGERED_MAX: Final = 256
 _FOREVER: Final = (1 << 63) - 1

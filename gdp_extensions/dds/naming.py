@@ -12,8 +12,6 @@ from typing import Final, NamedTuple
 
 from proxy.endpoints.core.endpoint import Role
 
-__all__ = ["CYCLONE", "Named", "dds_type", "hash_in", "identity", "identity_in", "named", "user_data", "vendor"]
-
 CYCLONE: Final = b"\x01\x10"
 _VENDORS: Final = {CYCLONE: "Cyclone DDS", b"\x01\x0f": "Fast DDS", b"\x01\x01": "RTI Connext"}
 _HASH: Final = re.compile(rb"(?:^|;)typehash=(RIHS01_[0-9a-f]{64});")

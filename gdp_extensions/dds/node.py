@@ -30,8 +30,6 @@ from gdp_extensions.dds.wait_thread import News, WaitThread
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.core.qos import default
 
-__all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
-
 ANY_STATE: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH: Final = 64  # samples read at once
 

@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-__all__ = ["GID_BYTES", "INFO_HASH", "INFO_TOPIC", "INFO_TYPE", "NodeInfo", "read_info", "write_info"]
-
 INFO_TOPIC: Final = "ros_discovery_info"
 INFO_TYPE: Final = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 INFO_HASH: Final = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"

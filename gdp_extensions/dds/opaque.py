@@ -22,8 +22,6 @@ from cyclonedds.topic import Topic
 from gdp.errors import LocalError
 from gdp_extensions.dds.library import sertype_of
 
-__all__ = ["OpaqueTopic"]
-
 _WORDS: Final = 64  # of the C description, searched for the type's Python object
 _LENGTH_AT: Final = 3  # words after it: the object, flags, the announcement's address, its length
 _WORD: Final = 8

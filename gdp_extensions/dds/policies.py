@@ -13,8 +13,6 @@ from cyclonedds.__library__ import library_path
 
 from proxy.serial.channel import NEVER, Qos
 
-__all__ = ["Announced", "announced"]
-
 _SECOND: Final = 1_000_000_000
 _FOREVER: Final = (1 << 63) - 1
 _LIVELINESS: Final = ("automatic", "manual_by_participant", "manual_by_topic")

@@ -12,8 +12,6 @@ from cyclonedds.core import Qos as DdsQos
 
 from proxy.serial.channel import NEVER, Qos
 
-__all__ = ["offered", "requested"]
-
 _SECOND: Final = 1_000_000_000
 _FOREVER: Final = (1 << 63) - 1
 # a writer whose readers do not keep up gives up after this time, so that it blocks only briefly

@@ -22,8 +22,6 @@ from proxy.endpoints.core.qos import default
 from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 
-__all__ = ["Client", "Server"]
-
 _PREFIX: Final = 4  # CDR encapsulation
 _HEADER: Final = 16
 _QOS: Final = default(depth=1_000)  # a thousand calls at once without eviction

@@ -17,8 +17,6 @@ from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.standard_types import standard_channel
 
-__all__ = ["Publication", "Subscription"]
-
 
 class Subscription:
     """Subscribes to a topic; its type need not be known here."""

@@ -19,8 +19,6 @@ from cyclonedds.domain import DomainParticipant
 
 from gdp_extensions.dds.library import WaitSet
 
-__all__ = ["Drain", "News", "WaitThread"]
-
 log = logging.getLogger(__name__)
 
 _QUEUE_MAX: Final = 64

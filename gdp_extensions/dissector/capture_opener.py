@@ -33,8 +33,6 @@ from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 from gdp.trust.grants import topic_secret
 
-__all__ = ["CaptureKeys", "CaptureOpener", "OpenedMessage", "Outcome"]
-
 _DESCRIPTION_MAX_BYTES: Final = 4 << 20
 _SEALED: Final = frozenset({Kind.DATA, Kind.HEARTBEAT, Kind.ACKNACK, Kind.INTRODUCTION, Kind.PARITY})
 _NOTES: Final = frozenset({Kind.ACKNACK, Kind.INTRODUCTION})

@@ -31,8 +31,6 @@ from gdp_extensions.dissector.capture_opener import CaptureKeys, CaptureOpener, 
 if TYPE_CHECKING:
     from gdp_extensions.dissector.pcap_files import CapturedFrame
 
-__all__ = ["app"]
-
 app = Program("gdp decrypt-pcap")
 
 _OPENED_PROTOCOL: Final = "gdp_opened"  # as the dissector registers it

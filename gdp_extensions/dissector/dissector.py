@@ -46,8 +46,6 @@ from gdp.frame.layers import (
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES, PARTS_MAX
 from gdp_extensions.dissector.opened import BODIES, OpenedFrame
 
-__all__ = ["FIRST_LINE", "dissector", "prefix_of"]
-
 FIRST_LINE: Final = "-- Wireshark dissector of the Global Data Plane"
 _TEMPLATE: Final = "gdp.lua"
 _MARK: Final = "@tables@"

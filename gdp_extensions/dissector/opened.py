@@ -23,8 +23,6 @@ from scapy.packet import Packet
 from gdp.frame.kinds import Kind
 from gdp.frame.layers import FLAG_NAMES, KIND_NAMES, NameField, RestField, least_bytes
 
-__all__ = ["BODIES", "ENCODINGS", "OpenedFrame", "RosBody"]
-
 ENCODINGS: Final = {0: "unknown", 1: "json", 2: "cbor", 3: "cdr"}
 
 

@@ -26,8 +26,6 @@ from scapy.utils import RawPcapNgReader, RawPcapReader
 
 from gdp.errors import LocalError
 
-__all__ = ["ETHERNET", "LONGEST_BYTES", "CapturedFrame", "PcapngWriter", "read_capture"]
-
 ETHERNET: Final = 1
 LONGEST_BYTES: Final = 1 << 18  # Wireshark refuses longer frames
 _BLOCK_MAX_BYTES: Final = 16 << 20  # of pcapng: a frame, its comments, names or secrets

@@ -20,8 +20,6 @@ from gdp.extras import require_extra
 from gdp.intervals import SERVER_S
 from gdp.stores.files import public, read_public, write_all
 
-__all__ = ["app"]
-
 app = Program("gdp wireshark")
 
 _FILE: Final = "gdp.lua"

@@ -23,8 +23,6 @@ from proxy.cli.node_options import Delegations, Iface
 if TYPE_CHECKING:
     from gdp_extensions.doors.endpoint import NewSession
 
-__all__ = ["DoorNode", "DoorOptions", "Listen", "NoToken", "Origins", "TokenFile", "door_token", "serve_door"]
-
 log = logging.getLogger(__name__)
 
 DOOR_TOKEN: Final = Secret("door token", "--token-file", "GDP_DOOR_TOKEN")

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["DoorEndpoint", "DoorSettings", "NewSession"]
-
 log = logging.getLogger(__name__)
 wire_log = logging.getLogger(f"{__name__}.wire")
 wire_log.setLevel(logging.INFO)  # the library's DEBUG has URLs with tokens, and what clients send

@@ -19,8 +19,6 @@ from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.config.config import ProxyConfig
 from proxy.node.node import ProxyNode, run_node
 
-__all__ = ["OpenDoor", "run_door"]
-
 log = logging.getLogger(__name__)
 
 OpenDoor = Callable[[Callable[[], DelegatedRules]], DoorEndpoint]

@@ -12,8 +12,6 @@ from gdp.cli.node import Logs, running
 from gdp.cli.program import Program
 from gdp_extensions.doors.command import DoorNode, DoorOptions, Listen, Origins, serve_door
 
-__all__ = ["app"]
-
 app = Program("gdp rosbridge")
 
 LISTEN = "127.0.0.1:9090"

@@ -30,8 +30,6 @@ from gdp.state.snapshot import short_id
 from proxy.bridge.call_tracer import CallKey, CallTracer, trace_ids
 from proxy.config.config import Traces
 
-__all__ = ["OtelTracer", "open_tracer"]
-
 log = logging.getLogger(__name__)
 
 CALLS_MAX: Final = 4_096  # traced at once; further calls have no spans and are counted

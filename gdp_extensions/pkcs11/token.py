@@ -23,8 +23,6 @@ from gdp.stores.files import read_private
 from gdp.stores.passphrase import passphrase_for
 from gdp_extensions.pkcs11.token_uri import TokenUri
 
-__all__ = ["TokenKey", "generate_token_key", "open_token_key"]
-
 _DIGEST_BYTES: Final = 32
 _POINT_BYTES: Final = 65
 _TRIAL: Final = b"gdp-token-trial-1"  # no statement begins with these bytes

@@ -16,8 +16,6 @@ from urllib.parse import unquote, unquote_to_bytes, urlsplit
 from gdp.errors import LocalError
 from gdp.stores.private_keys import SCHEME
 
-__all__ = ["TokenUri"]
-
 _EXAMPLE: Final = "pkcs11:token=robot;object=node?module-path=/usr/lib/softhsm/libsofthsm2.so"
 
 

@@ -14,8 +14,6 @@ from proxy.bridge.core.reduction import Adaptation
 from proxy.config.reduction import Adapt
 from proxy.config.rule import Rule
 
-__all__ = ["PathAdaptation", "adaptation_of"]
-
 _NOT_OF_THE_PATH: Final = (LossReason.NO_READER, LossReason.TOO_LARGE)
 
 

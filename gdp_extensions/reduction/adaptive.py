@@ -29,8 +29,6 @@ from typing import Final
 
 from proxy.config.reduction import MIN_HZ, MIN_QUALITY, QUALITY
 
-__all__ = ["AdaptBounds", "AdaptiveQuality"]
-
 _LATE_S: Final = 0.1  # longest wait that is no sign of a backlog, beyond the shortest wait seen lately
 _DECREASE: Final = 0.8
 _INCREASE_PER_S: Final = 0.08

@@ -17,8 +17,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.reader import Tree
 from proxy.serial.serializer import native_codec
 
-__all__ = ["CloudReducer"]
-
 _Axes: TypeAlias = "npt.NDArray[np.float64]"
 _FORMATS: Final = {7: "f4", 8: "f8"}  # PointField.FLOAT32, FLOAT64
 _VOXELS_MAX: Final = 1 << 21  # along each axis: three of them fit into 63 bits

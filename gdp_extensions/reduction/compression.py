@@ -18,8 +18,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["BodyCompressor", "BodyDecompressor", "check_dictionary"]
-
 GAIN_MIN: Final = 0.03  # share of the body that compression must save
 _SMALL_BYTES: Final = 32  # shorter bodies are never tried: a frame adds up to 9 bytes
 _FAILURES_MAX: Final = 3  # attempts without gain in a row, before attempts are left out

@@ -22,8 +22,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import Step
 
-__all__ = ["ReducingEncoder", "encoders_of"]
-
 
 def encoders_of(rule: Rule) -> Callable[[Channel], MessageEncoder]:
     """Return what makes the encoder of each channel of a topic; they share a compressor."""

@@ -16,8 +16,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import RosMessage, Step, TopicDescription
 
-__all__ = ["RestoringExpander", "body_max_bytes"]
-
 _TEXT_RATIO: Final = 16  # most bytes of JSON or CBOR, with the names of fields, for each byte as ROS wrote it
 _TEXT_FREE_BYTES: Final = 64 << 10
 

@@ -19,8 +19,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.serializer import native_codec
 from proxy.wire.message import PictureFormat
 
-__all__ = ["ImageReducer", "ImageRestorer"]
-
 _NAMED: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2, "rgb16": 6, "bgr16": 6}
 _OPENCV: Final = re.compile(r"(8|16|32|64)[USF]C(\d{1,2})")
 _BAYER: Final = re.compile(r"bayer_[a-z]{4}(8|16)")

@@ -24,14 +24,6 @@ except ImportError:  # the extra `images` is not installed
 else:
     HAS_LIBRARY = True
 
-__all__ = [
-    "HAS_LIBRARY",
-    "Layout",
-    "check_pictures",
-    "decode_picture",
-    "encode_picture",
-]
-
 _PNG_LEVEL: Final = 1  # of zlib: 6 takes eight times as long and saves a seventh
 
 

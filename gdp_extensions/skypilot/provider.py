@@ -26,8 +26,6 @@ from gdp.extras import install_command
 from gdp.intervals import HOUR_S
 from gdp_extensions.skypilot.record import being_made, cluster_name, labels_of, machine_of
 
-__all__ = ["SkyPilotProvider", "open_skypilot"]
-
 _SERVICE: Final = "fog-machine"
 _WRONG: Final = (  # names in sky.exceptions of permanent errors
     "NoCloudAccessError",

@@ -14,8 +14,6 @@ from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineSpec, MachineState
 from gdp.errors import LocalError
 
-__all__ = ["LAUNCH", "Request", "Status", "being_made", "cluster_name", "labels_of", "machine_of"]
-
 LAUNCH: Final = "sky.launch"
 _PREFIX: Final = "fog"
 _CLUSTER: Final = "fog-cluster"

@@ -41,8 +41,6 @@ from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphEntity, Role, RosEndpoint, proxy_node_name
 from proxy.serial.channel import Qos
 
-__all__ = ["Bridge", "BridgeRules", "FlowChange"]
-
 log = logging.getLogger(__name__)
 
 _ENDED_MAX: Final = 256

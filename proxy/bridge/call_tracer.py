@@ -14,8 +14,6 @@ from typing import Final, NamedTuple
 
 from gdp.names import Name
 
-__all__ = ["CallKey", "CallTracer", "TraceIds", "trace_ids"]
-
 _CONTEXT: Final = b"gdp trace of a call, version 1"
 
 

@@ -15,8 +15,6 @@ from proxy.bridge.core.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.endpoints.core.endpoint import RosEndpoint
 
-__all__ = ["NO_FIELDS", "TRIGGER", "Cancellation"]
-
 TRIGGER: Final = "std_srvs/srv/Trigger"
 
 # empty request of a Trigger; ROS 2 fills a message without fields with one byte

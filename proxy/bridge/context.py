@@ -19,8 +19,6 @@ from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
 from proxy.endpoints.core.endpoint import EndpointError
 
-__all__ = ["BridgeContext"]
-
 log = logging.getLogger(__name__)
 
 _Input = ParamSpec("_Input")

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 
 from gdp.telemetry.sources import Histogram
 
-__all__ = ["Traffic"]
-
 
 @dataclass(slots=True, kw_only=True)
 class Traffic:

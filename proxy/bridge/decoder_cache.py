@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import Final, Generic, TypeVar
 
-__all__ = ["DecoderCache"]
-
 _COUNT_MAX: Final = 1_024
 _BYTES_MAX: Final = 16 << 20  # of descriptions
 _EACH_MAX: Final = 8  # descriptions of one publisher of one topic

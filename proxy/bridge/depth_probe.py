@@ -12,8 +12,6 @@ from proxy.endpoints.core.endpoint import Event, MessageReceived
 from proxy.endpoints.core.qos import DEPTH_MAX
 from proxy.serial.channel import Qos
 
-__all__ = ["DepthProbe"]
-
 _QUIET_S = 1.0  # without a message, before a probe and during it
 _TRIES = 8  # one for each further message; later ones when the messages have doubled
 

@@ -12,8 +12,6 @@ from proxy.endpoints.core.endpoint import EndpointError, Event, GraphChanged, Ro
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 
-__all__ = ["EndpointDispatcher", "EventHandler"]
-
 
 class EventHandler(Protocol):
     """Receiver of the events of a handle."""

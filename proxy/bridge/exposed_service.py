@@ -53,8 +53,6 @@ from proxy.endpoints.core.endpoint import (
 from proxy.serial.schema import DefinitionError
 from proxy.wire.replication import is_word, sequencer_message, to_wire
 
-__all__ = ["ExposedService"]
-
 # requests that a ROS 2 server has at one time: its queue holds ten by default (rmw_qos_profile_services_default), and
 # clients on its own machine use it, too
 _QUEUE: Final = 8

@@ -30,8 +30,6 @@ from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Mes
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 
-__all__ = ["ExposedTopic"]
-
 
 class ExposedTopic:
     """Carries one local topic to the overlay while a local publisher exists.

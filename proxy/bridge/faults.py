@@ -15,8 +15,6 @@ from typing import Final
 
 from gdp.printable import printable
 
-__all__ = ["Fault", "Faults"]
-
 log = logging.getLogger(__name__)
 
 _COUNTS_MAX: Final = 4_096

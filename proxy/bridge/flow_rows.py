@@ -21,8 +21,6 @@ from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 
-__all__ = ["flow_fields", "flow_rows", "topic_counts"]
-
 _HIDDEN: Final = "/_gdp_proxy"  # presence topics of proxies
 _SERVERS_MAX: Final = 64
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from gdp.service.serving import Asked
 from proxy.bridge.core.action_interface import GOAL, RESULT
 
-__all__ = ["GoalCalls"]
-
 
 class GoalCalls:
     """Requests to accept goals and requests for their results; each operation takes constant time."""

@@ -43,8 +43,6 @@ from proxy.serial.serializer import Serializer
 from proxy.wire.replication import follower_message, is_word
 from proxy.wire.service import Exchange, News, too_large
 
-__all__ = ["ImportedService"]
-
 _FAULTS: Final = {
     Failure.TIMED_OUT: Fault.TIMED_OUT,
     Failure.NO_SERVER: Fault.NO_SERVER,

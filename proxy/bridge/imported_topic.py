@@ -34,8 +34,6 @@ from proxy.serial.frames import FrameRewriter
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
-__all__ = ["ImportedTopic"]
-
 _HEARD_MAX = 1_024  # publishers
 _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 

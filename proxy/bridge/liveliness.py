@@ -12,8 +12,6 @@ from typing import Final, Literal, TypeAlias
 
 from gdp.errors import LocalError
 
-__all__ = ["LivelinessEvent", "LivelinessTracker", "NameLiveliness", "Party", "PartyRole", "names_from_fields"]
-
 PartyRole: TypeAlias = Literal["publisher", "reader", "server", "client"]
 Change: TypeAlias = Literal["appears", "goes", "silent", "heard"]
 PARTIES_MAX: Final = 32  # of one name in a status

@@ -23,8 +23,6 @@ from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import CHANNELS_MAX
 
-__all__ = ["ChannelPublishers", "LocalOutput", "MergedPublisher"]
-
 _FAR_MAX: Final = 1_024  # publishers whose QoS is kept; the oldest are dropped
 _PUBLISHERS_MAX: Final = 4_096  # publishers whose channels are counted; the oldest are dropped
 

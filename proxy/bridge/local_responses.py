@@ -16,8 +16,6 @@ from gdp.intervals import Rate
 from gdp.token_bucket import TokenBucket
 from proxy.endpoints.core.endpoint import RosEndpoint
 
-__all__ = ["LocalResponses"]
-
 _LEAST_RATE: Final = Rate(200.0, burst=5)  # a busy node may not run for 25 ms
 _MEASURED_S: Final = 1.0  # time over which the rate of requests is measured
 _ROUNDING: Final = 1e-6  # of a token, at the very time that the timer gave

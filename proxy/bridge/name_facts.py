@@ -26,8 +26,6 @@ from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity, Role
 from proxy.endpoints.core.qos import unmatched
 
-__all__ = ["proxy_facts"]
-
 _FLOWS_MAX: Final = 16
 _KNOWN_MAX: Final = 64
 _SHORT_CHARS: Final = 16  # of a digest

@@ -19,8 +19,6 @@ from proxy.bridge.state_parameter import GET, SET, read_request, state_in, was_s
 from proxy.endpoints.core.endpoint import CallFailed, GraphEntity, ResponseReceived
 from proxy.wire.replication import STATE_MAX_BYTES
 
-__all__ = ["OrderedServer"]
-
 DOUBT_S: Final = 2.0  # a server that was replaced may have executed an entry for this long before the graph shows it
 AWAY_S: Final = 1.0  # a sequencer that sends nothing for this long is gone
 

@@ -5,8 +5,6 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-__all__ = ["RateLimiter"]
-
 
 class RateLimiter:
     """Passes so many messages a second, evenly; half a period early is in time, because no clock is exact.

@@ -14,8 +14,6 @@ from proxy.config.readiness import Readiness
 from proxy.endpoints.core.endpoint import CallFailed, EndpointError, Event, MessageReceived, ResponseReceived
 from proxy.serial.channel import RosVersion
 
-__all__ = ["ReadinessProbe", "Thresholds"]
-
 _SUCCESS_AT: Final[dict[RosVersion, int]] = {1: 0, 2: 4}  # ``bool success`` is the first field of the response
 
 

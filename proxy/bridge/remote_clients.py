@@ -17,8 +17,6 @@ from proxy.serial.channel import RosVersion
 from proxy.serial.schema import DefinitionError
 from proxy.wire.service import Exchange
 
-__all__ = ["ClientLiveness", "RemoteClients"]
-
 REMOTE_CLIENTS_MAX: Final = 1_024  # clients whose decoders are kept; the oldest are dropped
 
 

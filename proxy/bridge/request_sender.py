@@ -22,8 +22,6 @@ from proxy.bridge.server_discovery import ServerCalls
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.wire.replication import to_wire
 
-__all__ = ["BroadcastQueue", "Effect", "RequestSender", "wire_of"]
-
 DispatchEffect: TypeAlias = "Ask | DispatchStop"
 Effect: TypeAlias = "DispatchEffect | ReplicaCommand"
 

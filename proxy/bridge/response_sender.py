@@ -16,8 +16,6 @@ from proxy.bridge.service_flow import ServiceFlow
 from proxy.serial.serializer import Serializer
 from proxy.wire.service import Exchange, News, too_large
 
-__all__ = ["ResponseSender"]
-
 
 class ResponseSender:
     """Encodes and sends the messages of the local server.

@@ -14,8 +14,6 @@ from gdp.message.loss import LossReason
 if TYPE_CHECKING:
     from gdp.client.publisher import Publisher
 
-__all__ = ["SentStats"]
-
 
 @dataclass(frozen=True, slots=True)
 class SentStats:

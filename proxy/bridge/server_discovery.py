@@ -19,8 +19,6 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.wire.service import Exchange
 
-__all__ = ["SERVER_GONE", "Response", "ServerCalls", "ServerDiscovery"]
-
 SERVER_GONE: Final = "the far server is gone"
 
 Response: TypeAlias = "tuple[Name, bytes]"  # the sender, and its body in the local endpoint's wire form

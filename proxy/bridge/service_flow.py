@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from gdp.names import Name
     from proxy.endpoints.core.endpoint import Event
 
-__all__ = ["ServiceFlow"]
-
 
 class ServiceFlow(ABC):
     """One service or action of a rule, between this machine and the overlay.

@@ -14,8 +14,6 @@ from typing import Final
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-__all__ = ["GET", "SET", "read_request", "state_in", "was_set", "write_request"]
-
 GET: Final = ("get_parameters", "rcl_interfaces/srv/GetParameters")
 SET: Final = ("set_parameters", "rcl_interfaces/srv/SetParameters")
 _NAME: Final = "state"

@@ -21,8 +21,6 @@ from proxy.endpoints.core.endpoint import EndpointError, Event
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
 
-__all__ = ["StatusTopic", "open_status_topics", "string_message"]
-
 log = logging.getLogger(__name__)
 
 _STRING: Final = "std_msgs/msg/String"

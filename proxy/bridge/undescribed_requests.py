@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.client.participant import Message
 
-__all__ = ["UndescribedRequests"]
-
 EARLY_MAX: Final = 256  # of one client
 EARLY_MAX_BYTES: Final = 64 << 20  # of all clients; one client may use as much as it leaves free for others
 

@@ -16,8 +16,6 @@ from proxy.bridge.local_responses import LocalResponses
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.wire.service import Exchange
 
-__all__ = ["VirtualServer"]
-
 _STAYS_S: Final = 0.25  # after the last response; a second is long enough for clients to take it for a new server
 
 

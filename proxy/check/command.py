@@ -28,8 +28,6 @@ from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph
 from proxy.node.node import open_topics
 
-__all__ = ["check_proxy", "table"]
-
 
 def check_proxy(path: Path, settings: ProxyConfig, *, json: bool) -> int:
     """Print the meaning of each rule; return how many names here lack a delegation.

@@ -14,8 +14,6 @@ from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import Graph, proxy_node_name
 from proxy.endpoints.live import open_endpoints
 
-__all__ = ["LOOK_S", "read_graphs"]
-
 LOOK_S: Final = 4.0  # if the first announcement is missed, Fast DDS repeats it after 3 s
 
 

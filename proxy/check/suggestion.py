@@ -15,9 +15,6 @@ from gdp.ros_names import Kind, is_of_every_node
 from proxy.bridge.core.action_interface import action_of
 from proxy.endpoints.core.endpoint import Graph, Role
 
-__all__ = ["Offered", "Traffic", "offered_names", "suggested_file"]
-
-
 _OFFERS: Final[dict[Role, Kind]] = {Role.PUBLISHES: "topic", Role.SERVES: "service"}
 
 

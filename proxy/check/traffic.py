@@ -17,8 +17,6 @@ from proxy.check.suggestion import Offered, Traffic
 from proxy.endpoints.core.endpoint import Graph, MessageReceived, Role, RosEndpoint
 from proxy.endpoints.core.qos import request
 
-__all__ = ["measured"]
-
 
 def measured(endpoint: RosEndpoint, graph: Graph, offered: Sequence[Offered], seconds: float) -> list[Offered]:
     """Return the same names, topics with their traffic; a topic whose type is unknown here has none."""

@@ -27,9 +27,6 @@ from proxy.check.graph_snapshot import read_graphs
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import Graph
 
-__all__ = ["app", "main"]
-
-
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="the proxy.yaml of each machine")]
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 Live = Annotated[bool, typer.Option("--live", help="for patterns and missing types: what the first file's ROS has now")]

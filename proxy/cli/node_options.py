@@ -10,8 +10,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Delegations", "Iface"]
-
 Iface = Annotated[
     str | None, typer.Option("--iface", metavar="DEVICE", help="Device towards the switch. Default: as the node says.")
 ]

@@ -15,8 +15,6 @@ from gdp.cli.node import AwaitIface, Check, Config, Json, Logs, MemberPlane, run
 from gdp.cli.program import Program
 from gdp.intervals import ATTACH_S
 
-__all__ = ["Schema", "main", "schema_text"]
-
 app = Program("gdp-proxy")
 main = app.run
 

@@ -17,8 +17,6 @@ from proxy.cli.tool_options import print_json, print_text
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import PARTIAL, BagWriter
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help=f"The recording, such as rec.mcap{PARTIAL}.", exists=True)]

@@ -32,8 +32,6 @@ from proxy.recordings.limits import BagLimits
 from proxy.recordings.process import RecordingError
 from proxy.recordings.reader import BagReader
 
-__all__ = ["main"]
-
 log = logging.getLogger(__name__)
 
 

@@ -22,8 +22,6 @@ from gdp.errors import LocalError
 from gdp.metadata import SALT
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 
-__all__ = ["app"]
-
 app = Program(
     "gdp rule",
     no_args_is_help=True,

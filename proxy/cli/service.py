@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from proxy.bridge.bridge import Bridge
     from proxy.endpoints.probe import Probe
 
-__all__ = ["app"]
-
 app = Program("gdp service", no_args_is_help=True)
 
 

@@ -26,8 +26,6 @@ from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import Graph, RosEndpoint, proxy_node_name
 from proxy.endpoints.live import open_endpoint
 
-__all__ = ["suggest"]
-
 _FILE: Final = "proxy.yaml"
 _SUGGESTED: Final = "proxy.yaml.suggested"
 _TRAFFIC_S: Final = 3.0

@@ -25,17 +25,6 @@ from proxy.cli.node_options import Delegations, Iface
 if TYPE_CHECKING:
     from proxy.node.tool_member import Access, Wanted
 
-__all__ = [
-    "Node",
-    "ToolOptions",
-    "TypeName",
-    "complete_callable",
-    "complete_readable",
-    "print_json",
-    "print_text",
-    "running_tool",
-]
-
 Node = Annotated[
     Path,
     typer.Option(

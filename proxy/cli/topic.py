@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from proxy.tools.message_text import MessageText
     from proxy.tools.rates import Bandwidth, Frequency
 
-__all__ = ["app"]
-
 app = Program("gdp topic", no_args_is_help=True)
 
 _REPORT_S: Final = 1.0

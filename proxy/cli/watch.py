@@ -27,8 +27,6 @@ from gdp.state.control_protocol import Command
 from gdp.terminal import echo
 from proxy.bridge.liveliness import LivelinessEvent, LivelinessTracker, NameLiveliness, names_from_fields
 
-__all__ = ["app"]
-
 app = Program("gdp watch")
 
 _NOT_RUNNING: Final = 3

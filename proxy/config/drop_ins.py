@@ -20,8 +20,6 @@ from gdp.config.yaml_source import KeyPath, YamlSource, read_yaml
 from gdp.errors import ConfigError
 from proxy.config.rule import NamePatterns, Rule
 
-__all__ = ["DROP_INS", "DropIn", "DropIns", "add_drop_in_patterns", "add_drop_in_rules"]
-
 DROP_INS: Final = "drop_ins"  # key of the validation context
 _FILES_MAX: Final = 1_000
 

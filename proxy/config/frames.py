@@ -11,8 +11,6 @@ from pydantic import Field, model_validator
 
 from gdp.config.schema import Section
 
-__all__ = ["Frames"]
-
 _CHARS_MAX: Final = 255
 _Text = Annotated[str, Field(max_length=_CHARS_MAX, pattern=r"^[^\x00-\x20\x7f]*$")]
 

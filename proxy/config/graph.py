@@ -17,8 +17,6 @@ from gdp.errors import LocalError
 from proxy.config.rule import DOMAIN_MAX, Rule
 from proxy.serial.channel import RosVersion
 
-__all__ = ["RosGraphConfig"]
-
 DEFAULT_MASTER: Final = "http://localhost:11311"
 
 

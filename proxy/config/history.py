@@ -14,8 +14,6 @@ from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
 from gdp.config.schema import Section
 from gdp.intervals import DAY_S
 
-__all__ = ["History", "SomeHistory"]
-
 
 class History(Section):
     """Bounds of what is kept; the first that is reached counts."""

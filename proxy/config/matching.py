@@ -13,8 +13,6 @@ from gdp.names import Name
 from gdp.ros_names import Kind
 from proxy.config.rule import Rule
 
-__all__ = ["Fault", "choose", "clashes", "imported"]
-
 Fault: TypeAlias = "tuple[tuple[str | int, ...], str]"  # the wrong key, and its fault
 
 

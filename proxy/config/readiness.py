@@ -14,8 +14,6 @@ from gdp.config.schema import Section
 from gdp.intervals import HOUR_S
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, TYPE_FORMS, fits_kind, is_name
 
-__all__ = ["Readiness"]
-
 THRESHOLD_MAX: Final = 1_000
 
 

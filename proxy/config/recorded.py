@@ -16,8 +16,6 @@ from typing import Final
 from gdp.limits import MESSAGE_MAX_BYTES
 from proxy.config.rule import Rule
 
-__all__ = ["RecordedRules"]
-
 _UNLIMITED: Final[dict[str, object]] = {"max_hz": None, "max_bytes": MESSAGE_MAX_BYTES}
 _EXACT: Final[dict[str, object]] = {"remap": None, "max_hz": None, **dict.fromkeys(("voxel_m", "region", "adapt"))}
 

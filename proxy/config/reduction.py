@@ -16,8 +16,6 @@ from gdp.config.schema import Section, relative
 from gdp.errors import LocalError
 from gdp.extras import Seam
 
-__all__ = ["CLOUD", "IMAGE", "QUALITY", "Adapt", "Bounds", "Compress", "Region", "SomeAdapt", "SomeCompress"]
-
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMAGE: Final = "sensor_msgs/msg/Image"
 QUALITY: Final = 80  # of JPEG, where none is stated

@@ -55,8 +55,6 @@ from proxy.config.reduction import CLOUD, IMAGE, QUALITY, Region, SomeAdapt, Som
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import PictureFormat
 
-__all__ = ["DOMAIN_MAX", "REDUCTIONS", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
-
 _OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
 COPIES_MAX: Final = 1_024

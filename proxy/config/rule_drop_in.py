@@ -18,8 +18,6 @@ from gdp.errors import GdpError, LocalError
 from gdp.sharing.proxy_files import ProxyFiles
 from proxy.config.config import ProxyConfig
 
-__all__ = ["RULE_LISTS", "ListedRule", "RuleDropIn", "RuleList"]
-
 RuleList: TypeAlias = Literal["expose", "import", "deny"]
 RULE_LISTS: Final[tuple[RuleList, ...]] = ("expose", "import", "deny")
 _FILE: Final = "gdp-rule.yaml"

@@ -11,8 +11,6 @@ from gdp.config.schema import Section
 from gdp.intervals import DAY_S
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, is_name
 
-__all__ = ["StatusTopicConfig"]
-
 
 class StatusTopicConfig(Section):
     """A latched ``std_msgs/msg/String`` in each graph."""

@@ -15,8 +15,6 @@ from typing import Final, Protocol, TypeAlias, cast
 
 from gdp.errors import LocalError
 
-__all__ = ["Field", "Interface", "definition_of", "interface_of", "type_hash_of"]
-
 _RULE: Final = "=" * 80
 _WORDS: Final = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 _IDS: Final = {

@@ -15,8 +15,6 @@ from proxy.endpoints.core.endpoint import Event
 from proxy.serial.channel import RosVersion
 from proxy.serial.service import Service
 
-__all__ = ["InProcessEndpoint"]
-
 
 class InProcessEndpoint:
     """Queue of events, and the refusal of what needs a local server.

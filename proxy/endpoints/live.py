@@ -13,8 +13,6 @@ from gdp.extras import Seam
 from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import RosEndpoint
 
-__all__ = ["open_endpoint", "open_endpoints"]
-
 _ENDPOINTS: Final[Seam[Callable[[int, str], RosEndpoint]]] = Seam("gdp.endpoint")
 
 

@@ -16,8 +16,6 @@ from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 from proxy.serial.standard_types import known_channel
 
-__all__ = ["Probe"]
-
 _NODE = "/gdp_tool"
 _TICKET = 1
 

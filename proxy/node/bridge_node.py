@@ -30,8 +30,6 @@ from proxy.node.node import ProxyNode, run_node
 from proxy.node.proxy_state import described
 from proxy.node.state_answer import answer_for_proxy
 
-__all__ = ["open_tracer", "run"]
-
 log = logging.getLogger(__name__)
 
 _LOOK_S: Final = 2.0  # with less, a new proxy may not detect yet that another proxy of its graph carries the same

@@ -16,8 +16,6 @@ from gdp.errors import LocalError
 from gdp.session.settings import MEMBER_KEYS, settings_of
 from proxy.config.config import ProxyConfig
 
-__all__ = ["member_config"]
-
 
 def member_config(node: Path, iface: str | None, delegations: Path | None) -> tuple[ProxyConfig, Path]:
     """Return the configuration of such a member, and the directory of its delegations.

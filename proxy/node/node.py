@@ -29,8 +29,6 @@ from proxy.bridge.bridge import Bridge
 from proxy.config.config import ProxyConfig
 from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 
-__all__ = ["ProxyNode", "open_topics", "run_node"]
-
 log = logging.getLogger(__name__)
 
 

@@ -34,8 +34,6 @@ from proxy.bridge.faults import Faults
 from proxy.bridge.flow_rows import flow_fields, flow_rows, topic_counts
 from proxy.serial.channel import Qos
 
-__all__ = ["ProxyState", "described", "proxy_handlers", "proxy_sources"]
-
 BEST_EFFORT_MAX: Final = 32  # topics in one status; each has less than 1 KiB
 CALLED_MAX: Final = 256  # services in one status; each has less than 128 bytes
 DENIED_MAX: Final = 50  # names in one status; each has less than 1.5 KiB

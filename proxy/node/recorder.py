@@ -22,8 +22,6 @@ from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.split import SplitWriter, first_part
 from proxy.serial.channel import RosVersion
 
-__all__ = ["record", "refuse_existing_file"]
-
 
 def record(settings: ProxyConfig, *, json: bool) -> bool:
     """Receive the configured imports until stopped, or until they cannot be written; return whether all are.

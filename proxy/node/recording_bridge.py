@@ -17,8 +17,6 @@ from proxy.node.node import ProxyNode, open_topics
 from proxy.node.state_answer import answer_for_proxy
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 
-__all__ = ["open_recording_bridge"]
-
 log = logging.getLogger(__name__)
 
 

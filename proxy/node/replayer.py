@@ -20,8 +20,6 @@ from proxy.bridge.sent_stats import SentStats
 from proxy.node.node import ProxyNode
 from proxy.recordings.endpoint import ReplayEndpoint
 
-__all__ = ["Pace", "Replay", "ReplayedTopic", "Unconfirmed"]
-
 log = logging.getLogger(__name__)
 
 STALL_S: Final = 20.0  # after this time without any acknowledgement, readers are given up

@@ -18,8 +18,6 @@ from proxy.node.proxy_state import ProxyState
 if TYPE_CHECKING:
     from gdp.diagnosis.facts import ProxyFacts
 
-__all__ = ["answer_for_proxy"]
-
 _ASKED: Final = Keyed("q", text(256), absent="")
 
 

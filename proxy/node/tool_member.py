@@ -29,8 +29,6 @@ from proxy.endpoints.probe import Probe
 from proxy.node.member_config import member_config
 from proxy.node.node import run_node
 
-__all__ = ["Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
-
 _ELLIPSIS: Final = ("…", "...")
 _HEX: Final = set("0123456789abcdef")
 

@@ -33,8 +33,6 @@ from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard_types import standard_definition, type_hash
 
-__all__ = ["from_connection", "from_ros1", "from_ros2", "offered_qos", "ros2_type", "to_qos"]
-
 _QOS_TEXT_MAX = 64 << 10
 
 _RENAMED = {  # types of equal definition: by the old name and the md5 sum

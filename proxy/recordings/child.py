@@ -37,8 +37,6 @@ from proxy.recordings.stream import (
 )
 from proxy.serial.channel import Channel
 
-__all__ = ["confine_decoder", "main"]
-
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _SYSTEM: Final = tuple(map(Path, ("/usr/lib", "/usr/share/zoneinfo", "/lib", "/lib64")))
 _JOURNALS: Final = ("-wal", "-shm")  # journal files of SQLite, in the same folder as the database

@@ -17,8 +17,6 @@ from proxy.recordings.reader import BagReader
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import canonical
 
-__all__ = ["TopicComparison", "compare", "compare_digests"]
-
 _DIGEST_BYTES: Final = 16
 _Publisher: TypeAlias = "str | None"
 

@@ -42,8 +42,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["BagDecoder"]
-
 # These are raised by rosbags and the libraries under it for a malformed file.
 _FOREIGN: Final = (
     ReaderError1,

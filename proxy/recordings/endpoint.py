@@ -28,8 +28,6 @@ from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
-__all__ = ["RecordedMessage", "RecordingEndpoint", "ReplayEndpoint"]
-
 
 class RecordedMessage(NamedTuple):
     """One message of a subscribed topic."""

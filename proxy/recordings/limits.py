@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["BagLimits"]
-
 _MEMORY_BYTES: Final = 1 << 30
 _MEMORY_PER_BYTE: Final = 8  # an index entry of 31 bytes takes about 200 in memory
 _MEMORY_MOST_BYTES: Final = 4 << 30

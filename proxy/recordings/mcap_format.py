@@ -8,8 +8,6 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-__all__ = ["CHUNK_HEAD", "FOOTER", "MAGIC", "MESSAGE_HEAD", "RECORD", "Opcode"]
-
 MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD: Final = struct.Struct("<BQ")  # opcode, bytes
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time

@@ -20,8 +20,6 @@ from proxy.recordings.channels import to_qos
 from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD, RECORD, Opcode
 from proxy.serial.channel import Channel, DefinitionFormat
 
-__all__ = ["CHUNK_BYTES", "McapWriter"]
-
 CHUNK_BYTES: Final = 1 << 20  # a chunk is written when it has more
 _ENCODINGS: Final[dict[DefinitionFormat, str]] = {"msg": "ros2msg", "idl": "ros2idl", "": ""}
 

@@ -13,8 +13,6 @@ from ruamel.yaml import YAML
 
 from proxy.recordings.unpacking import SalvageError
 
-__all__ = ["BoundedYaml", "load_plain"]
-
 _LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml, where PyYAML was built with it
 _BYTES_MAX: Final = 1 << 20
 _DEPTH_MAX: Final = 16

@@ -23,8 +23,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S, STOP_S
 
-__all__ = ["BagProcess", "Cost", "RecordingError", "StoppedError"]
-
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _CODE: Final = """
 import sys

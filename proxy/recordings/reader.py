@@ -25,8 +25,6 @@ from proxy.recordings.stream import FailedError, FrameReader, RefusedError
 from proxy.recordings.unpacking import file_max_bytes
 from proxy.serial.channel import Channel
 
-__all__ = ["BagReader"]
-
 _SQLITE: Final = b"SQLite format 3\0"
 _Waiting = Callable[[], bool]
 

@@ -21,8 +21,6 @@ from proxy.recordings.source import Chunk, Heads, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel, DefinitionFormat
 
-__all__ = ["is_indexed", "scan"]
-
 _FOOTER_BYTES: Final = RECORD.size + FOOTER.size + len(MAGIC)
 
 _ID: Final = struct.Struct("<H")

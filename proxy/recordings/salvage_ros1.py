@@ -18,8 +18,6 @@ from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = ["MAGIC", "channel_of", "scan"]
-
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _MESSAGE, _BAG, _CHUNK, _CONNECTION = 2, 3, 5, 7

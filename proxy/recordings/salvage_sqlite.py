@@ -24,8 +24,6 @@ from proxy.recordings.sqlite_guard import check_schema, guard
 from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat
 
-__all__ = ["MAGIC", "SqliteSource"]
-
 MAGIC: Final = b"SQLite format 3\0"
 _DEFINITION: Final = ("topic_type", "encoding", "encoded_message_definition")
 _TOPIC: Final = ("name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")

@@ -18,21 +18,6 @@ from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = [
-    "COMPRESSIONS",
-    "ZSTD",
-    "Chunk",
-    "Heads",
-    "JoinedSource",
-    "Message",
-    "Place",
-    "Scan",
-    "ScannedSource",
-    "Source",
-    "Tally",
-    "UnpackedSource",
-]
-
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 COMPRESSIONS: Final = {b"\x04\x22\x4d\x18": "lz4", b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz"}
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file

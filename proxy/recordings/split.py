@@ -13,8 +13,6 @@ from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, RosVersion
 
-__all__ = ["SplitWriter", "first_part"]
-
 
 def first_part(path: Path, *, is_split: bool) -> Path:
     """Return the first file of a recording."""

@@ -13,8 +13,6 @@ import apsw
 
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError
 
-__all__ = ["check_schema", "guard"]
-
 _STEPS_FREE: Final = 20_000_000  # steps of SQLite's virtual machine for one statement, about a second
 _STEPS_PER_BYTE: Final = 16  # ... and this many for each byte of the file
 _STEPS_BETWEEN: Final = 50_000  # interval, in steps, of signal handling and step counting

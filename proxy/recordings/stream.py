@@ -26,21 +26,6 @@ from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.source import Message
 from proxy.serial.channel import CHANNEL_MAX_BYTES, Channel
 
-__all__ = [
-    "BLOCK_BYTES",
-    "CHANNELS_MAX",
-    "CHANNELS_MAX_BYTES",
-    "FailedError",
-    "FrameReader",
-    "Kind",
-    "RefusedError",
-    "Take",
-    "frame_head",
-    "message_head",
-    "opened_to",
-    "text_to",
-]
-
 BLOCK_BYTES: Final = 128 << 10  # small messages are collected up to this size
 CHANNELS_MAX: Final = 16_384
 CHANNELS_MAX_BYTES: Final = 32 << 20  # of all descriptions

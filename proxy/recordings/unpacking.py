@@ -25,8 +25,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-__all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "file_max_bytes", "unpack", "unpack_file"]
-
 CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can be sent
 _FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, in addition to the first 64 MiB
 _ASKED_BYTES: Final = 4 << 10  # may be requested without checking the file's length

@@ -29,8 +29,6 @@ from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
 
-__all__ = ["PARTIAL", "BagWriter"]
-
 log = logging.getLogger(__name__)
 
 PARTIAL: Final = ".partial"

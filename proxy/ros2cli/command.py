@@ -14,8 +14,6 @@ from typing import Final
 
 from ros2cli.command import CommandExtension
 
-__all__ = ["PROGRAMS", "GdpCommand"]
-
 PROGRAMS: Final = {  # verb to module and program
     "switch": ("gdp.cli.switch", "gdp-switch"),
     "rib": ("gdp.cli.rib", "gdp-rib"),

@@ -11,8 +11,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-__all__ = ["BoundedCache", "digest_of"]
-
 _Result = TypeVar("_Result")
 
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["check_bounds"]
-
 _DEPTH_MAX: Final = 64
 _BREAK: Final = 0xFF
 _TYPED_ARRAYS: Final = range(64, 88)  # tags

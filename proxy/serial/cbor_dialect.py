@@ -14,8 +14,6 @@ from cbor2 import CBORTag
 from proxy.serial.dialect import MisfitError, Wide
 from proxy.serial.schema import Number
 
-__all__ = ["CborDialect"]
-
 # RFC 8746, section 2.1
 _TAGS: Final = {"B": 64, "H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
 _FLOATS: Final = {"f": struct.Struct("<f"), "d": struct.Struct("<d")}

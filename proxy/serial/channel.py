@@ -12,20 +12,6 @@ from gdp.crypto.schema import FLAG, OCTETS, FieldSet, Form, Keyed, literal, many
 from gdp.errors import LocalError, RemoteError
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
-__all__ = [
-    "CHANNEL",
-    "CHANNEL_MAX_BYTES",
-    "EMPTY_MD5",
-    "NEVER",
-    "QOS_MAX",
-    "TEXT",
-    "Channel",
-    "DefinitionFormat",
-    "Qos",
-    "RosVersion",
-    "ros1_format",
-]
-
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
 

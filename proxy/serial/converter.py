@@ -20,8 +20,6 @@ from proxy.serial.serializer import Codec
 from proxy.serial.type_match import Amend, Side, match
 from proxy.serial.type_translation import bounds_of, md5_text, retyped, rihs01, text_of, types_of
 
-__all__ = ["MessageConverter", "translated_channel"]
-
 _NATIVE: Final = NativeDialect()
 # QoS equivalent of a latching ROS 1 publisher: every late joiner gets its last message.
 _LATCHED: Final = Qos(depth=1, reliability="reliable", durability="transient_local")

@@ -10,8 +10,6 @@ from typing import Final
 
 from proxy.serial.schema import Array, Number, Sequence, Text, Type
 
-__all__ = ["COST_MAX", "fixed_bytes", "items_of"]
-
 COST_MAX: Final = 1 << 40  # costs are counted up to this number
 
 

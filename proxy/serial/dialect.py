@@ -10,8 +10,6 @@ from typing import Final, Protocol
 
 from proxy.serial.schema import Number
 
-__all__ = ["BITS", "Dialect", "MisfitError", "Wide"]
-
 # The unsigned code of the same width, for the exact bits of a float; other codes map to themselves.
 BITS: Final = {"f": "I", "d": "Q"}
 

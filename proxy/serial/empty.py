@@ -22,8 +22,6 @@ from proxy.serial.schema import Array, DefinitionError, Number, Record, Sequence
 from proxy.serial.serializer import Codec
 from proxy.serial.service import Service
 
-__all__ = ["Defaults", "NoAnswer", "default_tree"]
-
 Defaults: TypeAlias = "Mapping[tuple[str, str], Default]"  # by type and field
 
 _SUCCESS: Final = ("success", Number("?"))

@@ -15,8 +15,6 @@ from proxy.serial.dialect import MisfitError
 from proxy.serial.schema import Array, Number, Record, Sequence, Text, parse
 from proxy.serial.serializer import native_codec
 
-__all__ = ["FrameRewriter"]
-
 _FIELDS: Final = frozenset({"frame_id", "child_frame_id"})
 _COUNT: Final = struct.Struct("<I")
 _TAIL_MIN: Final = 4_096  # bytes of a last array that are worth a copy less

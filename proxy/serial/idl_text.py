@@ -18,8 +18,6 @@ from rosbags.interfaces.typing import BaseDesc, Basename, Constdefs, FieldDesc, 
 
 from proxy.serial.msg_text import STATEMENTS_MAX
 
-__all__ = ["parse_idl"]
-
 _TOKENS_MAX: Final = 16_384  # a text of rosidl has one in five bytes
 _DEPTH_MAX: Final = 16  # modules within modules, sequences within sequences
 _NUMBER_MAX: Final = (1 << 32) - 1

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from proxy.serial.dialect import BITS, MisfitError, Wide
 from proxy.serial.schema import Number
 
-__all__ = ["JsonDialect"]
-
 _Numbers: TypeAlias = "NDArray[np.generic]"
 
 _SAFE: Final = (1 << 53) - 1  # RFC 7493, section 2.2

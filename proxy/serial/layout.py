@@ -13,8 +13,6 @@ from typing import Final
 from proxy.serial.dialect import BITS
 from proxy.serial.schema import SIZES, Array, Number, Record, Type
 
-__all__ = ["Phases", "Wire", "inline_codes", "runs"]
-
 _AS_BITS: Final = str.maketrans(BITS)
 # numbers of one record that are unpacked in runs; further arrays and records are unpacked one by one
 _RUN_MAX: Final = 4_096

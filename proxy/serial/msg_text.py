@@ -14,8 +14,6 @@ from typing import Final, TypeAlias
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Basename, Constdefs, Fielddefs, FieldDesc, NameDesc, Typesdict
 
-__all__ = ["STATEMENTS_MAX", "Default", "defaults_of", "parse_msg"]
-
 STATEMENTS_MAX: Final = 2_048  # fields and constants of one text
 _NUMBER_DIGITS_MAX: Final = 10
 _SECTIONS_MAX: Final = 1_024

@@ -8,8 +8,6 @@ from __future__ import annotations
 from proxy.serial.dialect import MisfitError, Wide
 from proxy.serial.schema import Number
 
-__all__ = ["NativeDialect"]
-
 
 class NativeDialect:
     """Floats as bits, longer leaves as bytes."""

@@ -19,8 +19,6 @@ from proxy.serial.dialect import Dialect, MisfitError, Wide
 from proxy.serial.layout import Wire, inline_codes, runs
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
-__all__ = ["ITEMS_MAX", "Reader", "Tree", "read_with"]
-
 Tree: TypeAlias = dict[str, object]
 Reader: TypeAlias = "Callable[[memoryview, int], tuple[object, int]]"
 _Step: TypeAlias = "Callable[[memoryview, int, Tree], int]"

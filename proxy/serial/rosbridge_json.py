@@ -24,8 +24,6 @@ from proxy.serial.json_dialect import JsonDialect
 from proxy.serial.schema import Array, Number, Record, Sequence, Text, Type, parse
 from proxy.serial.serializer import Codec, native_codec
 
-__all__ = ["RosbridgeCodec", "both_spellings", "cbor_raw", "codec_of", "png_text"]
-
 _NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
 _TIME, _DURATION, _HEADER = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "std_msgs/msg/Header"
 _SPELLINGS: Final = (("sec", "secs"), ("nanosec", "nsecs"))  # ROS 2's and ROS 1's

@@ -19,23 +19,6 @@ from proxy.serial.bounded_cache import BoundedCache, digest_of
 from proxy.serial.idl_text import parse_idl
 from proxy.serial.msg_text import Default, defaults_of, parse_msg
 
-__all__ = [
-    "DEFINITION_MAX_BYTES",
-    "Array",
-    "DefinitionError",
-    "Number",
-    "Record",
-    "Sequence",
-    "Text",
-    "Type",
-    "UnparsedError",
-    "default_values",
-    "definition_bytes",
-    "msg_name",
-    "parse",
-    "parsed",
-]
-
 DEFINITION_MAX_BYTES: Final = 64 << 10  # of a text in UTF-8; it is parsed in the loop that must also send hellos
 _KEPT_MAX: Final = 256  # parsed definitions
 _DEPTH_MAX: Final = 32  # records within records

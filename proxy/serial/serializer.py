@@ -28,8 +28,6 @@ from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
 
-__all__ = ["ENCODING", "Codec", "Encoding", "Serializer", "canonical", "native_codec"]
-
 _LITTLE: Final = b"\x00\x01"  # CDR_LE
 _BIG: Final = b"\x00\x00"  # CDR_BE
 _PREFIX: Final = b"\x00\x01\x00\x00"

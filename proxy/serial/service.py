@@ -12,8 +12,6 @@ from gdp.crypto.schema import OCTETS, FieldSet, Keyed, mapped
 from gdp.errors import DropReason, StatementError
 from proxy.serial.channel import CHANNEL, CHANNEL_MAX_BYTES, TEXT, Channel, RosVersion
 
-__all__ = ["SERVICE", "Service"]
-
 
 @dataclass(frozen=True, slots=True)
 class Service(FieldSet):

@@ -19,8 +19,6 @@ from proxy.serial.schema import msg_name
 from proxy.serial.service import Service
 from proxy.serial.type_translation import md5_text, retyped, rihs01, types_of
 
-__all__ = ["translated_service"]
-
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 
 

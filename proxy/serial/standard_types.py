@@ -14,8 +14,6 @@ from rosbags.typesys.store import Typestore
 from gdp.errors import LocalError
 from proxy.serial.channel import Channel, DefinitionFormat
 
-__all__ = ["known_channel", "standard_channel", "standard_definition", "type_hash"]
-
 
 @cache
 def _store(distribution: Stores) -> Typestore:

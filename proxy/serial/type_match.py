@@ -17,8 +17,6 @@ from proxy.serial.empty import Defaults, default_tree
 from proxy.serial.schema import Array, DefinitionError, Number, Record, Sequence, Text, Type
 from proxy.serial.type_translation import DUMMY, Bounds
 
-__all__ = ["Amend", "Pair", "Side", "match"]
-
 Amend: TypeAlias = "Callable[[object], None]"  # completes the tree of a value for the other side, or refuses it
 
 _Field: TypeAlias = "tuple[str, Type]"

@@ -19,8 +19,6 @@ from rosbags.typesys.store import Typestore
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import DefinitionError, parsed
 
-__all__ = ["DUMMY", "Bounds", "bounds_of", "md5_text", "retyped", "rihs01", "text_of", "types_of"]
-
 DUMMY: Final = "structure_needs_at_least_one_member"  # rosidl: no CDR structure is empty
 
 # By type and field: longest string, most items; zero: no bound.

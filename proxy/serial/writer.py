@@ -16,8 +16,6 @@ from proxy.serial.dialect import Dialect, MisfitError, Wide
 from proxy.serial.layout import Wire, inline_codes, runs
 from proxy.serial.schema import Array, Number, Record, Text, Type
 
-__all__ = ["Writer", "write_with"]
-
 Writer: TypeAlias = "Callable[[bytearray, object], None]"
 _Flatten: TypeAlias = "Callable[[object, list[object]], None]"
 

@@ -18,8 +18,6 @@ from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.schema import DefinitionError, Number, parse
 from proxy.serial.serializer import Codec, native_codec
 
-__all__ = ["TRUNCATE_LENGTH", "MessageText", "request_of", "request_tree"]
-
 TRUNCATE_LENGTH: Final = 128  # of arrays and strings; ros2 topic echo --truncate-length
 _ELLIPSIS: Final = "..."
 _DTYPES: Final = {"?": np.dtype("?"), **{code: np.dtype(f"<{code}") for code in "bBhHiIqQfd"}}

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-__all__ = ["Arrivals", "Bandwidth", "Frequency"]
-
 _UNITS = ((1e6, "MB"), (1e3, "KB"))
 
 

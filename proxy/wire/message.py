@@ -21,8 +21,6 @@ from proxy.serial.channel import CHANNEL, Channel
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 from proxy.serial.serializer import ENCODING, Encoding
 
-__all__ = ["DICTIONARY_MAX_BYTES", "PictureFormat", "RosMessage", "Step", "TopicDescription"]
-
 _T = TypeVar("_T")
 
 VERSION: Final = 1

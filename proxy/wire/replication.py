@@ -24,8 +24,6 @@ from gdp.service.replication_messages import (
     SnapshotRequest,
 )
 
-__all__ = ["STATE_MAX_BYTES", "follower_message", "is_word", "sequencer_message", "to_wire"]
-
 _WORDS: Final = 0x40  # in the position of a part
 _HEAD: Final = bytes([VERSION, _WORDS])
 STATE_MAX_BYTES: Final = MESSAGE_MAX_BYTES - 256

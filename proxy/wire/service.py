@@ -23,8 +23,6 @@ from proxy.serial.channel import CHANNEL, CHANNEL_MAX_BYTES, Channel
 from proxy.serial.serializer import ENCODING, Encoding
 from proxy.serial.service import SERVICE, Service
 
-__all__ = ["Exchange", "News", "too_large"]
-
 PARTS_MAX: Final = 8
 _NEWS: Final = struct.Struct("!BBQ")
 

@@ -15,8 +15,6 @@ from fog.providers.local import fault_injection
 from gdp.cli.node import failing_clearly
 from gdp.host.run_registry import RunRegistry
 
-__all__ = ["local_app"]
-
 Machine = Annotated[str, typer.Argument(help="its id, or its name where only one is called so")]
 Seconds = Annotated[float, typer.Option("--seconds", min=0.0, help="until it is taken")]
 Off = Annotated[bool, typer.Option("--off", help="let it go on")]

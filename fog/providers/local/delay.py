@@ -18,8 +18,6 @@ import time
 from collections import deque
 from typing import Final
 
-__all__ = ["DelayLine", "main"]
-
 log = logging.getLogger(__name__)
 
 _ALL: Final = 3  # ETH_P_ALL

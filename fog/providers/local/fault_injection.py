@@ -24,8 +24,6 @@ from gdp.errors import LocalError
 from gdp.host.processes import end_all
 from gdp.host.run_registry import RunRegistry
 
-__all__ = ["delay", "freeze", "hold", "is_sold_out", "kill", "notice", "restock", "sell_out", "slow", "thaw"]
-
 _SOLD_OUT: Final = "spot-sold-out"
 
 

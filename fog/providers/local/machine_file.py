@@ -13,8 +13,6 @@ from typing import Final
 from fog.hardware import Hardware, Offer
 from fog.machine import MachineSpec
 
-__all__ = ["MachineFile"]
-
 _FILE: Final = "machine.json"
 
 

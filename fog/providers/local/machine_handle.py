@@ -18,8 +18,6 @@ from gdp.host.cgroups import Cgroup
 from gdp.host.processes import Process
 from gdp.host.run_registry import Record, RunRegistry
 
-__all__ = ["LocalMachine", "find", "list_machines"]
-
 
 @dataclass(frozen=True, slots=True)
 class LocalMachine:

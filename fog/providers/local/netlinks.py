@@ -38,23 +38,6 @@ from gdp.host.run_registry import in_first_user_namespace
 if TYPE_CHECKING:
     from pyroute2 import IPRoute  # imported here: it takes 0.2 s to load, and most commands do not need it
 
-__all__ = [
-    "MACHINES",
-    "MACHINE_DEVICE",
-    "SEGMENT",
-    "UP",
-    "UPLINK_BRIDGE",
-    "delete",
-    "exists",
-    "join",
-    "join_within",
-    "make_bridge",
-    "make_segment",
-    "make_space",
-    "plug",
-    "space_path",
-]
-
 MACHINE_DEVICE: Final = "eth0"
 UP: Final = "up"
 MACHINES: Final = "machines"

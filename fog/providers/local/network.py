@@ -36,8 +36,6 @@ from gdp.errors import LocalError, StoreError
 from gdp.host.processes import Process
 from gdp.host.run_registry import Record, Run, RunRegistry
 
-__all__ = ["GatewayBoot", "Network"]
-
 log = logging.getLogger(__name__)
 
 GatewayBoot = Callable[[str, Sequence[str]], MachineBundle]

@@ -37,8 +37,6 @@ from gdp.host.processes import end_all
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.intervals import STOP_S
 
-__all__ = ["UPLINK", "LocalProvider"]
-
 log = logging.getLogger(__name__)
 
 UPLINK: Final = "fog0"

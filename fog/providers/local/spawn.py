@@ -19,8 +19,6 @@ from gdp.errors import LocalError
 from gdp.host.netns_files import reach
 from gdp.host.run_registry import Run
 
-__all__ = ["spawn_detached"]
-
 _HELD: Final = {signal.SIGUSR1, signal.SIGUSR2}  # until the process handles them; by default they would end it
 
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-__all__ = ["Activity"]
-
 
 class Activity:
     """Time since the last call of a cluster, or since it was first observed."""

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from fog.supervisor.core.reconcile import Timeouts
 from fog.supervisor.core.record import Record
 
-__all__ = ["Election", "elect", "excused_names"]
-
 
 @dataclass(frozen=True, slots=True)
 class Election:

@@ -13,8 +13,6 @@ from typing import TypeAlias
 from fog.cluster import MachineRequest
 from fog.supervisor.core.record import Outcome, Record
 
-__all__ = ["Action", "Drain", "Launch", "Release", "Timeouts", "decide"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeouts:

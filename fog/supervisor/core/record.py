@@ -11,8 +11,6 @@ from enum import Enum
 from fog.cluster import MachineRequest
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["IssuedCredentials", "Outcome", "Record", "cost_usd", "stage", "update_record"]
-
 
 class Outcome(Enum):
     """Outcome of a machine."""

@@ -12,8 +12,6 @@ from typing import Final
 
 from gdp.ports.confine.system import LIBC, checked, prctl
 
-__all__ = ["Capability", "drop_bounding", "keep_only"]
-
 _VERSION_3: Final = 0x20080522
 _BOUNDING_DROP: Final = 24  # PR_CAPBSET_DROP
 _HIGHEST: Final = 63

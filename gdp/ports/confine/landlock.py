@@ -17,8 +17,6 @@ from typing import Final
 
 from gdp.ports.confine.system import call
 
-__all__ = ["abi", "restrict"]
-
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 _VERSION: Final = 1
 _PATH_BENEATH, _NET_PORT = 1, 2

@@ -16,8 +16,6 @@ from typing import Final
 
 from gdp.ports.confine.system import call
 
-__all__ = ["allow_only_reading", "allowed", "denied", "refuse"]
-
 _FILTER, _TSYNC = 1, 1  # SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC
 _LOAD, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x15, 0x35, 0x06  # BPF_LD|W|ABS, JMP|JEQ|K, JMP|JGE|K, RET|K
 _ALLOW: Final = 0x7FFF0000

@@ -9,8 +9,6 @@ import ctypes
 import os
 from typing import Final
 
-__all__ = ["LIBC", "call", "prctl"]
-
 LIBC: Final = ctypes.CDLL(None, use_errno=True)
 LIBC.syscall.restype = ctypes.c_long
 

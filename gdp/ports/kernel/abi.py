@@ -25,34 +25,6 @@ from gdp.limits import PACE_MAX
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, SHARED_SIDE, Hops, Paces
 
-__all__ = [
-    "BRANCHES_MAX",
-    "BRANCH_BYTES",
-    "COUNT_BYTES",
-    "ENTRIES_DEFAULT",
-    "ENTRY_BYTES",
-    "EVERY_SOURCE",
-    "GROUP",
-    "GROUPS_MAX",
-    "GROUP_BYTES",
-    "GROUP_HEAD_BYTES",
-    "INDEX_BYTES",
-    "KEY_BYTES",
-    "NOWHERE_PORT",
-    "PORTS_MAX",
-    "PORT_BYTES",
-    "TOTALS_BYTES",
-    "BranchAt",
-    "EntryAt",
-    "PortAt",
-    "PortFlag",
-    "Total",
-    "entry_head",
-    "entry_tail",
-    "group",
-    "port",
-]
-
 INDEX_BYTES: Final = 4
 KEY_BYTES: Final = 2 * NAME_BYTES
 EVERY_SOURCE: Final = bytes(NAME_BYTES)

@@ -17,8 +17,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["Assembler", "Reg"]
-
 
 class Reg(IntEnum):
     """R0: results; R1 to R5: arguments, lost in a call; R6 to R9: preserved; R10: the top of the stack, read only."""

@@ -29,8 +29,6 @@ from gdp.ports.netlink import CLSACT_EGRESS, CLSACT_INGRESS, NetlinkSocket
 if TYPE_CHECKING:
     from pyroute2 import IPRoute
 
-__all__ = ["Attachment", "FilterAttachment", "LinkAttachment", "has_links"]
-
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _NAME: Final = re.compile(rf"{PROGRAM}:(?P<pid>\d+):(?P<started>\d+)", re.ASCII)
 _START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted after the command

@@ -20,8 +20,6 @@ from typing import Final
 from gdp.ports.kernel.syscall import BpfError, attached
 from gdp.ports.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, NetlinkSocket, nested
 
-__all__ = ["TxDrops", "peer_is_bare"]
-
 _INFO_KIND: Final = 1  # IFLA_INFO_KIND
 _TCX_EGRESS: Final = 47
 _XDP_ATTACHED: Final = 2  # IFLA_XDP_ATTACHED

@@ -39,18 +39,6 @@ from gdp.names import NAME_BYTES
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.sha256 import BLOCK_BYTES, FIRST_STATE, STATE_BYTES, add_compress
 
-__all__ = [
-    "END_BYTES",
-    "FRAME_BYTES",
-    "SESSION_BYTES",
-    "STATE_BYTES_OF_SESSION",
-    "KeepaliveMaps",
-    "SessionAt",
-    "StateAt",
-    "receiver",
-    "sender",
-]
-
 FRAME_BYTES: Final = ETHER_BYTES + TAGGED_BYTES + TAG_BYTES
 _FRAME_SPACE: Final = 160
 

@@ -38,8 +38,6 @@ from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load
 from gdp.ports.plane import Port
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 
-__all__ = ["KeepaliveSessions", "open_sessions"]
-
 log = logging.getLogger(__name__)
 
 _SESSIONS_MAX: Final = 64

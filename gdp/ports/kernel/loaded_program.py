@@ -31,8 +31,6 @@ from gdp.ports.kernel.syscall import load_program
 from gdp.ports.plane import Counters
 from gdp.switch.table import SHARED_SIDE
 
-__all__ = ["PROGRAM", "LoadedProgram"]
-
 PROGRAM: Final = "gdp_forward"
 _FIRST: Final = bytes(INDEX_BYTES)
 

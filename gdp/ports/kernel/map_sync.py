@@ -38,8 +38,6 @@ from gdp.ports.kernel.maps import KernelMap
 from gdp.ports.kernel.syscall import BpfError
 from gdp.switch.table import EVERY_SIDE, Hops, Paces, Table
 
-__all__ = ["EntryCounts", "MapSync"]
-
 EntryCounts = dict[bytes, tuple[int, int]]  # by the table's key: frames, and their bytes
 
 _GROUP_FROM: Final = 2  # branches

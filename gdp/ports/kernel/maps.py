@@ -19,8 +19,6 @@ from typing import Final
 
 from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
 
-__all__ = ["KernelMap", "MapKind", "possible_cpus"]
-
 # BPF_F_NO_PREALLOC: an entry costs memory only while it exists. From Linux 6.1 on, the kernel may reuse a removed or
 # replaced element at once, while a frame in progress still reads it. For some nanoseconds that frame may see the port
 # of one entry and the addresses of another. Then one sealed frame is misdelivered, and only its reader can open it.

@@ -29,8 +29,6 @@ from gdp.ports.plane import Counters, Port, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
 
-__all__ = ["KernelPlane"]
-
 _COUNTED_MAX: Final = 100
 _FILTER: Final = SoftState(1.0, periods=3)  # the filter of a process that died forwards no longer than this
 

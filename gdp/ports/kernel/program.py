@@ -43,8 +43,6 @@ from gdp.ports.kernel.abi import (
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.switch.table import MACS_BYTES, SHARED_SIDE
 
-__all__ = ["DROP", "LICENCE", "REDIRECT", "UP", "Descriptors", "forwarder"]
-
 LICENCE: Final = b"Apache-2.0"  # the helpers used here require no other licence
 UP: Final = -1  # TC_ACT_UNSPEC, TCX_NEXT: the next program at this hook gets the frame
 DROP: Final = 2  # TC_ACT_SHOT, TCX_DROP

@@ -14,8 +14,6 @@ from typing import Final
 
 from gdp.ports.kernel.assembler import Assembler, Reg
 
-__all__ = ["BLOCK_BYTES", "FIRST_STATE", "STATE_BYTES", "add_compress"]
-
 BLOCK_BYTES: Final = 64
 STATE_BYTES: Final = 32
 _ROUNDS: Final = 64

@@ -20,26 +20,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "TCX_INGRESS",
-    "BpfError",
-    "Command",
-    "LoadRefusedError",
-    "PreparedRun",
-    "Run",
-    "address",
-    "attached",
-    "bpf",
-    "create_link",
-    "link_program",
-    "load_program",
-    "name_of",
-    "objects",
-    "program_id",
-    "program_name",
-    "run",
-]
-
 NAME_MAX: Final = 15  # BPF_OBJ_NAME_LEN - 1
 _LOG_BYTES: Final = 1 << 20
 _SCHED_CLS: Final = 3  # BPF_PROG_TYPE_SCHED_CLS

@@ -12,8 +12,6 @@ from typing import NamedTuple, Protocol
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 
-__all__ = ["Change", "ControlLostError", "DeviceState", "PeerChange", "PeerState", "WireGuardControl"]
-
 
 class ControlLostError(LocalError):
     """The process behind the device does not respond; its keeper starts it again."""

@@ -23,25 +23,6 @@ from gdp.errors import LocalError
 from gdp.ports.netlink import NUMBER, ROUTE, Change, LinkAttribute, NetlinkSocket, RefusedError, Rtm, attribute, nested
 from gdp.ports.sockets import AS_ROOT
 
-__all__ = [
-    "Device",
-    "add_address",
-    "add_device",
-    "add_pair",
-    "add_route",
-    "bring_up",
-    "find_device",
-    "make_up",
-    "refusal_text",
-    "remove_device",
-    "remove_own_device",
-    "remove_route",
-    "set_alias",
-    "set_mtu",
-    "set_queue_length",
-    "without_addresses",
-]
-
 _INFO: Final = struct.Struct("=BxHiII")
 _ADDRESS: Final = struct.Struct("=BBBBI")
 _IFF_UP: Final = 1

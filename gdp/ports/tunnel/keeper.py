@@ -53,8 +53,6 @@ from gdp.ports.tunnel.socket_buffers import SocketBuffers
 from gdp.ports.tunnel.uapi import SOCKET_FOLDER, UserspaceControl, socket_path
 from gdp.ports.tunnel.uplink_routes import UplinkRoutes, mark_of
 
-__all__ = ["main"]
-
 _PROGRAM: Final = "wireguard-go"
 _TUN: Final = Path("/dev/net/tun")
 _TUNSETIFF: Final = 0x400454CA

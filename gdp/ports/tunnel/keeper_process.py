@@ -20,8 +20,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.intervals import STOP_S
 
-__all__ = ["KeeperProcess", "Report"]
-
 log = logging.getLogger(__name__)
 
 _MODULE: Final = "gdp.ports.tunnel.keeper"

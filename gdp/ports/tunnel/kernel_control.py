@@ -16,8 +16,6 @@ from gdp.errors import LocalError
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tunnel.control import Change, DeviceState, PeerChange, PeerState
 
-__all__ = ["KernelControl", "parse_messages", "peer_arguments"]
-
 _NANO: Final = 1e-9
 
 

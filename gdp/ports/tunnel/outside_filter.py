@@ -20,8 +20,6 @@ from typing import Any, Final
 
 from gdp.errors import LocalError
 
-__all__ = ["OutsideFilter"]
-
 _NFPROTO_IPV6: Final = 10
 _OWNER: Final = 0x2  # NFT_TABLE_F_OWNER
 _FIRST: Final = -300  # priority of "raw"

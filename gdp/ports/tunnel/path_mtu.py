@@ -17,8 +17,6 @@ from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 from gdp.ports.netlink import NUMBER, ROUTE, LinkAttribute, NetlinkSocket, RefusedError, Rtm, attribute, nested
 
-__all__ = ["Route", "RouteMonitor", "route_mtu", "route_to", "tunnel_mtu"]
-
 _IPV4_BYTES: Final = 20  # RFC 791, section 3.1
 _IPV6_BYTES: Final = 40  # RFC 8200, section 3
 _UDP_BYTES: Final = 8  # RFC 768

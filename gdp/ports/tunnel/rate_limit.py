@@ -19,8 +19,6 @@ from gdp.errors import LocalError
 from gdp.ports.netlink import NUMBER, ROOT, TRAFFIC, Change, NetlinkSocket, RefusedError, Rtm, attribute
 from gdp.ports.tunnel.devices import find_device, refusal_text, set_queue_length
 
-__all__ = ["limit_rate"]
-
 _QUEUE_S: Final = 0.05  # ordinary frames that wait longer are dropped
 _FRAME_BYTES: Final = 1_500
 _BURST_S: Final = 0.02

@@ -19,8 +19,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.ports.confine.system import call
 
-__all__ = ["SocketBuffers"]
-
 _PIDFD_GETFD: Final = 438  # the same on all architectures
 _SO_SNDBUFFORCE: Final = 32
 _SO_RCVBUFFORCE: Final = 33

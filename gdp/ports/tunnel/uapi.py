@@ -24,8 +24,6 @@ from gdp.errors import LocalError
 from gdp.intervals import ANSWER_S, LOOK_S, RETRY_S
 from gdp.ports.tunnel.control import Change, ControlLostError, DeviceState, PeerChange, PeerState
 
-__all__ = ["SOCKET_FOLDER", "UserspaceControl", "parse_state", "request_text", "socket_path"]
-
 SOCKET_FOLDER: Final = Path("/var/run/wireguard")  # wireguard-go allows no other
 _BIND_TRIES: Final = 10  # a keeper that enlarges the buffers of a socket holds its port open for a moment
 _REPLY_MAX_BYTES: Final = 4 << 20

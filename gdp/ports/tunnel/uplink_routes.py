@@ -43,8 +43,6 @@ from gdp.ports.netlink import (
 )
 from gdp.ports.tunnel.devices import refusal_text
 
-__all__ = ["PROTOCOL", "UplinkRoutes", "mark_of", "remove_leftovers"]
-
 log = logging.getLogger(__name__)
 
 PROTOCOL: Final = 71  # of routes and rules; free in iproute2's rt_protos

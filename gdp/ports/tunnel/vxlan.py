@@ -25,8 +25,6 @@ from gdp.ports.tunnel.devices import (
     without_addresses,
 )
 
-__all__ = ["VXLAN_PORT", "make_vxlan", "remove_link", "set_link_mtu"]
-
 VXLAN_PORT: Final = 24_789  # not 4789, where other programs on this host may receive from outside
 _ID, _LINK, _LEARNING, _PORT = 1, 3, 7, 15
 _REMOTE6, _LOCAL6 = 16, 17

@@ -26,8 +26,6 @@ from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Call", "ClientCore"]
-
 _GONE: Final = "the server has gone"
 
 

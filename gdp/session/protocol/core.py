@@ -27,8 +27,6 @@ from gdp.trust.right import Right
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["QUEUE_MAX_BYTES", "QUEUE_MESSAGES", "Inbox", "SessionCore", "replication_of"]
-
 QUEUE_MESSAGES: Final = 1_024
 QUEUE_MAX_BYTES: Final = 64 << 20
 _HEX: Final = frozenset("0123456789abcdefABCDEF")

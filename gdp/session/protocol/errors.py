@@ -7,17 +7,6 @@ from __future__ import annotations
 
 from gdp.errors import LocalError
 
-__all__ = [
-    "AttachError",
-    "CallError",
-    "CallTimeoutError",
-    "ClosedError",
-    "DelegationError",
-    "NoServerError",
-    "SessionError",
-    "SessionTimeoutError",
-]
-
 
 class SessionError(LocalError):
     """Root of the errors of sessions."""

@@ -12,8 +12,6 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.right import Right
 
-__all__ = ["DelegatedName", "Message", "NameLike", "Paths", "Request", "Response", "Sign", "describe"]
-
 Paths = Literal[1, 2, "spread"]
 Sign = Literal["always", "session"]
 NameLike: TypeAlias = Union[str, Name, Metadata]  # noqa: UP007 (typing.get_type_hints on 3.10)

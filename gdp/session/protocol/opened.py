@@ -26,8 +26,6 @@ from gdp.session.protocol.wire import PAYLOAD_MAX_BYTES
 from gdp.trust.advertisement import paths_value, session_value
 from gdp.trust.right import Right
 
-__all__ = ["BasePublisher", "BaseServer", "BaseSession", "BaseSubscription", "Node", "Opened", "Runner"]
-
 T = TypeVar("T")
 
 

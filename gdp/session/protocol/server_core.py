@@ -22,8 +22,6 @@ from gdp.session.protocol.wire import LEAVING, PAYLOAD_MAX_BYTES, RESPONSE, SERV
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["ServerCore"]
-
 _PART: Final = 0
 
 

@@ -16,19 +16,6 @@ from gdp.errors import DropReason, RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.service.frames import HEAD_MAX_BYTES, VERSION, Answer, Request, calls_to_wire, read_calls
 
-__all__ = [
-    "LEAVING",
-    "PAYLOAD_MAX_BYTES",
-    "REQUEST",
-    "RESPONSE",
-    "SERVING",
-    "message_to_wire",
-    "read_message",
-    "read_request",
-    "read_response",
-    "stop_to_wire",
-]
-
 SERVING: Final = b"gdp-session-1"  # description of a server, and of a client
 LEAVING: Final = b"gdp-session-1 leaving"  # ... of a server that finishes its active requests, and accepts no more
 REQUEST, RESPONSE, _STOP = range(3)

@@ -17,8 +17,6 @@ from gdp.errors import LocalError
 if TYPE_CHECKING:
     from types_boto3_ec2.type_defs import InstanceTypeDef, SpotInstanceRequestTypeDef
 
-__all__ = ["CLUSTER", "DRAIN", "MACHINE", "NOTICE_S", "machine_of", "tags_of"]
-
 CLUSTER: Final = "fog-cluster"
 MACHINE: Final = "fog-machine"
 DRAIN: Final = "fog-drain"

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from types_boto3_ec2.literals import InstanceTypeType, ResourceTypeType
     from types_boto3_ec2.type_defs import RunInstancesRequestTypeDef, TagTypeDef
 
-__all__ = ["Ground", "order"]
-
 
 @dataclass(frozen=True, slots=True)
 class Ground:

@@ -16,8 +16,6 @@ from typing import Final
 
 from gdp_extensions.dashboard.core.readings import Reading, flag_of, items_of, map_of, number_of, rows_of, text_of
 
-__all__ = ["Graph", "Link", "NameEntry", "Node", "ServerSeen", "merge_readings"]
-
 _SWITCHES: Final = frozenset(("switch", "leaf"))
 _ENDS: Final = {"publish": "publishers", "read": "readers", "serve": "servers", "call": "clients"}
 

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeGuard
 
-__all__ = ["Reading", "flag_of", "items_of", "map_of", "number_of", "rows_of", "text_of"]
-
 Fields = Mapping[str, object]
 SUPERVISOR: Final = "supervisor"
 

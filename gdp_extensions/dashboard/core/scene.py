@@ -15,8 +15,6 @@ from gdp_extensions.dashboard.core.graph import Graph, Link, NameEntry, merge_re
 from gdp_extensions.dashboard.core.readings import Reading, number_of, text_of
 from gdp_extensions.dashboard.core.series import SeriesStore
 
-__all__ = ["EVENTS_MAX", "Scene"]
-
 EVENTS_MAX: Final = 400
 _EVENT_AGE_S: Final = 900.0
 _LISTED_MAX: Final = 4  # names of one node that come or go at once and are listed one by one

@@ -9,8 +9,6 @@ from array import array
 from collections.abc import Mapping
 from typing import Final
 
-__all__ = ["SAMPLES", "SeriesStore"]
-
 SAMPLES: Final = 1_200  # one each ``server.POLL_S``
 SERIES_MAX: Final = 8_192  # 39 MB
 

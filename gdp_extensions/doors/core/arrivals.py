@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Final, Generic, TypeVar
 
-__all__ = ["Arrivals"]
-
 _KeyT = TypeVar("_KeyT")
 _SMALL_BYTES: Final = 64 << 10  # heartbeats and short messages, which say nothing of when a long one began
 

@@ -11,8 +11,6 @@ import orjson
 
 from gdp.errors import DropReason, RemoteError
 
-__all__ = ["Fields", "identifier", "ros2_type", "text_of", "whole_number", "word", "wrong"]
-
 _TEXT_MAX: Final = 1_024
 
 Fields: TypeAlias = "dict[str, object]"

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-__all__ = ["ClientQueue", "Pending"]
-
 DATA_MAX_BYTES: Final = 16 << 20
 DATA_MAX_MESSAGES: Final = 1_024
 CONTROL_MAX_BYTES: Final = 64 << 20

@@ -18,32 +18,6 @@ from gdp_extensions.doors.core.client_fields import word, wrong
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = [
-    "SUBPROTOCOLS",
-    "AdvertiseChannels",
-    "CallService",
-    "ClientChannel",
-    "ClientMessage",
-    "GetParameters",
-    "PublishMessage",
-    "SetParameters",
-    "SubscribeChannels",
-    "Subscription",
-    "UnadvertiseChannels",
-    "UnsubscribeChannels",
-    "advertise",
-    "advertise_services",
-    "message_data",
-    "parameter_values",
-    "parse",
-    "server_info",
-    "service_failure",
-    "service_response",
-    "status",
-    "unadvertise",
-    "unadvertise_services",
-]
-
 SUBPROTOCOLS: Final = ("foxglove.websocket.v1", "foxglove.sdk.v1")
 INFO, WARNING, ERROR = 0, 1, 2  # levels of a status
 _CAPABILITIES: Final = ("clientPublish", "parameters", "services")

@@ -17,8 +17,6 @@ from gdp_extensions.doors.core.parameter_calls import ParameterCall, ParameterCa
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = ["FoxgloveSession"]
-
 SUBSCRIPTIONS_MAX: Final = 4_096
 CALLS_MAX: Final = 1_024
 SCHEMAS_MAX: Final = 4 << 20  # characters of the schemas of a client's channels

@@ -18,8 +18,6 @@ from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, nod
 from proxy.serial.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
 
-__all__ = ["ParameterCall", "ParameterCalls"]
-
 Done: TypeAlias = "Callable[[Mapping[str, object]], None]"
 _LIST_MAX: Final = 4_096
 _CALLS_MAX: Final = 1_024

@@ -14,8 +14,6 @@ from typing import Final
 
 from gdp.errors import DropReason, RemoteError
 
-__all__ = ["GET", "LIST", "SET", "from_value", "node_and_name", "to_value"]
-
 GET: Final = ("get_parameters", "rcl_interfaces/srv/GetParameters")
 LIST: Final = ("list_parameters", "rcl_interfaces/srv/ListParameters")
 SET: Final = ("set_parameters", "rcl_interfaces/srv/SetParameters")

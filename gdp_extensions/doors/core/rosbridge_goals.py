@@ -21,8 +21,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.rosbridge_json import codec_of
 from proxy.serial.service import Service
 
-__all__ = ["SENDS", "GoalStep", "RosbridgeGoals"]
-
 GOALS_MAX: Final = 256
 _SEND, _RESULT, _CANCEL = "send_goal", "get_result", "cancel_goal"
 SENDS: Final = f"{ACTION_INFIX}{_SEND}"

@@ -26,8 +26,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
 from proxy.serial.service import Service
 
-__all__ = ["RosbridgeSession"]
-
 IDS_MAX: Final = 4_096  # of all subscriptions and advertised topics
 CALLS_MAX: Final = 1_024
 _QUEUE_MAX: Final = 1_024

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 
-__all__ = ["Throttle"]
-
 
 class Throttle:
     """Passes a message at most every ``period_s`` seconds.

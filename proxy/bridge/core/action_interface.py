@@ -15,8 +15,6 @@ from proxy.endpoints.core.qos import default
 from proxy.serial.serializer import Encoding
 from proxy.wire.service import Exchange
 
-__all__ = ["CANCEL", "GOAL", "PROFILES", "RESULT", "ActionInterface", "action_of", "is_part"]
-
 GOAL: Final = 0  # the parts of an action
 CANCEL: Final = 1
 RESULT: Final = 2  # answers when the goal has ended, without a time limit

@@ -14,8 +14,6 @@ from typing import Final
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.serial.channel import EMPTY_MD5, Channel, RosVersion
 
-__all__ = ["SIGN", "BridgeElection", "presence_of", "sign"]
-
 SIGN: Final = "/_gdp_proxy"
 _STEP_S: Final = 0.4  # longer than a graph takes to show a new entity
 _EMPTY: Final = "std_msgs/msg/Empty"

@@ -14,8 +14,6 @@ from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Encoding, Serializer
 
-__all__ = ["MessageDecoder", "differences_of"]
-
 
 class MessageDecoder:
     """Decoder of one message type.

@@ -18,8 +18,6 @@ from gdp.errors import GdpError
 from gdp.trust.right import Right
 from proxy.config.rule import Rule
 
-__all__ = ["DelegatedRules", "rules_of"]
-
 _OWN_KEYS = ("kind", "name", "type")
 
 

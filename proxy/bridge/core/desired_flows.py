@@ -18,8 +18,6 @@ from proxy.config.matching import choose
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 
-__all__ = ["ConfigProblem", "DeniedName", "FlowSpec", "denied", "exposed", "imported"]
-
 _SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERVES, "action": Role.SERVES}
 _WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
 

@@ -12,8 +12,6 @@ from proxy.serial.channel import Channel
 from proxy.serial.serializer import Serializer
 from proxy.wire.message import Step, TopicDescription
 
-__all__ = ["MessageEncoder", "description_of"]
-
 
 def description_of(rule: Rule, channels: tuple[Channel, ...]) -> TopicDescription:
     """Return the description of a rule's messages for their readers."""

@@ -23,8 +23,6 @@ from gdp.errors import DropReason, RemoteError
 from gdp.names import Name
 from proxy.bridge.core.action_interface import CANCEL
 
-__all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
-
 GOALS_MAX: Final = 1_024  # requested by clients here, and as many that only servers named
 HEARTBEATS_MAX: Final = 16_384  # goals in one status message
 GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that joins later

@@ -17,8 +17,6 @@ from proxy.config.rule import Rule
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage, TopicDescription
 
-__all__ = ["Adaptation", "MessageExpander", "Restore", "adaptation_of", "encoders_of", "expander_of"]
-
 Restore: TypeAlias = "Callable[[bytes], bytes]"
 
 

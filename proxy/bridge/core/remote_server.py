@@ -20,8 +20,6 @@ from proxy.serial.service import Service
 from proxy.serial.service_converter import translated_service
 from proxy.wire.service import Exchange
 
-__all__ = ["RemoteServer"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteServer:

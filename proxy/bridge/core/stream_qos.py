@@ -17,8 +17,6 @@ from proxy.endpoints.core.endpoint import GraphEntity
 from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, is_depth_unknown, kept, request, shared_depth
 from proxy.serial.channel import QOS_MAX, Channel, Qos
 
-__all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
-
 
 class Change(Enum):
     """Consequence of a change among the local publishers."""

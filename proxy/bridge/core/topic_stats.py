@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.message.loss import Losses
 
-__all__ = ["SAMPLES_MAX", "TopicStats", "percentile"]
-
 SAMPLES_MAX: Final = 200_000  # latencies kept for percentiles; the oldest go
 
 

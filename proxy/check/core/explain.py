@@ -22,8 +22,6 @@ from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.core.qos import is_depth_unknown
 from proxy.serial.channel import Qos
 
-__all__ = ["Delegated", "explain", "unknown_qos"]
-
 _NAMES_SHOWN: Final = 10
 _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which ``gdp delegate`` has an option
 

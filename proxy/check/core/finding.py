@@ -11,8 +11,6 @@ from typing import Literal, TypeAlias
 from gdp.names import Name
 from gdp.ros_names import Kind
 
-__all__ = ["Direction", "Finding", "Match"]
-
 Direction: TypeAlias = Literal["expose", "import"]
 
 

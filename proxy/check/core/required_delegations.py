@@ -21,8 +21,6 @@ from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph
 
-__all__ = ["Machine", "RequiredDelegation", "needs", "unmet"]
-
 _GIVES = frozenset({Right.PUBLISH, Right.SERVE})
 
 

@@ -18,25 +18,6 @@ from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
-__all__ = [
-    "CallFailed",
-    "EndpointError",
-    "Event",
-    "Graph",
-    "GraphChanged",
-    "GraphEntity",
-    "MessageReceived",
-    "MessageRecorder",
-    "Origin",
-    "RequestReceived",
-    "ResponseReceived",
-    "Role",
-    "RosEndpoint",
-    "TypeResolved",
-    "is_proxy_node",
-    "proxy_node_name",
-]
-
 _PROXY_NODE: Final = re.compile(r"gdp_proxy_[0-9a-f]{12}(_[0-9a-z_]*)?\Z")
 
 

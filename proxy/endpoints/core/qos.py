@@ -13,20 +13,6 @@ from typing import Final
 from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from proxy.serial.channel import NEVER, Channel, Qos
 
-__all__ = [
-    "DEPTH_MAX",
-    "deadline_s",
-    "default",
-    "depth_of",
-    "is_depth_unknown",
-    "joint",
-    "kept",
-    "offer",
-    "request",
-    "shared_depth",
-    "unmatched",
-]
-
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one publisher
 INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _DEPTH: Final = 10  # where none is known; ROS 2's own default

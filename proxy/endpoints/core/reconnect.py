@@ -13,8 +13,6 @@ from typing import Final, Generic, TypeVar
 
 from gdp.requests import Backoff, Requests
 
-__all__ = ["MissingConnections"]
-
 _REMINDERS: Final = Backoff(1.5, 60.0)  # rospy drops a failed connection after 1 s
 
 _Connection = TypeVar("_Connection", bound=Hashable)

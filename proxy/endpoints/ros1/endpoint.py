@@ -38,8 +38,6 @@ from proxy.endpoints.ros1.rospy_process import RospyProcess
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
-__all__ = ["Ros1Endpoint"]
-
 
 @dataclass(slots=True)
 class _Held:

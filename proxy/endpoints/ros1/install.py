@@ -11,8 +11,6 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["rospy_folder"]
-
 _DEBIAN: Final = "/usr/lib/python3/dist-packages"
 
 

@@ -21,8 +21,6 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = ["Frame", "IpcLink", "Kind", "LinkEndedError"]
-
 _HEAD: Final = struct.Struct("<IBqq")
 _CHUNK_BYTES: Final = 65_536
 _BUDGET_BYTES: Final = 64 << 20

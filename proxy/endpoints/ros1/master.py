@@ -24,8 +24,6 @@ from xml.parsers.expat import ExpatError
 
 from gdp.intervals import ANSWER_S, POLL_S, PROMPT_S, TICK_S
 
-__all__ = ["GraphSnapshot", "LocalEnd", "Master", "MasterError", "MasterWatch"]
-
 _LENGTH: Final = struct.Struct("<I")
 _HEADER_MAX: Final = 1 << 20
 _ANSWER_MAX_BYTES: Final = 16 << 20

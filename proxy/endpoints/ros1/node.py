@@ -42,8 +42,6 @@ from proxy.endpoints.ros1.topics import Publisher, Subscriber
 from proxy.serial.channel import Channel, ros1_format
 from proxy.serial.service import Service
 
-__all__ = ["Node"]
-
 _Connected: TypeAlias = tuple[int, str, int]
 
 _BACKLOG: Final = 128

@@ -18,21 +18,6 @@ from gdp.errors import LocalError
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = [
-    "KnownMessage",
-    "KnownService",
-    "Raw",
-    "RawService",
-    "installed_message",
-    "installed_service",
-    "known_message",
-    "known_service",
-    "raw_class",
-    "raw_service",
-    "ros1_name",
-    "ros2_name",
-]
-
 _RULE: Final = "\n" + "=" * 80 + "\n"
 _WITH_FOLDER: Final = re.compile(r"\b([A-Za-z]\w*)/msg/([A-Za-z]\w*)")
 

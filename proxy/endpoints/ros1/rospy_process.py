@@ -18,8 +18,6 @@ from gdp.intervals import ANSWER_S, STEADY_S
 from gdp.requests import Backoff
 from proxy.endpoints.ros1.ipc import Frame, IpcLink
 
-__all__ = ["RospyProcess"]
-
 _START_S: Final = 4.0  # a process that has just been started answers later
 _RESTARTS: Final = Backoff(0.25, 5.0)
 _ROOT: Final = Path(__file__).resolve().parents[3]

@@ -23,8 +23,6 @@ from gdp.ports.readiness import readable
 from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_service, ros1_name
 
-__all__ = ["Client", "Server", "tickets"]
-
 _WORKERS: Final = 64  # calls of one service under way at once; further calls wait
 _SAID_MAX: Final = 4_096  # characters of a server's error text
 _RESPONDED: Final = " responded with an error: "

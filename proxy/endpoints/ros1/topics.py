@@ -21,8 +21,6 @@ from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, Raw, raw_class, ros2_name
 from proxy.serial.channel import Channel, ros1_format
 
-__all__ = ["Publisher", "Subscriber"]
-
 _QUEUE: Final = 100  # messages in the queue of one slow subscriber
 
 

@@ -30,8 +30,6 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 from proxy.serial.standard_types import type_hash
 
-__all__ = ["Ros2Endpoint"]
-
 
 class Ros2Endpoint:
     """A node of a ROS 2 graph.

@@ -37,8 +37,6 @@ from proxy.endpoints.ros2.session import (
 )
 from proxy.serial.channel import Channel, Qos
 
-__all__ = ["ClientEntity", "Kind", "PublisherEntity", "ServiceEntity", "Source", "SubscriptionEntity"]
-
 Kind: TypeAlias = Literal["subscription", "service", "client"]
 
 _AT_ONCE: Final = 64

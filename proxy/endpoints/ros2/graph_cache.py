@@ -14,8 +14,6 @@ from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.ros2.qos import from_profile
 from proxy.endpoints.ros2.session import ContextNode, TopicEnd
 
-__all__ = ["GraphCache"]
-
 _TURNS: Final = 4
 _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"  # its discovery is incomplete
 

@@ -11,8 +11,6 @@ from collections import deque
 from threading import Lock
 from typing import Final
 
-__all__ = ["LoopbackFilter"]
-
 _MEMORY_S: Final = 2.0
 _COUNT_MAX: Final = 4_096
 _HEADER: Final = 4  # bytes of encapsulation: an RMW may write its padding there

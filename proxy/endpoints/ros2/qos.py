@@ -16,8 +16,6 @@ from proxy.serial.channel import Channel, Qos
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
-__all__ = ["conflict", "filled", "from_profile", "incompatibility", "service_profile", "to_profile"]
-
 _INFINITE: Final = (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
 _DEPTH: Final = 10
 _DEPTH_OF_ALL: Final = 1_000

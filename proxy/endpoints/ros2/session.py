@@ -22,24 +22,6 @@ from gdp.errors import LocalError
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
-__all__ = [
-    "ClientHandle",
-    "ContextNode",
-    "Entity",
-    "GuardCondition",
-    "Handle",
-    "Node",
-    "PublisherHandle",
-    "RequestInfo",
-    "ServiceHandle",
-    "ServiceType",
-    "SubscriptionHandle",
-    "TopicEnd",
-    "WaitSet",
-    "open_session",
-    "translated",
-]
-
 
 class Handle(Protocol):
     """An rcl object; it is valid at least while entered."""

@@ -21,8 +21,6 @@ from proxy.endpoints.ros2.graph_cache import GraphCache
 from proxy.endpoints.ros2.qos import incompatibility
 from proxy.endpoints.ros2.session import ContextNode
 
-__all__ = ["WaitThread"]
-
 log = logging.getLogger(__name__)
 
 _BACKLOG_MAX_BYTES: Final = 64 << 20
