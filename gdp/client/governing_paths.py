@@ -73,7 +73,9 @@ class GoverningPaths:
         self.set_options(settings.options)
 
     def set_options(self, options: SendOptions) -> None:
-        """Change how many bits may leave in a second."""
+        """Change how many bits may leave in a second, and whether readers may have paces."""
+        if not options.own_pace:
+            self.paces.take_back()
         bytes_s = None if options.max_bits_s is None else options.max_bits_s / 8
         if bytes_s != self.limit_bytes_s:
             self._limit = None if bytes_s is None else TokenBucket(bytes_s, max(bytes_s * _LIMIT_BURST_S, 1.0))
@@ -100,7 +102,7 @@ class GoverningPaths:
         if self._count > 1 and self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._governing()
-        may_slow = self._may_pace and not self._queue.is_acknowledged
+        may_slow = self._may_pace and self._queue.options.own_pace and not self._queue.is_acknowledged
         if paths and not paths[1:] and not self.blocking.blocks and not (may_slow and self.paces.stated):
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]

@@ -105,6 +105,7 @@ class Publisher:
         self.sent_frames = SentFrames(
             self._node_paths, counts_losses=settings.paths != SPREAD, paces=self.governing_paths.paces.stated
         )
+        self.governing_paths.paces.is_under_way = self.sent_frames.is_under_way
         self.acknowledgements = AckNackHandler(
             readers=self.matched,
             queue=self.queue,

@@ -4,12 +4,13 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A reader that holds ba
 of its path's rate. It states the pace to its switch, whose joins bring it upstream. From the reader's next report on it
 governs no more. Each message then states the lowest pace of those whose path is free for it, and switches copy it to
 branches of that pace and above (``frame/spec.md``). A path is free while what is under way would leave a queue of at
-most ``_QUEUE_REPORTS`` delays of a report. So a slow reader gets the newest message each time.
+most ``_QUEUE_REPORTS`` delays of a report, or while no message of this topic is: other topics may fill the path for
+long. So a slow reader gets the newest message each time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import log2
 from typing import Final
@@ -49,10 +50,12 @@ class ReaderPaces:
         stated: by reader, what its latest report says; readers that get everything are not in it.
         slowing: readers that hold back others, while messages wait all the time.
         withheld: count of messages that were not for every reader.
+        is_under_way: returns whether frames of this topic are under way to a reader.
     """
 
     def __init__(self, paths: ReaderPaths) -> None:
         self._paths = paths
+        self.is_under_way: Callable[[bytes], bool] = lambda _name: True
         self.stated: dict[bytes, int] = {}
         self._given: dict[bytes, _Given] = {}
         self._begun: dict[bytes, int] = {}  # bytes of messages that begin now
@@ -122,6 +125,10 @@ class ReaderPaces:
         new += [(name, PACE_MAX) for name in self.stated if name not in self._given]
         return tuple(new[:PACES_MAX])
 
+    def take_back(self) -> None:
+        """Take back what was given: all readers are to get everything."""
+        self._given.clear()
+
     def keep(self, names: Iterable[bytes]) -> None:
         """Forget all readers but these."""
         gone = (self._given.keys() | self.stated.keys()) - set(names)
@@ -178,7 +185,9 @@ class ReaderPaces:
         model, under_way = path.controller.model, path.controller.rate.inflight + self._begun.get(name, 0)
         # a flight is confirmed with its last frame: the shortest round trip has the time that its bytes take
         trip_bytes = max(model.bytes_s * model.base_rtt_s - FLIGHT_FRAMES * path.mtu, 0.0)
-        return under_way <= trip_bytes + model.bytes_s * _QUEUE_REPORTS * REPORT_DELAY_S
+        if under_way <= trip_bytes + model.bytes_s * _QUEUE_REPORTS * REPORT_DELAY_S:
+            return True
+        return name not in self._begun and not self.is_under_way(name)
 
     def _gates(self, name: bytes) -> bool:
         """Return whether slower readers wait for this one: not so if it confirms nothing."""

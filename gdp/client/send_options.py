@@ -41,12 +41,14 @@ class SendOptions:
         history_bytes: most bytes that a latched topic keeps for late joiners; None: its depth alone counts.
         history_age_s: longest time that a latched message waits for late joiners; None: its depth alone counts.
         repairs: lost parts of a best-effort message are sent again while that can be in time.
+        own_pace: each reader of a best-effort topic gets what its path carries; else the slowest one governs.
     """
 
     deadline_s: float | None = None
     weight: int = 1
     max_bits_s: float | None = None
     repairs: bool = True
+    own_pace: bool = False
     fec: bool = True
     priority: Priority = "normal"
     history_bytes: int | None = None

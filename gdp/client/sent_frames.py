@@ -279,6 +279,11 @@ class SentFrames:
         if confirmed:
             path.acknowledged(confirmed, lost if self._counts_losses else 0, None, now_s)
 
+    def is_under_way(self, name: bytes) -> bool:
+        """Return whether frames are under way to a reader, as far as known here."""
+        reader = self._readers.get(name)
+        return reader is not None and any(flight.is_under_way for flight in reader.flights)
+
     def keep(self, readers: Iterable[bytes]) -> None:
         """Take off the account what is under way to other readers than these: it will not be confirmed."""
         for name in self._readers.keys() - set(readers):

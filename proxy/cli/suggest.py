@@ -29,6 +29,7 @@ from proxy.endpoints.live import open_endpoint
 _FILE: Final = "proxy.yaml"
 _SUGGESTED: Final = "proxy.yaml.suggested"
 _TRAFFIC_S: Final = 3.0
+_EMPTY_LOOKS: Final = 4
 
 
 def suggest(directory: Path) -> Path:
@@ -58,10 +59,14 @@ def suggest(directory: Path) -> Path:
 
 
 def _observed(endpoint: RosEndpoint) -> Graph:
-    end_s = time.monotonic() + LOOK_S
-    while (rest_s := end_s - time.monotonic()) > 0:
-        readable([endpoint], rest_s)
-        endpoint.poll_events()  # only the final graph counts
+    """Return the graph after a while; one in which nothing shows yet gets more time, for a busy machine."""
+    begun_s = time.monotonic()
+    for look_s in (LOOK_S, _EMPTY_LOOKS * LOOK_S):
+        while (rest_s := begun_s + look_s - time.monotonic()) > 0:
+            readable([endpoint], rest_s)
+            endpoint.poll_events()  # only the final graph counts
+        if offered_names(endpoint.graph()):
+            break
     return endpoint.graph()
 
 

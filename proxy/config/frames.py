@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from gdp.config.schema import Section
 
@@ -17,6 +17,8 @@ _Text = Annotated[str, Field(max_length=_CHARS_MAX, pattern=r"^[^\x00-\x20\x7f]*
 
 class Frames(Section):
     """How the coordinate frames in messages are renamed."""
+
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["add"]}, {"required": ["remove"]}]})
 
     add: _Text = Field(default="", description="Text in front of every frame, such as `robot1/`.")
     remove: _Text = Field(default="", description="Text to take away in front of frames; others stay.")

@@ -66,7 +66,18 @@ DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTP
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_KINDS: Final = {  # keys that only the rules of these kinds have
-    "topics": ("reliable", "latched", "offered", "history", "max_hz", "deadline_ms", "repair", "frames", *REDUCTIONS),
+    "topics": (
+        "reliable",
+        "latched",
+        "offered",
+        "history",
+        "max_hz",
+        "deadline_ms",
+        "repair",
+        "readers",
+        "frames",
+        *REDUCTIONS,
+    ),
     "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
     "services": ("stop", "at_once", "state", "state_node"),
 }
@@ -257,6 +268,10 @@ class Rule(Section):
     repair: Literal["never", "in-time"] = Field(
         default="in-time", description="Exposed best-effort topics: send lost parts again in time."
     )
+    readers: Literal["together", "own-pace"] = Field(
+        default="together",
+        description="Exposed best-effort topics: all wait for the slowest, or each gets what its path carries.",
+    )
     weight: int = Field(default=1, ge=1, le=WEIGHT_MAX, description="Share of a full path at the same `priority`.")
     max_bits_s: float | None = Field(
         default=None, ge=RATE_MIN_BITS_S, le=RATE_MAX_BITS_S, description="Most bits of frames a second from here."
@@ -407,6 +422,7 @@ class Rule(Section):
             priority=self.priority,
             max_bits_s=self.max_bits_s,
             repairs=self.repair == "in-time",
+            own_pace=self.readers == "own-pace",
             fec=self.fec == "auto",
             history_bytes=None if self.history is None else self.history.max_bytes,
             history_age_s=None if self.history is None else self.history.age_s,

@@ -10,6 +10,7 @@ from math import ceil
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.frame.codec import ETHER_BYTES, Header, decode
 from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.names import Name
@@ -171,12 +172,13 @@ def advertise(
     depth: int = 0,
     is_global: bool = True,
     urgent: bool = False,
+    options: SendOptions = DEFAULT_OPTIONS,
 ) -> Flow:
     """Return a topic that a member publishes from now on."""
     member = world.members[source]
     topic = world.topic(name, member, [Right.PUBLISH])
     publisher = member.advertise(
-        topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent
+        topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent, options=options
     )
     world.network.send_pending(source)
     return Flow(world, name, source, topic, publisher)

@@ -11,6 +11,7 @@ from functools import partial
 
 import pytest
 
+from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
 from gdp.message.loss import LossReason
 from lab.simulation import Simulation
@@ -58,7 +59,7 @@ def world_of() -> Simulation:
 
 def images_to(world: Simulation, *readers: str) -> Flow:
     """Return best-effort images with these readers, and the links as thin as they are."""
-    flow = advertise(world, "/image", "s0/robot", reliable=False)
+    flow = advertise(world, "/image", "s0/robot", reliable=False, options=SendOptions(own_pace=True))
     for label in readers:
         flow.read_by(label)
     assert world.network.run(5, lambda: flow.is_read_by(len(readers)))

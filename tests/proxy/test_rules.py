@@ -45,6 +45,7 @@ GOOD = [
     "name: /a, ros: 2, domain: 0",
     "name: /a, frames: {add: robot1/, common: [map, earth]}",
     "name: /a, frames: {remove: robot1/}",
+    "name: /a, readers: own-pace, reliable: false",
     "name: /a, paths: 2",
     "name: /set, kind: service, paths: 2",
     "name: /set, kind: service, sign: session",

@@ -74,6 +74,18 @@ def test_a_message_is_for_all_whose_paths_are_free_for_it() -> None:
     assert paces.withheld == 2
 
 
+def test_a_path_that_other_topics_keep_full_starves_no_topic() -> None:
+    paths, paces, given = stated()
+    own = {THIN}
+    paces.is_under_way = own.__contains__
+    paths.path(THIN, 1.0).sent(10 * IMAGE_BYTES, 1, 1.0)
+    assert paces.pace_for(ALL, IMAGE_BYTES) == given[MEDIUM]
+    own.clear()  # what is left are frames of others
+    paces.begin_turn()
+    assert paces.pace_for(ALL, IMAGE_BYTES) == 0
+    assert paces.pace_for(ALL, IMAGE_BYTES) == given[MEDIUM]
+
+
 def test_messages_that_begin_at_once_are_not_all_for_the_slow_reader() -> None:
     _, paces, given = stated()
     assert [paces.pace_for(ALL, IMAGE_BYTES) for _ in range(2)] == [0, given[MEDIUM]]
