@@ -101,8 +101,6 @@ class RawPlane(NetdevPlane):
         try:
             for rank, traffic_class in enumerate(_CLASSES):
                 self._open_traffic_class(port, traffic_class, rank)
-            if self._sessions is not None:
-                self._sessions.attach(port.index, port.ifname)
         except LocalError:
             self._shut(port.index)
             raise

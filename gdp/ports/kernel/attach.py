@@ -2,7 +2,7 @@
 
 I/O. Each device has one attachment and one live switch; a second one is refused, attached by link or by filter.
 Programs of other owners at the same hook stay there.
-Source: Linux, include/uapi/linux/bpf.h (``BPFTCX_INGRESS``); tc-bpf(8).
+Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``); tc-bpf(8).
 
 A TCX link is a descriptor: it ends with its process, however that ends. A filter outlives its process, so its name
 carries the process that it belongs to. The next run on that device removes the filter of a dead process. Until then the

@@ -144,6 +144,8 @@ class KernelPlane(RawPlane):
         except LocalError as error:
             self._shut(port.index)
             raise LocalError(f"port {port.ifname}: {error}") from error
+        if self._sessions is not None:
+            self._sessions.attach(port.index, port.ifname)  # behind the forwarder, which passes on what is for us
 
     def _shut(self, index: int) -> None:
         self._loaded.set_port(index, 0, 0, 0)
