@@ -218,9 +218,7 @@ class ImportedTopic:
             expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
             rewriters = [self._rewriter(each.target) for each in incoming]
         except DefinitionError as error:
-            self._context.faults.report(
-                what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}; 'fields: default' allows it"
-            )
+            self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
         if differences := differences_of(incoming):
             self._context.faults.report(what, Fault.OTHER_TYPE, differences)
