@@ -118,10 +118,9 @@ def _given(kind: Type, value: Default) -> object:
     if isinstance(kind, Array | Sequence):
         if not isinstance(value, list):
             raise TypeError("no list")
-        items = [_given(kind.item, each) for each in value]
         if isinstance(kind.item, Number):
             return memoryview(b"".join(_bytes(kind.item, each) for each in value))
-        return items
+        return [_given(kind.item, each) for each in value]
     if isinstance(kind, Number) and not isinstance(value, list):
         return int.from_bytes(_bytes(kind, value), "little", signed=kind.code in _SIGNED)
     if isinstance(kind, Text) and isinstance(value, str):

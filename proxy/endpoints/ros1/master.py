@@ -17,6 +17,7 @@ import time
 import xmlrpc.client
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
@@ -133,11 +134,8 @@ class Master:
         """
         try:
             (uri,) = self.call_batch(("lookupNode", node))
-            slave = Master(str(uri), self._node)
-            try:
+            with closing(Master(str(uri), self._node)) as slave:
                 (named,) = slave.call_batch(("getSubscriptions",))
-            finally:
-                slave.close()
             return dict(_pairs(named)).get(topic, "")
         except (MasterError, OSError):  # OSError: an address of another protocol
             return ""

@@ -15,6 +15,7 @@ import select
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from typing import Final, TypeAlias
 
@@ -226,8 +227,9 @@ class Node:
             if get_service_manager().get_service(subject.name) is not None:
                 return f"{subject.name} is served by this proxy already"
             return ""
-        for end in sorted(look.ends) if look is not None else ():
-            if end.name == subject.topic and self._is_other_type(end, subject.known.name):
+        ends = look.ends if look is not None else ()
+        for end in sorted(end for end in ends if end.name == subject.topic):
+            if self._is_other_type(end, subject.known.name):
                 return f"{subject.topic} is a {end.type_name} here ({end.node}), not a {subject.known.name}"
         ours = get_topic_manager().get_publisher_impl(subject.topic)
         if ours is not None and ours.data_class._md5sum != subject.known.md5:
@@ -240,11 +242,8 @@ class Node:
             return False
         if end.role == "publishes":
             return True
-        master = Master(self._master, self._id)
-        try:
+        with closing(Master(self._master, self._id)) as master:
             return master.subscribed_type(end.node, end.name) not in {"*", type_name}
-        finally:
-            master.close()
 
     # the watch
 
