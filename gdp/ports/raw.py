@@ -17,7 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from gdp import burst
 from gdp.errors import DropReason, LocalError
@@ -29,7 +29,7 @@ from gdp.frame.codec import (
     OVERHEAD_BYTES,
 )
 from gdp.frame.kinds import CONTROL_FROM, Flag
-from gdp.intervals import NEVER_S, Rate
+from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
@@ -45,9 +45,6 @@ from gdp.ports.sockets import (
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 from gdp.token_bucket import TokenBucket
-
-if TYPE_CHECKING:  # a plane that leaves keepalives to its node loads nothing of them
-    from gdp.ports.kernel.keepalives import KeepaliveSessions
 
 _ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
 _URGENT: Final = int(Flag.URGENT)
@@ -72,22 +69,13 @@ class RawPlane(NetdevPlane):
 
     Args:
         bypass_qdisc: send past traffic control.
-        keepalives: sessions that the kernel runs, which the plane closes.
 
     Raises:
         LocalError: as ``add_port``.
     """
 
-    def __init__(
-        self,
-        ifnames: Sequence[str] = (),
-        table: Table | None = None,
-        *,
-        bypass_qdisc: bool = False,
-        keepalives: KeepaliveSessions | None = None,
-    ) -> None:
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False) -> None:
         self._bypass_qdisc = bypass_qdisc
-        self._sessions = keepalives
         self._sockets_by_class: dict[TrafficClass, dict[int, socket.socket]] = {
             traffic_class: {} for traffic_class in _CLASSES
         }  # by port
@@ -105,12 +93,6 @@ class RawPlane(NetdevPlane):
             self._shut(port.index)
             raise
 
-    def close(self) -> None:
-        """Close every socket, and the sessions that the kernel runs."""
-        super().close()
-        if self._sessions is not None:
-            self._sessions.close()
-
     def _open_traffic_class(self, port: Port, traffic_class: TrafficClass, rank: int) -> None:
         sockets = self._sockets_by_class[traffic_class]
         opened = sockets[port.index] = open_port(port.ifname, traffic_class, bypass_qdisc=self._bypass_qdisc)
@@ -119,17 +101,10 @@ class RawPlane(NetdevPlane):
             ready = partial(self._punt_all, port.index, opened)
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
-        if traffic_class is TrafficClass.CONTROL:
-            ready = partial(self._take_control, ready)
         if traffic_class in (TrafficClass.HELLO, TrafficClass.GUEST):
             ready = partial(self._take_some, opened, TokenBucket(*_GREETINGS), ready)
         self.watch(opened, ready, rank=rank)
         tell_neighbours(opened, traffic_class, self._neighbours.get(port.index, ()))
-
-    @property
-    def keepalives(self) -> KeepaliveSessions | None:
-        """Return the keepalive sessions that the kernel runs, as ``Plane.keepalives``."""
-        return self._sessions
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
         """Store the addresses of a port's neighbours: their frames get a class ahead of strangers'."""
@@ -155,33 +130,12 @@ class RawPlane(NetdevPlane):
             if self._resting:
                 left_s = min(until_s for _, until_s in self._resting.values()) - now_s
                 timeout_s = left_s if timeout_s is None else min(timeout_s, left_s)
-        if self._sessions is None or self._sessions.due_s == NEVER_S:
-            return super().poll(timeout_s)
-        return self._poll_and_tick(self._sessions, timeout_s)
-
-    def _poll_and_tick(self, sessions: KeepaliveSessions, timeout_s: float | None) -> Sequence[ReceivedFrame]:
-        """Poll; send the keepalives of the sessions that the kernel runs whenever they are due."""
-        now_s = time.monotonic()
-        until_s = NEVER_S if timeout_s is None else now_s + timeout_s
-        while True:
-            if now_s >= sessions.due_s:
-                sessions.tick(now_s)
-            wait_s = 0.0 if sessions.has_news else max(min(until_s, sessions.due_s) - now_s, 0.0)
-            arrivals = super().poll(wait_s)
-            now_s = time.monotonic()
-            if arrivals or not self._is_idle or sessions.has_news or now_s >= until_s:
-                return arrivals
+        return super().poll(timeout_s)
 
     def remove_port(self, index: int) -> None:
         """Close a port and forget its neighbours."""
         super().remove_port(index)
         self._neighbours.pop(index, None)
-
-    def _take_control(self, ready: Callable[[], None]) -> None:
-        """Receive control frames; the kernel may have passed a keepalive up, which ends a session that it runs."""
-        if self._sessions is not None:
-            self._sessions.has_news = True
-        ready()
 
     def _take_some(self, source: socket.socket, quota: TokenBucket, ready: Callable[[], None]) -> None:
         """Receive a batch; pause the socket if it exceeded its quota."""
@@ -203,8 +157,6 @@ class RawPlane(NetdevPlane):
             self._batch = make_batch(port.mtu + ETHER_BYTES)
 
     def _shut(self, index: int) -> None:
-        if self._sessions is not None:
-            self._sessions.detach(index)
         self._finish([sockets[index] for sockets in self._sockets_by_class.values() if index in sockets])
         for sockets in self._sockets_by_class.values():
             opened = sockets.pop(index, None)
