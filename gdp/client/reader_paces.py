@@ -24,7 +24,7 @@ from gdp.requests import Backoff
 _MOVED_STEPS: Final = 3  # a rate that has changed by so many is another pace
 _MOVED_REPORTS: Final = 100  # of full delay, after the one before
 _SLOWED_REPORTS: Final = 25  # for which a reader holds back others while messages wait all the time
-_QUEUE_REPORTS: Final = 6  # of what may be under way: else a path would be idle until the next message comes
+_QUEUE_REPORTS: Final = 4  # of what may be under way: else a path would be idle until the next message comes
 _ALL: Final = 1 << 30
 _FASTER: Final = 1.5  # times the rate of a reader that holds it back
 # A queue that holds no whole message loses the end of each. Its reader governs again, for ever longer times.
