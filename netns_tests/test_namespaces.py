@@ -79,6 +79,7 @@ def test_nothing_of_ours_speaks_ipv6(run: Run) -> None:
 
 def test_a_cut_link_loses_its_carrier_at_both_ends_and_gets_it_back(run: Run) -> None:
     namespaces = Namespaces(ring5(), run)
+    namespaces["nuc3"].wait_for_carrier("nuc2", "nuc4")
     namespaces.cut("nuc3", "nuc2")
     assert "UP" not in links(namespaces, "nuc2")["nuc3"][2].strip("<>").split(",")
     assert "NO-CARRIER" in links(namespaces, "nuc3")["nuc2"][2]
