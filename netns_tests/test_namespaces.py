@@ -88,6 +88,14 @@ def test_a_cut_link_loses_its_carrier_at_both_ends_and_gets_it_back(run: Run) ->
     until(lambda: "NO-CARRIER" not in links(namespaces, "nuc3")["nuc2"][2], "the kernel announces the carrier")
 
 
+def test_a_bridge_joins_devices_and_goes_without_them(run: Run) -> None:
+    middle = Namespaces(chain(3), run)["s2"]
+    middle.bridge("joined", ("s1", "s3"))
+    assert all("master joined" in middle.ip("link", "show", "dev", device) for device in ("s1", "s3"))
+    middle.configure(["link del dev joined"])
+    assert not any("master" in middle.ip("link", "show", "dev", device) for device in ("s1", "s3"))
+
+
 def test_a_link_that_is_not_there_cannot_be_cut(run: Run) -> None:
     with pytest.raises(LocalError, match="no link nuc1-nuc3"):
         Namespaces(ring5(), run).cut("nuc1", "nuc3")
