@@ -82,7 +82,7 @@ class Reply:
 
 Answerer = Callable[[Question, Timestamps], "Mapping[str, object] | None"]
 OnReply = Callable[["Reply | None", float], None]
-Send = Callable[[list[bytes], Name, Timestamps], None]
+Send = Callable[[list[bytes], Name, Timestamps], object]
 
 
 @dataclass(frozen=True, slots=True)

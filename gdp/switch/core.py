@@ -29,7 +29,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH, Header, decode, encode
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, HOPS_MASK, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
@@ -124,7 +124,7 @@ class SwitchCore:
             policy,
             fragmenter,
             settings.first_sequence,
-            lambda frames, to, now: self.unicast.originate(frames, to, identity.name, now.mono_s),
+            lambda frames, to, now: self.unicast.forward(to, identity.name, frames, now.mono_s),
         )
         self.diagnostic_answers = DiagnosticAnswers(state, self.diagnostics, self._wake)
         self.boundary = ErrorBoundary()
@@ -382,7 +382,8 @@ class SwitchCore:
         else:
             frame = arrival.frame[: HEADER_BYTES + header.length]
             destination, source = Name(header.destination), Name(header.source)
-            sought = self.unicast.forward(destination, source, frame, owner_of(neighbour), now.mono_s)
+            leaving = frame[:HOPS_AT] + bytes([max(frame[HOPS_AT] - 1, 0)]) + frame[HOPS_AT + 1 :]
+            sought = self.unicast.forward(destination, source, [leaving], now.mono_s, owner_of(neighbour))
             if sought is not None and self.resolver.cache.serves_stale:
                 self.relocations.ask_neighbour(sought, neighbour, now.mono_s)
             if header.destination in self.relocations.moved_names:

@@ -353,7 +353,9 @@ class NameResolver:
         self.requests.cancel(name)
 
 
-class _PendingFrame(NamedTuple):
+class PendingFrame(NamedTuple):
+    """A frame as it is to leave, until when it waits, and the neighbour that it came from."""
+
     frame: bytes
     until_s: float
     owner: bytes
@@ -366,7 +368,7 @@ class PendingFrames:
     """
 
     def __init__(self) -> None:
-        self._by_name: OrderedDict[bytes, deque[_PendingFrame]] = OrderedDict()
+        self._by_name: OrderedDict[bytes, deque[PendingFrame]] = OrderedDict()
         self._frames = Shares(PENDING_FRAMES_MAX)
         self._bytes = Shares(PENDING_BYTES_MAX)
         self.drops: Counter[DropReason] = Counter()
@@ -389,17 +391,17 @@ class PendingFrames:
             self._frames.release(owner)
             self.drops[DropReason.PENDING_FULL] += 1
             return
-        waiting = _PendingFrame(frame, now_s + PENDING_S if until_s is None else until_s, owner)
+        waiting = PendingFrame(frame, now_s + PENDING_S if until_s is None else until_s, owner)
         self._by_name.setdefault(name, deque()).append(waiting)
 
-    def release(self, name: bytes) -> list[tuple[bytes, float, bytes]]:
-        """Remove and return, in order, the frames that wait for a name, each with its ``until_s`` and owner."""
-        waiting = self._by_name.pop(name, deque())
+    def release(self, name: bytes) -> list[PendingFrame]:
+        """Remove and return, in order, the frames that wait for a name."""
+        waiting = list(self._by_name.pop(name, ()))
         for each in waiting:
             self._give_back(each)
-        return [(each.frame, each.until_s, each.owner) for each in waiting]
+        return waiting
 
-    def _give_back(self, waiting: _PendingFrame) -> None:
+    def _give_back(self, waiting: PendingFrame) -> None:
         self._frames.release(waiting.owner)
         self._bytes.release(waiting.owner, size=len(waiting.frame))
 

@@ -9,19 +9,21 @@ leaves it: then only domains that the policies of both ends trust may carry the 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT, SOURCE_AT
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_AT
 from gdp.intervals import LINK_STATE, NEGATIVE_LEASE_S
-from gdp.names import Name
+from gdp.names import NAME_BYTES, Name
 from gdp.sansio import OutgoingFrames
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
+from gdp.switch.name_resolver import PendingFrame
 from gdp.switch.paths import Path
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
@@ -56,26 +58,24 @@ class Unicast:
         self.drops: Counter[DropReason] = Counter()
 
     def forward(
-        self, destination: Name, source: Name, frame: bytes, owner: bytes, now_s: float, until_s: float | None = None
+        self, destination: Name, source: Name, frames: Sequence[bytes], now_s: float, owner: bytes = b""
     ) -> Name | None:
-        """Forward a frame without a table entry, or make it pending until the query for a name is answered.
+        """Send frames without a table entry on, or keep them until the query for a name is answered.
 
         Args:
-            owner: the neighbour that sent it, as ``owner_of``; empty: this switch.
-            until_s: when it has been pending for long enough; None: it comes now.
+            frames: each with the hops that are left when it has left this switch.
+            owner: the neighbour that sent them, as ``owner_of``; empty: this switch.
 
         Returns:
-            The name whose location the frame waits for, if any.
+            The name whose location the frames wait for, if any.
         """
         waits_for = self._resolve(destination, source, owner, now_s)
-        if waits_for is not None:
-            self._state.resolver.buffer_frame(waits_for, frame, now_s, owner, until_s)
-            return waits_for
-        hop = self._hop(destination, source)
-        if frame[HOPS_AT] <= 1 and not isinstance(hop, DropReason):
-            hop = DropReason.HOPS_EXPIRED
-        self._send(hop, [frame[:HOPS_AT] + bytes([max(frame[HOPS_AT] - 1, 0)]) + frame[HOPS_AT + 1 :]])
-        return None
+        if waits_for is None:
+            self._send(self._hop(destination, source), frames)
+        else:
+            for frame in frames:
+                self._state.resolver.buffer_frame(waits_for, frame, now_s, owner)
+        return waits_for
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
         """Send frames of our own to a name, by the same path as forwarded frames."""
@@ -88,21 +88,17 @@ class Unicast:
         frames = self._state.outbox.fragmenter.split(kind, statement, mtu, destination)
         self.send(frames, destination, self._state.me, now_s)
 
-    def originate(self, frames: Iterable[bytes], destination: Name, source: Name, now_s: float) -> None:
-        """Send frames of our own to a name as ``send`` does, but keep them while its location is queried.
-
-        Args:
-            frames: each with the hops that are left when it has left this switch.
-        """
-        for frame in frames:
-            leaving = frame[:HOPS_AT] + bytes([frame[HOPS_AT] + 1]) + frame[HOPS_AT + 1 :]
-            self.forward(destination, source, leaving, b"", now_s)
-
     def release(self, name: Name, now_s: float) -> None:
-        """Retry the frames that wait for a name."""
-        for frame, until_s, owner in self._state.resolver.pending.release(name):
-            source = Name(frame[SOURCE_AT:HEADER_BYTES])
-            self.forward(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
+        """Resolve the paths that frames wait for with a name, as the policies are now; the frames leave by them."""
+        resolver = self._state.resolver
+        for (names, owner), waiting in groupby(resolver.pending.release(name), _path_of):
+            destination, source = Name(names[:NAME_BYTES]), Name(names[NAME_BYTES:])
+            waits_for = self._resolve(destination, source, owner, now_s)
+            if waits_for is None:
+                self._send(self._hop(destination, source), [each.frame for each in waiting])
+                continue
+            for each in waiting:
+                resolver.buffer_frame(waits_for, each.frame, now_s, owner, each.until_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed path again after a link change; ``refresh_more`` does the rest of very many."""
@@ -161,11 +157,16 @@ class Unicast:
         why = self._installed.get(destination + source)
         return DropReason.NO_ROUTE if why is None or why.nowhere is None else why.nowhere
 
-    def _send(self, hop: Hop | DropReason, frames: list[bytes]) -> None:
+    def _send(self, hop: Hop | DropReason, frames: Sequence[bytes]) -> None:
+        """Send frames that state the hops left behind this switch."""
         if isinstance(hop, DropReason):
             self.drops[hop] += len(frames)
-        else:
-            self._state.outbox.waiting.append(OutgoingFrames(hop[0], hop[1][:6], frames))
+            return
+        alive = [frame for frame in frames if frame[HOPS_AT]]
+        if len(alive) < len(frames):
+            self.drops[DropReason.HOPS_EXPIRED] += len(frames) - len(alive)
+        if alive:
+            self._state.outbox.waiting.append(OutgoingFrames(hop[0], hop[1][:6], alive))
 
     def _resolve(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
         """Install an entry, perhaps a negative one; or return the name whose location must be queried first.
@@ -291,3 +292,8 @@ class Unicast:
         key = destination + source
         if not self._state.table.entries.get(key) and self._state.table.install(key, NOWHERE, now_s + NEGATIVE_LEASE_S):
             self._note(key, _Installed(destination, source, reason))
+
+
+def _path_of(waiting: PendingFrame) -> tuple[bytes, bytes]:
+    """Return what decides the path of a frame: its destination and source, and whose query rate applies."""
+    return waiting.frame[DESTINATION_AT:HEADER_BYTES], waiting.owner

@@ -128,3 +128,20 @@ def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
         assert world.network.run(1.0, lambda: not len(nuc1.resolver.pending))
     assert nuc1.table.entries[server + world.members[ROBOT].name]
     assert len(seen) <= FILES_OF_A_MISS, sorted(seen)
+
+
+def test_a_frame_enters_once_and_its_path_is_resolved_once_for_all_that_wait_for_it() -> None:
+    world = ring()
+    nuc1, robot, server = world.switches["nuc1"], world.members[ROBOT].name, world.members[SERVER].name
+    unicast = nuc1.unicast
+    with (
+        patch.object(unicast, "forward", wraps=unicast.forward) as entered,
+        patch.object(unicast, "_resolve", wraps=unicast._resolve) as resolved,
+    ):
+        for _ in range(3):
+            send(world, server)
+        world.network.run(0.0005)
+        assert len(nuc1.resolver.pending) == 3
+        assert world.network.run(1.0, lambda: not len(nuc1.resolver.pending))
+    assert sum(len(call.args[2]) for call in entered.call_args_list if call.args[:2] == (server, robot)) == 3
+    assert [call.args[:2] for call in resolved.call_args_list].count((server, robot)) == 3 + 1  # arrivals, the release
