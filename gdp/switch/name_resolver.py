@@ -353,9 +353,7 @@ class NameResolver:
         self.requests.cancel(name)
 
 
-class PendingFrame(NamedTuple):
-    """A frame as it is to leave, until when it waits, and the neighbour that it came from."""
-
+class _PendingFrame(NamedTuple):
     frame: bytes
     until_s: float
     owner: bytes
@@ -368,7 +366,7 @@ class PendingFrames:
     """
 
     def __init__(self) -> None:
-        self._by_name: OrderedDict[bytes, deque[PendingFrame]] = OrderedDict()
+        self._by_name: OrderedDict[bytes, deque[_PendingFrame]] = OrderedDict()
         self._frames = Shares(PENDING_FRAMES_MAX)
         self._bytes = Shares(PENDING_BYTES_MAX)
         self.drops: Counter[DropReason] = Counter()
@@ -391,17 +389,17 @@ class PendingFrames:
             self._frames.release(owner)
             self.drops[DropReason.PENDING_FULL] += 1
             return
-        waiting = PendingFrame(frame, now_s + PENDING_S if until_s is None else until_s, owner)
+        waiting = _PendingFrame(frame, now_s + PENDING_S if until_s is None else until_s, owner)
         self._by_name.setdefault(name, deque()).append(waiting)
 
-    def release(self, name: bytes) -> list[PendingFrame]:
+    def release(self, name: bytes) -> list[_PendingFrame]:
         """Remove and return, in order, the frames that wait for a name."""
         waiting = list(self._by_name.pop(name, ()))
         for each in waiting:
             self._give_back(each)
         return waiting
 
-    def _give_back(self, waiting: PendingFrame) -> None:
+    def _give_back(self, waiting: _PendingFrame) -> None:
         self._frames.release(waiting.owner)
         self._bytes.release(waiting.owner, size=len(waiting.frame))
 

@@ -23,7 +23,6 @@ from gdp.names import NAME_BYTES, Name
 from gdp.sansio import OutgoingFrames
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.name_cache import Location
-from gdp.switch.name_resolver import PendingFrame
 from gdp.switch.paths import Path
 from gdp.switch.table import NOWHERE, Hop, ProtectedHop
 
@@ -90,15 +89,15 @@ class Unicast:
 
     def release(self, name: Name, now_s: float) -> None:
         """Resolve the paths that frames wait for with a name, as the policies are now; the frames leave by them."""
-        resolver = self._state.resolver
-        for (names, owner), waiting in groupby(resolver.pending.release(name), _path_of):
+        pending = self._state.resolver.pending.release(name)
+        for (names, owner), frames in groupby(pending, lambda f: (f.frame[DESTINATION_AT:HEADER_BYTES], f.owner)):
             destination, source = Name(names[:NAME_BYTES]), Name(names[NAME_BYTES:])
             waits_for = self._resolve(destination, source, owner, now_s)
             if waits_for is None:
-                self._send(self._hop(destination, source), [each.frame for each in waiting])
-                continue
-            for each in waiting:
-                resolver.buffer_frame(waits_for, each.frame, now_s, owner, each.until_s)
+                self._send(self._hop(destination, source), [each.frame for each in frames])
+            else:
+                for each in frames:
+                    self._state.resolver.buffer_frame(waits_for, each.frame, now_s, owner, each.until_s)
 
     def refresh(self, now_s: float) -> None:
         """Compute every installed path again after a link change; ``refresh_more`` does the rest of very many."""
@@ -292,8 +291,3 @@ class Unicast:
         key = destination + source
         if not self._state.table.entries.get(key) and self._state.table.install(key, NOWHERE, now_s + NEGATIVE_LEASE_S):
             self._note(key, _Installed(destination, source, reason))
-
-
-def _path_of(waiting: PendingFrame) -> tuple[bytes, bytes]:
-    """Return what decides the path of a frame: its destination and source, and whose query rate applies."""
-    return waiting.frame[DESTINATION_AT:HEADER_BYTES], waiting.owner
