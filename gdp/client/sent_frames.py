@@ -115,11 +115,12 @@ class SentFrames:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
         if again:
-            for run in self._of_one_pace(frames[:again]):
+            for run in self._of_one_pace(frames[:again]) if self._paces else (frames[:again],):
                 self._add(run, names, now_s, is_repair=True)
             frames = frames[again:]
-        for run in self._of_one_pace(frames):
-            self._add(run, names, now_s, is_repair=False)
+        if frames:
+            for run in self._of_one_pace(frames) if self._paces else (frames,):
+                self._add(run, names, now_s, is_repair=False)
         if not readers or (frames and len(self._runs) > _MESSAGES_MAX):
             self._forget_places()
 
@@ -150,10 +151,7 @@ class SentFrames:
                 paths.leaving.append(record)
 
     def _of_one_pace(self, frames: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
-        """Yield runs of frames that state one pace; without readers that have one, all together."""
-        if not self._paces and frames:
-            yield frames
-            return
+        """Yield runs of frames that state one pace."""
         begin = 0
         for end in range(1, len(frames) + 1):
             if end == len(frames) or frames[end][PACE_AT] != frames[begin][PACE_AT]:
