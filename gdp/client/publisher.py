@@ -244,7 +244,8 @@ class Publisher:
         Returns:
             whether something has to be sealed again for it.
         """
-        mtu = self.queue.mtu = max(mtu, MTU_MIN_BYTES)
+        mtu = max(mtu, MTU_MIN_BYTES)
+        self.queue.set_mtu(mtu)
         self.matched.is_reachable = True
         self._node_paths.tree_stands(self.matched.active, mtu)
         self.protection.late.drop_larger(mtu)
