@@ -196,20 +196,15 @@ class SendQueue:
         reliable, urgent = self._settings.reliable, self._settings.urgent
         self.is_acknowledged = reliable or depth > 0
         self.flags = _RELIABLE * reliable | _LATCHED * (depth > 0) | _URGENT * urgent
-        self._note_bundles()
+        self.bundle_bytes = BUNDLE_BYTES
+        if not self.is_acknowledged and self.mtu is not None:  # one frame: the loss of one loses the whole bundle
+            self.bundle_bytes = min(BUNDLE_BYTES, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
 
     def set_mtu(self, mtu: int) -> None:
         """Set how many bytes each frame may have, from the header on."""
         if mtu != self.mtu:
             self.mtu = mtu
-            self._note_bundles()
-
-    def _note_bundles(self) -> None:
-        """Note the largest bundle: on a best-effort topic one frame, for the loss of one part loses a whole bundle."""
-        self.bundle_bytes = BUNDLE_BYTES
-        if not self.is_acknowledged and self.mtu is not None:
-            frame_bytes = fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES
-            self.bundle_bytes = min(BUNDLE_BYTES, frame_bytes)
+            self._note_depth(self.depth)
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
