@@ -346,7 +346,7 @@ class Opener:
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
         salt = frame[HEADER_BYTES:BODY_AT]
-        cipher = self.cipher_of(salt)
+        cipher = self.cipher_of(salt) if header.parts > 1 else burst.CIPHER(self._keys.of(salt))
         opened = cipher.open(frame, sealed_end)
         if opened is None:
             raise EnvelopeError(DropReason.BAD_TAG)
