@@ -238,14 +238,15 @@ class SentFrames:
             return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
-        new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
+        new_lost = max(lost - reader.lost, 0)
+        reader.lost += new_lost
         frames = sum(flight.frames for flight in confirmed) if self._paces else reader.resolved - before
         judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost) if self._counts_losses else 0
         is_unproven = judged > new_lost
         if is_unproven and held_s is not None:
             held_s = waited_s  # nor is it believed how long it held its report
         path.handle_held(acknack.held_us / 1e6)
-        path.acknowledged(confirmed, max(min(judged, frames - 1), 0), held_s, now_s)
+        path.acknowledged(confirmed, max(min(judged, frames - 1), 0) if judged else 0, held_s, now_s)
         return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:
