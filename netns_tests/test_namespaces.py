@@ -79,12 +79,21 @@ def test_nothing_of_ours_speaks_ipv6(run: Run) -> None:
 
 def test_a_cut_link_loses_its_carrier_at_both_ends_and_gets_it_back(run: Run) -> None:
     namespaces = Namespaces(ring5(), run)
+    namespaces["nuc3"].wait_for_carrier("nuc2", "nuc4")
     namespaces.cut("nuc3", "nuc2")
     assert "UP" not in links(namespaces, "nuc2")["nuc3"][2].strip("<>").split(",")
     assert "NO-CARRIER" in links(namespaces, "nuc3")["nuc2"][2]
     assert "NO-CARRIER" not in links(namespaces, "nuc3")["nuc4"][2]
     namespaces.restore_link("nuc2", "nuc3")
     until(lambda: "NO-CARRIER" not in links(namespaces, "nuc3")["nuc2"][2], "the kernel announces the carrier")
+
+
+def test_a_bridge_joins_devices_and_goes_without_them(run: Run) -> None:
+    middle = Namespaces(chain(3), run)["s2"]
+    middle.bridge("joined", ("s1", "s3"))
+    assert all("master joined" in middle.ip("link", "show", "dev", device) for device in ("s1", "s3"))
+    middle.configure(["link del dev joined"])
+    assert not any("master" in middle.ip("link", "show", "dev", device) for device in ("s1", "s3"))
 
 
 def test_a_link_that_is_not_there_cannot_be_cut(run: Run) -> None:

@@ -8,7 +8,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from gdp.host.run_registry import RunRegistry
 from lab.dds import ros_environment
 from lab.machine import LabMachine
 from lab.machines import Lab
-from lab.namespaces import add_address
 from lab.process import ROOT, calling, new_run, python_path
 from lab.topology import chain
 from tests.proxy.endpoints.ros2_net import Peer, needs
@@ -42,7 +40,7 @@ def lab() -> Iterator[Lab]:
     with new_run() as run:
         made = Lab(run, chain(2), own_shared_memory=("s1", "s2"))
         for node, device, address in (("s1", "s2", "10.97.0.1"), ("s2", "s1", "10.97.0.2")):
-            made.inside(node, partial(add_address, device, address))
+            made.namespaces[node].configure([f"addr add {address}/24 dev {device}"])
         yield made
 
 

@@ -6,7 +6,6 @@ Examples:
   scripts/fuzz.py --seconds 5                        all decoders, five seconds each
   scripts/fuzz.py --guided --total 60                guided by branches (atheris), a minute for all of them
   scripts/fuzz.py --only msg,idl --seconds 60        two of them, a minute each
-  scripts/fuzz.py --guided --total 480 --record      and add the numbers to those of earlier runs
   scripts/fuzz.py --only mcap --seed 7 --keep        other inputs; new ones go to tests/corpus/mcap/
   scripts/fuzz.py --only frame --input crash.bin     one input, with the whole traceback of what it raises
   scripts/fuzz.py minimise                           delete kept inputs that run nothing of their own
@@ -21,7 +20,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +28,6 @@ from typing import TYPE_CHECKING
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.fuzzing.decoder import Decoder
-from tests.fuzzing.record import Tried, add
 from tests.fuzzing.runner import Outcome, corpus_of, fuzz, keep, minimise
 
 if TYPE_CHECKING:
@@ -75,10 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show(outcomes[-1])
         if options.keep:
             keep(outcomes[-1])
-        if options.record:
-            add(outcomes[-1:])
-    if options.record:
-        _show_record(add(()))
     return _findings(outcomes, has_limits=options.limits)
 
 
@@ -106,7 +100,6 @@ def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1, help="of the mutations (default: 1)")
     parser.add_argument("--list", action="store_true", help="list the decoders and exit")
     parser.add_argument("--keep", action="store_true", help="write new inputs and findings to tests/corpus/")
-    parser.add_argument("--record", action="store_true", help="add the numbers to tests/corpus/executions.json")
     parser.add_argument("--input", type=Path, metavar="FILE", help="run this input alone; with --only")
     return parser.parse_args(arguments)
 
@@ -127,17 +120,6 @@ def _show(outcome: Outcome) -> None:
         f"{outcome.decoder.name:<15} {outcome.executions:>10} {outcome.refused:>8} {outcome.foreign:>8}"
         f" {outcome.slowest_ms:>11.1f} {outcome.memory_ratio:>9.1f} {len(outcome.found):>5}",
         flush=True,
-    )
-
-
-def _show_record(tried: Mapping[str, Tried]) -> None:
-    executions = sum(each.executions for each in tried.values())
-    foreign = sum(each.foreign for each in tried.values())
-    slowest = max((each.slowest_ms for each in tried.values()), default=0.0)
-    memory = max((each.memory_ratio for each in tried.values()), default=0.0)
-    print(
-        f"\nin all runs: {executions} executions of {len(tried)} decoders, {foreign} with a foreign exception,"
-        f" at most {slowest:.0f} ms and {memory:.1f} times an input's length"
     )
 
 

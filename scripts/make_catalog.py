@@ -16,12 +16,11 @@ from typing import Final
 
 import yaml
 
-from fog.plan.trace import Trace, outages, times_independent
-
 ROOT: Final = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "scripts" / "bench"))
 from machine import data_folder  # noqa: E402
 from skeleton import clean_exit  # noqa: E402
+from spot_trace import Trace, outages, times_independent  # noqa: E402
 
 TRACES: Final = "aws_*.json"
 ADVISOR: Final = "spot-advisor-data.json"

@@ -54,7 +54,8 @@ def _branch_lines(hop: Mapping[str, object], indent: str) -> Iterator[str]:
         below = branch.get("below")
         is_closed = isinstance(below, Mapping) and (below.get("withheld") or below.get("state") != "answered")
         outcome = f": {_switch(below)}" if isinstance(below, Mapping) and is_closed else ""
-        yield f"{indent}tree -> {_link(branch)}{outcome}"
+        rate = f", messages for {branch['kbit_s']} kbit/s" if "kbit_s" in branch else ""
+        yield f"{indent}tree -> {_link(branch)}{rate}{outcome}"
         if isinstance(below, Mapping):
             yield from _branch_lines(below, indent + "    ")
     if hop.get("cut"):

@@ -12,20 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from math import log2
 from typing import Final
 
 from gdp.client.blocking_readers import BlockingReaders, PathState
 from gdp.client.reader_path import FLIGHT_FRAMES, ReaderPath, ReaderPaths
+from gdp.frame.pace import pace_of
 from gdp.limits import PACE_MAX, REPORT_DELAY_S
 from gdp.message.heartbeat import PACES_MAX
 from gdp.requests import Backoff
 
-_STEPS: Final = 4  # paces in a doubling of the rate, from 1 kB/s on
 _MOVED_STEPS: Final = 3  # a rate that has changed by so many is another pace
 _MOVED_REPORTS: Final = 100  # of full delay, after the one before
 _SLOWED_REPORTS: Final = 25  # for which a reader holds back others while messages wait all the time
-_QUEUE_REPORTS: Final = 6  # of what may be under way: else a path would be idle until the next message comes
+_QUEUE_REPORTS: Final = 4  # of what may be under way: else a path would be idle until the next message comes
 _ALL: Final = 1 << 30
 _FASTER: Final = 1.5  # times the rate of a reader that holds it back
 # A queue that holds no whole message loses the end of each. Its reader governs again, for ever longer times.
@@ -84,8 +83,8 @@ class ReaderPaces:
                 given.failures += 1
                 given.pace, given.since_s = PACE_MAX, now_s
                 given.governs_until_s = now_s + _GOVERNS.pause_s(given.failures)
-            elif abs(_pace_of(model.bytes_s) - pace) >= _MOVED_STEPS:
-                given.pace, given.since_s = _pace_of(model.bytes_s), now_s
+            elif abs(pace_of(model.bytes_s) - pace) >= _MOVED_STEPS:
+                given.pace, given.since_s = pace_of(model.bytes_s), now_s
         return given.pace != pace
 
     def record(self, names: Iterable[bytes], now_s: float) -> None:
@@ -168,7 +167,7 @@ class ReaderPaces:
             given = self._given[name] = _Given(PACE_MAX, now_s)
         if given.pace < PACE_MAX or now_s < given.governs_until_s:
             return False
-        given.pace, given.since_s = _pace_of(path.controller.model.bytes_s), now_s
+        given.pace, given.since_s = pace_of(path.controller.model.bytes_s), now_s
         return True
 
     def _top(self, names: Iterable[bytes]) -> int:
@@ -193,7 +192,3 @@ class ReaderPaces:
         """Return whether slower readers wait for this one: not so if it confirms nothing."""
         path: ReaderPath | None = self._paths.get(name)
         return path is not None and path.governs_others
-
-
-def _pace_of(bytes_s: float) -> int:
-    return min(max(round(_STEPS * log2(max(bytes_s, 1.0) / 1_000)), 1), PACE_MAX - 1)

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Final
 
 from gdp.diagnosis.answer import Cause
+from gdp.diagnosis.facts import FlowFact
 from gdp.diagnosis.view import Found, Rule, View, short
 from gdp.intervals import REPORT_S
 
@@ -24,14 +25,15 @@ def arrives(view: View) -> Iterator[Found]:
         if flow.kind != "topic" and flow.connected and not _failures(flow.faults):
             text = f"It answers: {flow.connected} server{'s' if flow.connected > 1 else ''} of {flow.local} connected."
             yield text, ""
-        lost = sum(flow.lost.values())
+        lost = sum(flow.lost.values()) - flow.lost.get("thinned", 0)
         if flow.received and lost <= flow.received // 10 and not flow.odd_qos:
             age = "now" if flow.idle_s is None else f"{flow.idle_s:.2f} s ago"
             window_s = view.facts.window_s
             rate = f", {flow.received / window_s:.3g} Hz" if window_s else ""
             thinned = flow.thinned + sum(far.flow.thinned for far in view.exporters)
             left_out = f"; max_hz leaves out {thinned} of {thinned + flow.received} messages" if thinned else ""
-            yield f"It arrives {end.place}: last message {age}{rate}{left_out}{_governs(view)}.", ""
+            clauses = f"{left_out}{_own_pace(view, flow)}{_governs(view)}"
+            yield f"It arrives {end.place}: last message {age}{rate}{clauses}.", ""
         far = [each.flow for each in view.exporters]
         if flow.full_parts and not (flow.received or lost or any(e.is_throttled or e.lost or e.faults for e in far)):
             yield f"It arrives {end.place}: parts of a message came, which is not complete yet{_governs(view)}.", ""
@@ -249,6 +251,15 @@ def _governs(view: View) -> str:
         return ""
     path = f"round trip {1e3 * flow.governing_rtt_s:.3g} ms, {flow.governing_bits_s / 1e6:.3g} Mbit/s"
     return f"; the slowest reader, proxy {short(flow.governing)}, governs ({path})"
+
+
+def _own_pace(view: View, flow: FlowFact) -> str:
+    """Return how many messages went to faster readers only, and which switches left them out; empty: none did."""
+    if not (thinned := flow.lost.get("thinned", 0)):
+        return ""
+    places = [view.place_of(switch) for switch in view.facts.switches if switch.drops.get("thinned")]
+    at = f", left out at {' and '.join(places)}" if places else ""
+    return f"; {thinned} of {thinned + flow.received} messages went to faster readers only{at}"
 
 
 def _failures(faults: Mapping[str, int]) -> list[str]:

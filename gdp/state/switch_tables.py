@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from gdp.frame.pace import kbit_s_of
 from gdp.names import NAME_BYTES, Name
 from gdp.ports.plane import MAC_BYTES
 from gdp.sansio import Timestamps
@@ -65,6 +66,7 @@ def _trees(state: SwitchState, now: Timestamps) -> list[Row]:
             "to": _at(state, at),
             "state": "active" if branch.is_active else "backup",
             "mtu": branch.mtu,
+            "kbit_s": kbit_s_of(branch.pace),
             "lease_s": seconds_left(branch.expires_s, now),
         }
         for tree in state.switch.multicast.trees.all()

@@ -13,6 +13,7 @@ from gdp.control.diagnostics import Diagnostics, Question
 from gdp.crypto.certificates import Role
 from gdp.crypto.schema import NAME_OR_ZERO, Keyed
 from gdp.errors import DropReason, StatementError
+from gdp.frame.pace import kbit_s_of
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.forwarding_state import ForwardingState
@@ -45,7 +46,8 @@ class DiagnosticAnswers:
 
         The body may name one publisher (``p``); without it the branches of all publishers come. It may also name the
         end of the path (``t``), where that is not the member that was asked. A proxy whose
-        request shows no right on the name gets the reason (``w``) instead of branches.
+        request shows no right on the name gets the reason (``w``) instead of branches. A branch that gets only what
+        its path carries states that rate (``kbit_s``).
         """
         result: dict[str, object] = {}
         if question.port is not None:
@@ -61,7 +63,7 @@ class DiagnosticAnswers:
             return result | {"w": error.reason.label}
         wanted = _PUBLISHER.read(question.body)
         result["branches"] = [
-            {"p": tree.publisher, **self._link(port, mac)}
+            {"p": tree.publisher, **self._link(port, mac), **_rate(branch.pace)}
             for tree in self._state.trees.of_topic(question.name)
             if wanted in (ZERO, tree.publisher) and tree.path == 1
             for (port, mac), branch in sorted(tree.branches.items())
@@ -122,3 +124,8 @@ class DiagnosticAnswers:
             if rtt_s is not None:
                 link["rtt_us"] = round(1e6 * rtt_s)
         return link
+
+
+def _rate(pace: int) -> Mapping[str, object]:
+    kbit_s = kbit_s_of(pace)
+    return {} if kbit_s is None else {"kbit_s": kbit_s}

@@ -32,7 +32,7 @@ from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab
-from lab.namespaces import add_bridge, mac_addresses, remove_link
+from lab.namespaces import mac_addresses
 from lab.process import FailedError, LabProcess, new_run
 from lab.topology import chain
 
@@ -101,8 +101,8 @@ class Row(Lab):
         """Make a bridge in every middle, which has learnt both addresses; yield as ``kernel``."""
         with ExitStack() as undo:
             for node in self.topology.nodes[1:-1]:
-                self.inside(node, partial(add_bridge, _BRIDGE, self.topology.neighbours(node)))
-                undo.callback(self.inside, node, partial(remove_link, _BRIDGE))
+                self.namespaces[node].bridge(_BRIDGE, self.topology.neighbours(node))
+                undo.callback(self.namespaces[node].configure, [f"link del dev {_BRIDGE}"])
             frames = self._frames(4)
             self.round_trips(frames, _WARM_UP_PINGS)
             yield frames

@@ -25,7 +25,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -35,7 +34,6 @@ from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import BUFFER_BYTES, ros_environment
 from lab.machines import BenchNodes, Lab
-from lab.namespaces import add_address, add_bridge
 from lab.process import LabProcess
 from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 
@@ -86,9 +84,9 @@ class Row:
         ends = tuple(self._machines.values())
         self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else (), cores=cores)
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
-            self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
+            self._lab.namespaces[node].bridge(_BRIDGE, (before, after))
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
-            self._lab.inside(self._machines[side], partial(add_address, device, _ADDRESSES[side]))
+            self._lab.namespaces[self._machines[side]].configure([f"addr add {_ADDRESSES[side]}/24 dev {device}"])
         with ExitStack() as undo:
             nodes = BenchNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
             self._nodes = undo.enter_context(nodes)

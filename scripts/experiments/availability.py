@@ -22,10 +22,10 @@ from machine import data_folder
 from page_text import text_of
 from report import markdown_table, print_table
 from skeleton import Options
+from spot_trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
 
 from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text
-from fog.plan.trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
 
 RECOVERIES: Final = ("34s", "5min", "20min")
 BLOCK_S, RESAMPLES, MOST_REPLICAS = 6 * 3600.0, 2000, 3

@@ -45,6 +45,11 @@ class Lease:
     address6: str = ""
     gateway6: str = ""
 
+    def pairs(self) -> list[tuple[str, str]]:
+        """Return each address with its gateway."""
+        both = ((self.address, self.gateway), (self.address6, self.gateway6))
+        return [(address, gateway) for address, gateway in both if address]
+
     def has(self, version: int) -> bool:
         """Return whether there is an address of this IP version."""
         return bool(self.address if version == 4 else self.address6)

@@ -11,9 +11,8 @@ import contextlib
 import ctypes
 import os
 import select
-import socket
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
@@ -70,26 +69,18 @@ class Namespace:
         except NetlinkError as error:
             raise LocalError(f"{self.path.name}: {error}") from error
 
-    def join(self, far: Namespace, own: Mapping[str, object], peer: Mapping[str, object], **more: int) -> None:
-        """Make a pair of devices, one here and one in a far namespace; ``more``: further keys of the near one."""
-        descriptor = os.open(far.path, os.O_RDONLY | os.O_CLOEXEC)
-
-        def add() -> None:
-            with IPRoute() as here:
-                here.link("add", kind="veth", peer={**peer, "net_ns_fd": descriptor}, **own, **more)
-
-        try:
-            self.inside(add)
-        finally:
-            os.close(descriptor)
+    def join(self, far: Namespace, device: str, far_device: str) -> None:
+        """Make a pair of devices, one here and one in a far namespace; either may have more words of ip-link(8)."""
+        self.configure([f"link add dev {device} type veth peer name {far_device} netns {far.path}"])
 
     def move(self, device: str, to: Namespace) -> None:
         """Move a device to another namespace, where it is down."""
-        descriptor = os.open(to.path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            self.inside(partial(set_link, device, net_ns_fd=descriptor))
-        finally:
-            os.close(descriptor)
+        self.configure([f"link set dev {device} netns {to.path}"])
+
+    def bridge(self, name: str, devices: Iterable[str] = ()) -> None:
+        """Join devices by a new bridge without spanning tree."""
+        made = f"link add dev {name} type bridge stp_state 0 forward_delay 0"
+        self.configure([made, *(f"link set dev {each} master {name}" for each in devices), f"link set dev {name} up"])
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
@@ -241,8 +232,7 @@ class Namespaces:
             namespace.inside(netns_files.disable_ipv6)
         self._join()
         for node, namespace in self._namespaces.items():
-            for device in ("lo", *topology.neighbours(node)):
-                namespace.inside(partial(set_link, device, state="up"))
+            namespace.configure(f"link set dev {device} up" for device in ("lo", *topology.neighbours(node)))
 
     def __getitem__(self, node: str) -> Namespace:
         """Return the namespace of a switch."""
@@ -260,18 +250,18 @@ class Namespaces:
         """Connect device ``ifname`` in one switch's namespace to a new ``ifname-s`` in another's, or its own."""
         self._plugged += 1
         mtu = max(link.mtu for link in self.topology.links)
-        own, peer = {"ifname": ifname, "mtu": mtu}, {"ifname": f"{ifname}-s", "mtu": mtu}
-        self[home].join(self[switch], own, peer, index=_PLUG_FROM + self._plugged)
-        self[switch].inside(partial(set_link, f"{ifname}-s", state="up"))
-        self[home].inside(partial(set_link, ifname, state="up"))
+        own, peer = f"{ifname} index {_PLUG_FROM + self._plugged} mtu {mtu}", f"{ifname}-s mtu {mtu}"
+        self[home].join(self[switch], own, peer)
+        self[switch].configure([f"link set dev {ifname}-s up"])
+        self[home].configure([f"link set dev {ifname} up"])
 
     def unplug(self, home: str, ifname: str) -> None:
         """Remove the pair that ``plug`` made."""
-        self[home].inside(partial(remove_link, ifname))
+        self[home].configure([f"link del dev {ifname}"])
 
     def _set_link(self, a: str, b: str, state: str) -> None:
         link = self.topology.link(a, b)
-        self[link.a].inside(partial(set_link, link.b, state=state))
+        self[link.a].configure([f"link set dev {link.b} {state}"])
 
     def _join(self) -> None:
         """Make the veth pairs, whose two ends must not share an index.
@@ -282,48 +272,12 @@ class Namespaces:
         number = {node: index for index, node in enumerate(self.topology.nodes, 1)}
         for index, link in enumerate(self.topology.links, _INDEX_FROM):
             a, b = number[link.a], number[link.b]
-            own = {"ifname": link.b, "mtu": link.mtu, "address": _mac(a, b)}
-            peer = {"ifname": link.a, "mtu": link.mtu, "address": _mac(b, a)}
-            self[link.a].join(self[link.b], own, peer, index=index)
+            own = f"{link.b} index {index} address {_mac(a, b)} mtu {link.mtu}"
+            self[link.a].join(self[link.b], own, f"{link.a} address {_mac(b, a)} mtu {link.mtu}")
 
 
 def _mac(own: int, other: int) -> str:
     return f"{_MAC_PREFIX}:{own:02x}:{other:02x}"
-
-
-def add_address(device: str, address: str) -> None:
-    """Give a device of the thread's namespace an IPv4 address of a network of 24 bits."""
-    with IPRoute() as here:
-        here.addr("add", index=_index(device), address=address, prefixlen=24)
-
-
-def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
-    """Join devices by a new bridge without spanning tree."""
-    with IPRoute() as here:
-        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
-    for device in devices:
-        set_link(device, master=name)
-    set_link(name, state="up")
-
-
-def add_neighbour(device: str, address: str, mac: bytes) -> None:
-    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
-    with IPRoute() as here:
-        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=_index(device), state="permanent")
-
-
-def set_link(device: str, **change: str | int) -> None:
-    """Change a device: ``state``, ``mtu`` in bytes, ``master``: its bridge, ``net_ns_fd``: of where to move it to."""
-    if isinstance(master := change.get("master"), str):
-        change["master"] = _index(master)
-    with IPRoute() as here:
-        here.link("set", index=_index(device), **change)
-
-
-def remove_link(device: str) -> None:
-    """Remove a device, and with it the other end of a pair."""
-    with IPRoute() as here:
-        here.link("del", index=_index(device))
 
 
 def received(devices: Sequence[str]) -> dict[str, int]:
@@ -338,11 +292,3 @@ def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
     with IPRoute() as here:
         links = {link.get("ifname"): link.get("address") for link in here.get_links()}
     return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
-
-
-def _index(device: str) -> int:
-    """Return the index of a device of the thread's namespace. Raises ``LocalError``: there is none."""
-    try:
-        return socket.if_nametoindex(device)
-    except OSError as error:
-        raise LocalError(f"no device {device}") from error

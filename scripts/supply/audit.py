@@ -3,12 +3,11 @@
 
     .venv/bin/python scripts/supply/audit.py --lock requirements/dev.lock
     .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --advisories advisory-database/vulns
-    .venv/bin/python scripts/supply/audit.py --lock requirements/run.lock --archives wheels
 
 The audit checks each distribution that the running interpreter finds. The lock must pin it here, in that version, and
-its files must be those that its RECORD states. ``--archives`` compares downloaded archives with the lock's hashes. A
-virtual environment brings pip, setuptools and wheel: they are compared where the lock pins them. Exit: 0 nothing found,
-1 something, 2 wrong usage. ``pip-audit`` reads no advisories from files, and asks a service for each package.
+its files must be those that its RECORD states. A virtual environment brings pip, setuptools and wheel: they are
+compared where the lock pins them. Exit: 0 nothing found, 1 something, 2 wrong usage. ``pip-audit`` reads no advisories
+from files, and asks a service for each package.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _WITH_EVERY_VENV = frozenset({"pip", "setuptools", "wheel"})
 class Finding(NamedTuple):
     """Difference from the lock, a RECORD or an advisory."""
 
-    kind: str  # not-pinned, other-version, changed-file, missing-file, unknown-archive, advisory
+    kind: str  # not-pinned, other-version, changed-file, missing-file, advisory
     name: str
     detail: str
 
@@ -77,14 +76,6 @@ def check_files(installed: Iterable[Distribution]) -> Iterator[Finding]:
                 yield Finding("changed-file", _name(each), str(file))
 
 
-def check_archives(folder: Path, pins: Sequence[Pin]) -> Iterator[Finding]:
-    """Yield each file of a folder whose hash no pin of the lock has."""
-    known = {digest for pin in pins for digest in pin.hashes}
-    for path in sorted(path for path in folder.iterdir() if path.is_file()):
-        if hashlib.sha256(path.read_bytes()).hexdigest() not in known:
-            yield Finding("unknown-archive", path.name, "its SHA-256 stands in no pin")
-
-
 def check_advisories(installed: Iterable[Distribution], path: Path) -> Iterator[Finding]:
     """Yield each distribution whose version has a vulnerability by an advisory.
 
@@ -103,7 +94,6 @@ def main(words: Sequence[str] | None = None, installed: Iterable[Distribution] |
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lock", type=Path, required=True, help="a file of requirements/")
     parser.add_argument("--advisories", type=Path, help="OSV: a file, or a folder of them")
-    parser.add_argument("--archives", type=Path, help="a folder of archives, as pip download makes it")
     parser.add_argument("--json", action="store_true", help="findings as JSON")
     given = parser.parse_args(words)
     found = list(distributions()) if installed is None else list(installed)
@@ -111,8 +101,6 @@ def main(words: Sequence[str] | None = None, installed: Iterable[Distribution] |
     try:
         pins = read_lock(given.lock)
         findings = [*compare(dists, pins), *check_files(dists)]
-        if given.archives:
-            findings += check_archives(given.archives, pins)
         if given.advisories:
             findings += check_advisories(dists, given.advisories)
     except (LockError, AdvisoryError, OSError) as error:

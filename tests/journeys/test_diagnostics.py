@@ -13,6 +13,7 @@ from gdp.control.diagnostics import Question, Reply
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
+from gdp.frame.pace import pace_of
 from gdp.limits import DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
@@ -128,6 +129,13 @@ def test_a_switch_of_our_domain_tells_links_and_branches(flow: Flow) -> None:
     assert (out["to"], out["role"], str(out["port"])[:3]) == (world.switches["nuc2"].name, "switch", "eth")
     assert branch["to"] == world.switches["nuc2"].name
     assert branch["p"] == world.members[ROBOT].name
+    assert "kbit_s" not in branch
+    for tree in world.switches["nuc1"].multicast.trees.all():
+        for each in tree.branches.values():
+            each.pace = pace_of(125_000)
+    reply = asker.ask(target, "trace", flow.topic.name, 1, 2_000)
+    assert reply is not None
+    assert [each["kbit_s"] for each in reply.result["branches"]] == [1_020]
 
 
 def test_branches_are_shown_to_those_with_a_right_on_the_name_and_to_switches() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
+from gdp.frame.pace import kbit_s_of
 from gdp.message.loss import LossReason
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
@@ -106,3 +107,10 @@ def test_each_reader_gets_whole_images_at_the_pace_of_its_own_link() -> None:
         assert is_thinned or label not in (MEDIUM, THIN)
         assert writer_proxy.delivery.delivered + writer_proxy.losses.total <= (SETTLED_S + MEASURED_S) * RATE
     assert flow.world.network.drops[DropReason.THINNED] > 0
+    assert 700 <= least_kbit_s(flow.world, "s2") <= 1_300 < 3_500 <= least_kbit_s(flow.world, "m1") <= 6_500
+
+
+def least_kbit_s(world: Simulation, label: str) -> int:
+    """Return the rate of the slowest branch at a switch, which leaves out what it does not carry."""
+    trees = world.switches[label].multicast.trees.all()
+    return min(kbit_s_of(branch.pace) or 100_000 for tree in trees for branch in tree.branches.values())

@@ -19,6 +19,7 @@ from faults.records import Kind, Record
 
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -52,6 +53,7 @@ class SimulatedChaos:
         faults: in the order of their starts, of the kinds in ``SIMULATED``.
         keepalive_ms: None: the usual one.
         seed: of keys, delays and losses.
+        options: of all topics.
 
     Attributes:
         world: the simulated network.
@@ -60,9 +62,14 @@ class SimulatedChaos:
     """
 
     def __init__(
-        self, plan: Plan, faults: Sequence[Fault], seed: int, keepalive_ms: int | None = SCAPY_KEEPALIVE_MS
+        self,
+        plan: Plan,
+        faults: Sequence[Fault],
+        seed: int,
+        keepalive_ms: int | None = SCAPY_KEEPALIVE_MS,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
-        self._plan, self._faults = plan, faults
+        self._plan, self._faults, self._options = plan, faults, options
         self.world = Simulation(
             topology=_topology(plan), seed=seed, keepalive_ms=keepalive_ms, journal_bytes=JOURNAL_BYTES
         )
@@ -143,7 +150,9 @@ class SimulatedChaos:
             if member == flow.publisher:
                 topic = self.world.topic(flow.topic, node, [Right.PUBLISH])
                 self._names[channel] = topic.name
-                self.publishers[channel] = node.advertise(topic, b"chaos", reliable=flow.reliable)
+                self.publishers[channel] = node.advertise(
+                    topic, b"chaos", reliable=flow.reliable, options=self._options
+                )
             elif member in flow.readers:
                 node.subscribe(self.world.topic(flow.topic, node, [Right.READ]))
         self.world.network.send_pending(self._labels[member])

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 import fuzz as script
 from tests.fuzzing.decoder import Decoder
-from tests.fuzzing.record import Tried, add
 from tests.fuzzing.registry import DECODERS
-from tests.fuzzing.runner import Outcome, corpus_of, fuzz
+from tests.fuzzing.runner import corpus_of, fuzz
 
 EXECUTIONS = 60  # of mutated inputs for each decoder
 
@@ -68,11 +66,3 @@ def test_the_script_ends_with_a_table(capsys: pytest.CaptureFixture[str]) -> Non
         script.main(["--help"])
     assert not left.value.code
     assert "Examples" in capsys.readouterr().out
-
-
-def test_executions_of_several_runs_add_up(tmp_path: Path) -> None:
-    path = tmp_path / "executions.json"
-    first, second = Outcome(DECODERS[0], 10, 1, 0, 3.0, 0.5), Outcome(DECODERS[0], 5, 0, 1, 2.0, 1.5)
-    add([first], path)
-    assert add([second], path) == {DECODERS[0].name: Tried(15, 1, 3.0, 1.5)}
-    assert add([], path) == {DECODERS[0].name: Tried(15, 1, 3.0, 1.5)}

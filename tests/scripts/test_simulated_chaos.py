@@ -12,6 +12,7 @@ import pytest
 from faults.plan import random_network
 from faults.schedule import make_schedule
 
+from gdp.client.send_options import SendOptions
 from lab.faults import Fault
 from tests.draws import IS_LONG, TIMES
 from tests.insiders.oracle import signing_oracle
@@ -30,6 +31,16 @@ def test_flows_over_thin_full_links_outlive_overlapping_faults(seed: int, tmp_pa
     faults = make_schedule(plan, seed, SECONDS, kinds=SIMULATED)
     with signing_oracle():
         chaos = SimulatedChaos(plan, faults, seed)
+        chaos.settle(thin_bits_s=THIN_BITS_S, fifo_s=FIFO_S)
+        outlive(chaos, faults, LIMIT_S, WELL_S, tmp_path)
+
+
+@pytest.mark.nightly
+def test_images_at_the_pace_of_each_reader_starve_no_flow_over_full_links(tmp_path: Path) -> None:
+    plan = random_network(2, 8, rate=0.4, image_bits_s=IMAGE_SHARE * THIN_BITS_S)
+    faults = make_schedule(plan, 2, 12.0, kinds=SIMULATED)
+    with signing_oracle():
+        chaos = SimulatedChaos(plan, faults, 2, options=SendOptions(own_pace=True))
         chaos.settle(thin_bits_s=THIN_BITS_S, fifo_s=FIFO_S)
         outlive(chaos, faults, LIMIT_S, WELL_S, tmp_path)
 

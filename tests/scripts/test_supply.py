@@ -194,16 +194,6 @@ def test_a_file_that_was_changed_or_deleted_after_its_installation_is_reported(
     assert run(capsys, site, "--lock", lock(site)) == (1, [("changed-file", "alpha"), ("missing-file", "beta")])
 
 
-def test_an_archive_whose_hash_no_pin_has_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    wheels = site.parent / "wheels"
-    wheels.mkdir()
-    (wheels / "alpha-1.2-py3-none-any.whl").write_bytes(b"as meant")
-    (wheels / "beta-2.0-py3-none-any.whl").write_bytes(b"exchanged")
-    pinned = PINNED.replace(HASH, hashlib.sha256(b"as meant").hexdigest())
-    code, findings = run(capsys, site, "--lock", lock(site, pinned), "--archives", wheels)
-    assert (code, findings) == (1, [("unknown-archive", "beta-2.0-py3-none-any.whl")])
-
-
 def advisory(*ranges: tuple[str, str], versions: tuple[str, ...] = (), **other: Any) -> dict[str, Any]:
     affected = {
         "package": {"ecosystem": "PyPI", "name": "Al_pha"},

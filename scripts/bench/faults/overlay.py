@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from pyroute2 import IPRoute
 from report import progress
 
 from faults.accounts import Books
@@ -36,7 +35,7 @@ from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
 from lab.faults import STORE, Fault, FaultKind, links_of
 from lab.machines import Lab
-from lab.namespaces import received, set_link
+from lab.namespaces import received
 from lab.process import FailedError, LabProcess, end_processes, until
 
 READY_S: Final = 60.0
@@ -315,8 +314,10 @@ class Overlay:
 
     def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
         """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
+        limit = max(round(bits_s / 8 * fifo_s), _BUCKET_BYTES)
+        shape = f"tbf rate {bits_s:.0f}bit burst {_BUCKET_BYTES} limit {limit}"  # before the bucket, frames wait
         for own, other in ((a, b), (b, a)):
-            self._lab.inside(own, partial(_shape, other, bits_s, fifo_s))
+            self.spaces[own].run("tc", "qdisc", "add", "dev", other, "root", *shape.split())
 
     def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
         """Return how many frames have come in at a node's devices towards these neighbours."""
@@ -325,7 +326,7 @@ class Overlay:
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
         self.spaces[self.at[mover]].move(mover, self.spaces[to])
-        self._lab.inside(to, partial(set_link, mover, state="up"))
+        self.spaces[to].configure([f"link set dev {mover} up"])
         self.at[mover] = to
 
     # files
@@ -401,14 +402,6 @@ class Overlay:
         self._credentials.write(
             f"end-{member}.yaml", {**self._credentials.node_yaml(Role.PROXY, member), "iface": iface}
         )
-
-
-def _shape(ifname: str, bits_s: float, fifo_s: float) -> None:
-    """Limit what leaves a device: a token bucket, before which frames wait in a FIFO."""
-    with IPRoute() as here:
-        (index,) = here.link_lookup(ifname=ifname)
-        limit = max(round(bits_s / 8 * fifo_s), _BUCKET_BYTES)
-        here.tc("add", "tbf", index, 0x10000, rate=round(bits_s / 8), burst=_BUCKET_BYTES, limit=limit)
 
 
 def _flow_part(channel: int, flow: Flow) -> dict[str, object]:

@@ -25,7 +25,7 @@ from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
 from lab.faults import Fault, FaultKind
 from lab.machine import LabMachine
-from lab.namespaces import Namespace, Namespaces, add_address, add_bridge, set_link
+from lab.namespaces import Namespace, Namespaces
 from lab.process import until
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
@@ -58,9 +58,8 @@ class StoreCluster:
         self._folder = run.directory / "store"
         self._namespace = Namespace(run, "store")
         self._namespace.inside(netns_files.disable_ipv6)
-        self._namespace.inside(partial(set_link, "lo", state="up"))
-        self._namespace.inside(partial(add_bridge, _BRIDGE))
-        self._namespace.inside(partial(add_address, _BRIDGE, _ADDRESS))
+        self._namespace.bridge(_BRIDGE)
+        self._namespace.configure(["link set lo up", f"addr add {_ADDRESS}/24 dev {_BRIDGE}"])
         for at, node in enumerate(ribs, 2):
             self._join(spaces[node], f"to-{node}", _OF_RIBS.format(at))
         self._enter = self._namespace.command([], dies_with_us=False)
@@ -127,10 +126,9 @@ class StoreCluster:
         return int((self._folder / str(number) / "server.pid").read_text(encoding="ascii"))
 
     def _join(self, rib: Namespace, ifname: str, address: str) -> None:
-        self._namespace.join(rib, {"ifname": ifname}, {"ifname": _IFNAME})
-        self._namespace.inside(partial(set_link, ifname, state="up", master=_BRIDGE))
-        rib.inside(partial(add_address, _IFNAME, address))
-        rib.inside(partial(set_link, _IFNAME, state="up"))
+        self._namespace.join(rib, ifname, _IFNAME)
+        self._namespace.configure([f"link set dev {ifname} master {_BRIDGE} up"])
+        rib.configure([f"addr add {address}/24 dev {_IFNAME}", f"link set dev {_IFNAME} up"])
 
 
 def critical_lines(folder: Path) -> list[str]:

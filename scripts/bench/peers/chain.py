@@ -8,22 +8,17 @@ right end .2; the three in the middle forward IPv4::
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from machine import clear_offloads
-from pyroute2 import IPRoute
 
 from gdp.host.run_registry import Run
 from lab.machines import Lab
-from lab.namespaces import add_address
 from lab.topology import MIDDLE, ROW, row
 
 NODES: Final = ROW
 _LINKS: Final = len(NODES) - 1
-_FORWARD: Final = Path("/proc/sys/net/ipv4/ip_forward")
 
 
 def address(node: str, towards: str) -> str:
@@ -48,15 +43,11 @@ class Chain(Lab):
     def __init__(self, mtu: int, run: Run) -> None:
         super().__init__(run, row(mtu))
         for node in NODES:
-            self.inside(node, partial(_number, node, self.topology.neighbours(node)))
-
-
-def _number(node: str, neighbours: Iterable[str]) -> None:
-    for other in neighbours:
-        add_address(other, address(node, other))
-        clear_offloads(other)
-    with IPRoute() as here:
-        for network, gateway in routes(node).items():
-            here.route("add", dst=network, gateway=gateway)
-    if node in MIDDLE:
-        _FORWARD.write_text("1", encoding="ascii")
+            neighbours = self.topology.neighbours(node)
+            addresses = [f"addr add {address(node, other)}/24 dev {other}" for other in neighbours]
+            ways = [f"route add {network} via {gateway}" for network, gateway in routes(node).items()]
+            self.namespaces[node].configure([*addresses, *ways])
+            for other in neighbours:
+                self.inside(node, partial(clear_offloads, other))
+        for node in MIDDLE:
+            self.namespaces[node].set("ipv4/ip_forward", 1)

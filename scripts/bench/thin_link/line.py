@@ -16,7 +16,7 @@ from machine import clear_offloads
 
 from gdp.host.run_registry import Run
 from lab.machines import Lab
-from lab.namespaces import add_address, add_neighbour, mac_addresses
+from lab.namespaces import mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions
@@ -118,13 +118,14 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     )
     lab = Lab(run, topology)
     for node, address in ADDRESSES.items():
-        lab.inside(node, partial(add_address, LINE, address))
+        lab.namespaces[node].configure([f"addr add {address}/24 dev {LINE}"])
         _set_tcp_control(lab, node, tcp_control)
         lab.inside(node, partial(clear_offloads, LINE))
         lab.inside(LINE, partial(clear_offloads, node))
     macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
     for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
-        lab.inside(node, partial(add_neighbour, LINE, ADDRESSES[other], macs[other]))  # no ARP crosses the link
+        far = f"{ADDRESSES[other]} lladdr {macs[other].hex(':')}"
+        lab.namespaces[node].configure([f"neigh add {far} dev {LINE} nud permanent"])  # no ARP crosses the link
     return lab
 
 

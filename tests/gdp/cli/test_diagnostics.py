@@ -261,12 +261,13 @@ def test_statistics_of_silence_have_no_times() -> None:
 def test_branches_below_are_indented() -> None:
     below: dict[str, Any] = {"state": "answered", "branches": [{"port": "p", "label": "robot"}]}
     hop = {"hop": 1, "state": "silent", "branches": [{"port": "q", "label": "nuc2", "rtt_us": 250, "below": below}]}
+    below["branches"][0]["kbit_s"] = 420
     path = {"right": "serve", "node": ROBOT, "answered": False, "hops": [hop]}
     assert list(path_lines("/echo", path)) == [
         "/echo, served by aaa…aaa, which does not answer",
         "  1  no answer",
         "       tree -> q nuc2 0.25 ms",
-        "           tree -> p robot",
+        "           tree -> p robot, messages for 420 kbit/s",
     ]
 
 

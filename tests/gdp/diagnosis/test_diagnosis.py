@@ -53,6 +53,15 @@ def test_the_reader_that_governs_a_topic_is_named_with_its_path(side: str) -> No
     assert named in answer.sentence
 
 
+def test_messages_for_faster_readers_only_are_no_fault_and_the_switch_that_left_them_out_is_named() -> None:
+    flow = replace(FLOW, received=10, idle_s=0.03, lost={"thinned": 30})
+    switch = SwitchFacts(name=SWITCH, drops={"thinned": 31})
+    answer = diagnose(facts(flow=flow, switches=(replace(switch, name=NEAR, is_near=True, drops={}), switch)))
+    assert answer.cause is Cause.ARRIVES
+    named = f"30 of 40 messages went to faster readers only, left out at switch {Name.from_text(SWITCH).short}"
+    assert named in answer.sentence
+
+
 EXPOSED: Final = replace(FLOW, side="expose", messages=8, sent=8, readers=1, mtu=1_500)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from fog.plan.trace import (
+from spot_trace import (
     Trace,
     none_up,
     outages,
@@ -14,6 +13,7 @@ from fog.plan.trace import (
     share_with_interval,
     times_independent,
 )
+
 from gdp.errors import LocalError
 
 
