@@ -55,9 +55,8 @@ class DueQueue(Generic[K]):
         entry = self._entries.get(key)
         if entry is None or entry[_DUE] == NEVER_S:
             self._waiting += 1
-            self._entries.pop(key, None)  # the order is that in which keys began to wait
-            if entry is not None:
-                self._entries[key] = entry
+            if entry is not None:  # the order is that in which keys began to wait
+                self._entries[key] = self._entries.pop(key)
         if entry is None or at_s < entry[_PLACE]:
             if entry is not None:
                 entry[_DUE] = _VOID

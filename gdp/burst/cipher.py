@@ -80,7 +80,6 @@ class MessageCipher:
             signature_bytes: that the caller appends to the last frame.
         """
         frames: list[bytes] = []
-        payloads: list[bytes] = []
         header, additional, size = bytearray(head), bytearray(), -1
         encrypt, last = self._aead.encrypt, int.from_bytes(head[PARTS_AT:INCARNATION_AT], "big") - 1
         for part, at in zip(range(first, end), count(first * capacity - len(prefix), capacity), strict=False):
@@ -95,10 +94,9 @@ class MessageCipher:
             else:
                 _PART.pack_into(additional, PART_AT - 1, part)
             payload = encrypt(header[NUMBER_AT:PACE_AT], plain, additional)
-            payloads.append(payload)
             frames.append(bytes(header) + payload)
-        if running is not None:
-            running.update(b"".join(payloads))
+            if running is not None:
+                running.update(payload)
         return frames
 
     def open(self, frame: bytes, end: int, /) -> tuple[bytes, bytes] | None:

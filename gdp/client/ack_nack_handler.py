@@ -104,7 +104,7 @@ class AckNackHandler:
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
         reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
-        if acknack.sequence >= queue.sent_sequence:
+        if sequence > ledger.last or acknack.sequence >= queue.sent_sequence:
             return
         sent, _ = queue.sent
         is_stuck = now_s - reader.advanced_s >= READER.refresh_s

@@ -78,17 +78,18 @@ class AckNackSchedule:
         """
         number, data = header.number, self._data
         if header.parts == 1 and number == highest + 1 == expected and self.due_s <= now_s + REPORT_DELAY_S:
-            if self._unreported_bytes >= _FIRST_BYTES and self._is_owed():
+            if self._is_owed():
                 self.due_s = now_s
             return  # a complete message in order changes nothing else
         is_next = number == highest or (number == highest + 1 and (highest < expected or data.is_finished(highest)))
-        is_in_order = is_next and (data.is_finished(number) or header.part == data.progress(number) - 1)
+        is_done = header.parts == 1 or data.is_finished(number)
+        is_in_order = is_next and (is_done or header.part == data.progress(number) - 1)
         if self._is_owed():
             due_s = now_s
         elif not is_in_order:
             due_s = now_s + REPORT_GAP_S
         else:
-            due_s = now_s + (REPORT_DELAY_S if data.is_finished(number) else REPORT_PAUSE_S)
+            due_s = now_s + (REPORT_DELAY_S if is_done else REPORT_PAUSE_S)
         self.due_s = min(self.due_s, due_s)
 
     def start_report(self) -> None:
@@ -110,6 +111,8 @@ class AckNackSchedule:
         A writer's congestion window has grown by what was reported since the last loss, and must never run empty. At
         first the writer knows nothing of the path, and two frames are enough.
         """
+        if self._unreported_bytes < _FIRST_BYTES:
+            return False
         first_bytes = max(self._total_bytes // 8, _FIRST_BYTES)
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
         return self._unreported_bytes >= min(first_bytes, every_bytes)

@@ -120,7 +120,8 @@ class Protection:
         paths, parity, again = self._paths, self.parity, 0
         is_doubled, self.has_more = not self._has_one_path and paths.is_doubled(now_s), False
         before, sent, after = list[bytes](), list[bytes](), list[bytes]()
-        paths.paces.begin_turn()
+        if paths.paces.stated:
+            paths.paces.begin_turn()
         if limit_bytes > 0:
             left = limit_bytes // ((self._queue.mtu or MTU_MIN_BYTES) * (2 if is_doubled else 1)) or 1
             if parity.waiting:

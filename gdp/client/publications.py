@@ -186,8 +186,7 @@ class Publications:
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
         publisher.receive_acknack(header, frame, now_s, waited_s)
-        self.scheduler.add(publisher)
-        self.scheduler.resume()  # the path may carry frames of other publishers, too
+        self.scheduler.add(publisher)  # with it those that wait for the same path
 
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
@@ -231,8 +230,9 @@ class Publications:
     def next_due(self) -> float:
         """Return the monotonic second of the next timer; infinity: none."""
         timers = self._timers
-        timer_s = timers.next_due() if timers.touched else timers.due_s
-        due_s = min(timer_s, self._reader_paths.due_s, self.scheduler.due_s)
+        due_s = timers.next_due() if timers.touched else timers.due_s
+        for each_s in (self._reader_paths.due_s, self.scheduler.due_s):
+            due_s = each_s if each_s < due_s else due_s
         for requests in self.holding:
             due_s = min(due_s, requests.get_timer())
         return due_s

@@ -244,7 +244,8 @@ class Publisher:
         Returns:
             whether something has to be sealed again for it.
         """
-        mtu = self.queue.mtu = max(mtu, MTU_MIN_BYTES)
+        mtu = max(mtu, MTU_MIN_BYTES)
+        self.queue.set_mtu(mtu)
         self.matched.is_reachable = True
         self._node_paths.tree_stands(self.matched.active, mtu)
         self.protection.late.drop_larger(mtu)
@@ -317,7 +318,7 @@ class Publisher:
         self._handle_pace(source, report, now_s)
         if self._fastest_governs:
             self._window.governing = next(iter(self.governing_paths.fastest()), None)
-        path = self._node_paths.get(source)
+        path = self._node_paths.get(source) if report.missing else None  # repairs alone need its round trip
         trip_s = 0.0 if path is None else path.trip_s
         self.acknowledgements.handle_acknack(source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
         if report.missing:
@@ -389,6 +390,7 @@ class Publisher:
             heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
-        if queue.is_empty:
-            self.governing_paths.paces.slowing.blocks.clear()  # all that is published leaves in time
+        slowing = self.governing_paths.paces.slowing
+        if slowing.blocks and queue.is_empty:
+            slowing.blocks.clear()  # all that is published leaves in time
         return frames

@@ -72,9 +72,9 @@ class ReaderPaces:
         """Note the pace in a report, and follow the path's rate; return whether the reader is to be given another."""
         if pace < PACE_MAX:
             self.stated[name] = pace
-        else:
+        elif self.stated:
             self.stated.pop(name, None)
-        given, path = self._given.get(name), self._paths.get(name)
+        given, path = self._given.get(name), self._paths.get(name) if self._given else None
         if given is None or path is None:
             return pace != PACE_MAX
         model = path.controller.model

@@ -78,8 +78,8 @@ class Reception:
         for writer_proxy in timers.poll_due(now_s) if timers.touched or now_s >= timers.due_s else ():
             writer_proxy.handle_timer(now_s)
             self.reporting[writer_proxy] = None
-            subscription = self._subscriptions.get(writer_proxy.topic)
-            if subscription is not None:  # it may have gone on without what is lost
+            subscription = self._subscriptions.get(writer_proxy.topic) if writer_proxy.delivery.ready else None
+            if subscription is not None:  # it has gone on without what is lost
                 self.messages += subscription.poll_messages(writer_proxy.publisher)
 
     def report(self, now_s: float) -> None:

@@ -74,10 +74,8 @@ class SendQueue:
         self.next_number = past.next_number
         self.ledger = Ledger(past.sequence)
         self.awaited = 0
-        self._note_depth(settings.depth)
         self.mtu: int | None = None
-        self._frame_capacity = (-1, 0)  # an MTU, and the bytes of the messages that one frame carries
-        self.bundle_bytes = BUNDLE_BYTES
+        self._note_depth(settings.depth)
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
         self.deferred = DeferredMessages(self.ledger)
@@ -164,7 +162,7 @@ class SendQueue:
         gathered = self._gathered
         if self.deferred.waiting:
             self.seal_deferred()
-        if self.depth or not gathered.is_small(message, self._bundle_capacity()):
+        if self.depth or not gathered.is_small(message, self.bundle_bytes):
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s)
             self.ledger.next(added_s)
@@ -198,6 +196,15 @@ class SendQueue:
         reliable, urgent = self._settings.reliable, self._settings.urgent
         self.is_acknowledged = reliable or depth > 0
         self.flags = _RELIABLE * reliable | _LATCHED * (depth > 0) | _URGENT * urgent
+        self.bundle_bytes = BUNDLE_BYTES
+        if not self.is_acknowledged and self.mtu is not None:  # one frame: the loss of one loses the whole bundle
+            self.bundle_bytes = min(BUNDLE_BYTES, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
+
+    def set_mtu(self, mtu: int) -> None:
+        """Set how many bytes each frame may have, from the header on."""
+        if mtu != self.mtu:
+            self.mtu = mtu
+            self._note_depth(self.depth)
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
@@ -298,20 +305,9 @@ class SendQueue:
         self.drops[DropReason.NO_READER] += len(self._gathered.messages) + deferred
         self._gathered, self._best_effort = Gathered(), BestEffortQueue(self.options.deadline_s)
 
-    def _bundle_capacity(self) -> int:
-        """Return the largest bundle in bytes.
-
-        On a best-effort topic it is one frame, because the loss of one fragment loses the whole bundle.
-        """
-        if self.is_acknowledged or self.mtu is None:
-            return self.bundle_bytes
-        if self._frame_capacity[0] != self.mtu:
-            self._frame_capacity = self.mtu, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES
-        return min(self.bundle_bytes, self._frame_capacity[1])
-
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(self._bundle_capacity())
+        first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(self.bundle_bytes)
         count = len(together)
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
 

@@ -115,11 +115,12 @@ class SentFrames:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
         if again:
-            for run in self._of_one_pace(frames[:again]):
+            for run in self._of_one_pace(frames[:again]) if self._paces else (frames[:again],):
                 self._add(run, names, now_s, is_repair=True)
             frames = frames[again:]
-        for run in self._of_one_pace(frames):
-            self._add(run, names, now_s, is_repair=False)
+        if frames:
+            for run in self._of_one_pace(frames) if self._paces else (frames,):
+                self._add(run, names, now_s, is_repair=False)
         if not readers or (frames and len(self._runs) > _MESSAGES_MAX):
             self._forget_places()
 
@@ -150,10 +151,7 @@ class SentFrames:
                 paths.leaving.append(record)
 
     def _of_one_pace(self, frames: Sequence[bytes]) -> Iterator[Sequence[bytes]]:
-        """Yield runs of frames that state one pace; without readers that have one, all together."""
-        if not self._paces and frames:
-            yield frames
-            return
+        """Yield runs of frames that state one pace."""
         begin = 0
         for end in range(1, len(frames) + 1):
             if end == len(frames) or frames[end][PACE_AT] != frames[begin][PACE_AT]:
@@ -240,14 +238,15 @@ class SentFrames:
             return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
-        new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
+        new_lost = max(lost - reader.lost, 0)
+        reader.lost += new_lost
         frames = sum(flight.frames for flight in confirmed) if self._paces else reader.resolved - before
         judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost) if self._counts_losses else 0
         is_unproven = judged > new_lost
         if is_unproven and held_s is not None:
             held_s = waited_s  # nor is it believed how long it held its report
         path.handle_held(acknack.held_us / 1e6)
-        path.acknowledged(confirmed, max(min(judged, frames - 1), 0), held_s, now_s)
+        path.acknowledged(confirmed, max(min(judged, frames - 1), 0) if judged else 0, held_s, now_s)
         return is_unproven
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:

@@ -122,6 +122,7 @@ class WriterProxy:
         self._status = Reassembler(name, partial(opener, Kind.HEARTBEAT), key, budget)
         self.schedule = AckNackSchedule(self._data, now_s)
         self._copies: SecondCopies | StripedPaths | None = None
+        self._striped: StripedPaths | None = None  # the same, of a publisher that stripes
         self._deferred = DeferredRequests()
         self._late = LateRepairs(self._data, self._lag_s, self.recovery.awaited_s)
         self.delivery = Delivery(
@@ -147,15 +148,14 @@ class WriterProxy:
         """Return over how many paths frames of this publisher come, and reports to it go."""
         if self._copies is None:
             return 1
-        return SPREAD if isinstance(self._copies, StripedPaths) else 2
+        return 2 if self._striped is None else SPREAD
 
     @paths.setter
     def paths(self, paths: int) -> None:
         """Set over how many paths frames come and reports go."""
         if paths != self.paths:
-            self._copies = None
-            if paths > 1:
-                self._copies = StripedPaths() if paths == SPREAD else SecondCopies()
+            self._striped = StripedPaths() if paths == SPREAD else None
+            self._copies = SecondCopies() if paths > 1 and self._striped is None else self._striped
             self._data.copies, self._status.copies = self._copies, SecondCopies() if paths > 1 else None
 
     @property
@@ -202,9 +202,9 @@ class WriterProxy:
         if taken:
             header, last = decode(arrivals[at].frame), arrivals[at + taken - 1]
             number, part = header.number, header.part + taken - 1
-            if isinstance(self._copies, StripedPaths):
+            if self._striped is not None:
                 second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
-                self._copies.handle_arrivals(number, taken - second, second, now_s)
+                self._striped.handle_arrivals(number, taken - second, second, now_s)
             self.recovery.keep_run(arrivals, at, taken, now_s)
             samples = burst.samples(arrivals, at, taken)
             is_in_order = self._data.progress(number) > part
@@ -265,7 +265,7 @@ class WriterProxy:
         schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
         expected = self.delivery.expected
         part, sequence = self._data.progress(expected), self.delivery.sequence
-        share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
+        share = 0 if self._striped is None else self._striped.poll_share()
         flags = AckNackFlag.NONE
         if self.pace < PACE_MAX:
             flags, share = AckNackFlag.PACED, self.pace
@@ -324,9 +324,9 @@ class WriterProxy:
             else:
                 reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
-        striped, is_done = None, False
-        if isinstance(self._copies, StripedPaths):
-            striped, is_done = self._copies, reassembler.window.is_finished(header.number)
+        striped, is_done = self._striped, False
+        if striped is not None:
+            is_done = reassembler.window.is_finished(header.number)
         is_whole = header.parts == 1
         seen, highest = reassembler.new_parts, reassembler.highest
         refused = 0 if is_whole else reassembler.drops[DropReason.MEMORY_FULL]

@@ -244,14 +244,19 @@ class PathController:
 
     def _note_queue(self, now_s: float) -> None:
         """Signal an empty queue at once."""
+        model = self.model
+        if model.queue_s <= _STANDING_S / 2 or model.queue_s <= self._no_queue_s():
+            self._empty_s = now_s
+            self._signal(Signal.QUEUE_EMPTY, now_s)
+
+    def _no_queue_s(self) -> float:
+        """Return up to which standing queue, in seconds, the path counts as empty."""
         model, frames_s = self.model, max(self.model.bytes_s / self._mtu, 1.0)
         # the base may be that of a short frame: what a full one takes to leave is no queue
         # and the least window of a lone flow on a thin path is no queue of another one
         most_s = max(_WANTED_MOST_S, _LEAST_FRAMES * self._mtu / (model.capacity_bytes_s or float("inf")))
         wanted_s = min(_wanted_frames(frames_s) / frames_s, most_s) + 1 / frames_s
-        if model.queue_s <= max(_EMPTY_SHARE * (model.highest_s - model.base_rtt_s), wanted_s, _STANDING_S / 2):
-            self._empty_s = now_s
-            self._signal(Signal.QUEUE_EMPTY, now_s)
+        return max(_EMPTY_SHARE * (model.highest_s - model.base_rtt_s), wanted_s)
 
     def _adapt(self, size: int, newest: Flight, now_s: float) -> None:
         """Change the window by what one acknowledgement allows."""

@@ -96,5 +96,6 @@ class PathModel:
 
     def add_loss(self, frames: int, lost: int) -> None:
         """Average the share of lost frames over about ``_LOSS_FRAMES``."""
-        part = min(frames / _LOSS_FRAMES, 1.0)
-        self.loss += (lost / max(frames, 1) - self.loss) * part
+        if lost or self.loss:
+            part = min(frames / _LOSS_FRAMES, 1.0)
+            self.loss += (lost / max(frames, 1) - self.loss) * part

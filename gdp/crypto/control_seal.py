@@ -38,7 +38,6 @@ from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 
-_NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
 _LENGTH_AND_NUMBER: Final = struct.Struct("!HQ")
 # numbers between two messages that arrive together; the writer proxies of a reader share its numbers
@@ -122,7 +121,7 @@ class ControlOpener:
         """Return the body of a control message. Raises ``EnvelopeError``: BAD_TAG, altered or under another key."""
         sealed = frame[_BODY_AT : HEADER_BYTES + header.length]
         try:
-            return self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)
+            return self._aead.decrypt(frame[NUMBER_AT:PACE_AT], sealed, authenticated(frame) + self._context)
         except (InvalidTag, ValueError):  # ValueError: shorter than a tag
             raise EnvelopeError(DropReason.BAD_TAG, "note") from None
 

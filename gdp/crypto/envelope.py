@@ -31,7 +31,18 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from gdp import burst
 from gdp.burst.cipher import BODY_AT, SALT_BYTES, TAG_BYTES, MessageCipher
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.codec import HEADER_BYTES, INCARNATION_AT, NUMBER_AT, PACE_AT, Header, encode
+from gdp.frame.codec import (
+    FLAGS_AT,
+    HEADER_BYTES,
+    HOPS_AT,
+    INCARNATION_AT,
+    LENGTH_AT,
+    NUMBER_AT,
+    PACE_AT,
+    PART_AT,
+    Header,
+    encode,
+)
 from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
@@ -58,8 +69,6 @@ SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
 _LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a microsecond each
-_SHARED: Final = struct.Struct("!2sBxH2xQ4x84s")  # of a frame: without hops left, payload length and part
-_HASHED: Final = struct.Struct("!13s2sBHQ84s")
 SHARED_FLAGS: Final = 0xFF & ~_LAST  # of all parts of a message
 _NUMBERS: Final = struct.Struct("!QII")  # of message, part and parts
 _KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
@@ -111,7 +120,7 @@ class MessageKeys:
 
     def of(self, salt: bytes) -> bytes:
         """Return the key of a salt of up to 12 bytes: the first half of XAES's nonce, padded with zeros."""
-        first = int.from_bytes(salt, "big") << 8 * (12 - len(salt))
+        first = int.from_bytes((salt + bytes(12))[:12], "big")
         return self._encrypt(((first << 128 | first) ^ self._mask).to_bytes(32, "big"))
 
 
@@ -130,8 +139,9 @@ def fragment_capacity(mtu: int) -> int:
 
 def digest_of(frame: bytes) -> hashlib._Hash:
     """Return the running SHA-256 of a message, fed with what all its parts share: header fields and salt."""
-    kind, flags, epoch, number, others = _SHARED.unpack_from(frame)
-    return burst.DIGEST(_HASHED.pack(b"gdp-message-2", kind, flags & SHARED_FLAGS, epoch, number, others))
+    flags = bytes([frame[FLAGS_AT] & SHARED_FLAGS])
+    before, number = frame[:FLAGS_AT] + flags + frame[HOPS_AT + 1 : LENGTH_AT], frame[NUMBER_AT:PART_AT]
+    return burst.DIGEST(b"gdp-message-2" + before + number + frame[PACE_AT:BODY_AT])
 
 
 class Sealer:
@@ -336,7 +346,7 @@ class Opener:
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
         salt = frame[HEADER_BYTES:BODY_AT]
-        cipher = self.cipher_of(salt)
+        cipher = self.cipher_of(salt) if header.parts > 1 else burst.CIPHER(self._keys.of(salt))
         opened = cipher.open(frame, sealed_end)
         if opened is None:
             raise EnvelopeError(DropReason.BAD_TAG)

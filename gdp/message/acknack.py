@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, FrameError
 from gdp.limits import NACKS_PER_REPORT
+from gdp.sansio import new_tuple
 
 _HEAD: Final = struct.Struct("!BBQIQQIQIIIQH")
 _HEAD_BYTES: Final = _HEAD.size
@@ -95,4 +96,4 @@ class AckNack(NamedTuple):
         ranges: tuple[MissingRange, ...] = ()
         if count:
             ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD_BYTES:]))
-        return cls(_FLAGS[flags], number, part, ranges, sequence, lost, share, *path)
+        return new_tuple(cls, (_FLAGS[flags], number, part, ranges, sequence, lost, share, *path))

@@ -31,7 +31,7 @@ from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.replay import ReplayWindow
 from gdp.message.second_copies import REPEATED_PARTS_MAX, RepeatedFrames, SecondCopies
 from gdp.message.striping import StripedPaths
-from gdp.sansio import ReceivedFrame
+from gdp.sansio import ReceivedFrame, new_tuple
 
 ALL_PARTS = 0xFFFF_FFFF
 _URGENT = int(Flag.URGENT)  # a plain number: an IntFlag's operators cost a microsecond each
@@ -194,8 +194,8 @@ class Reassembler:
         if self.window.is_finished(number):
             self.drop_copy(header, DropReason.LATE, now_s)
             return None
-        message, salt = self._unfinished.get(number), salt_of(frame)
-        is_same = message is not None and message.parts == header.parts and message.salt == salt
+        message = self._unfinished.get(number)
+        is_same = message is not None and message.parts == header.parts and message.salt == salt_of(frame)
         if is_same and message is not None and (header.part < message.hashed or header.part in message.early):
             self.drop_copy(header, DropReason.DUPLICATE, now_s)
             return None
@@ -241,14 +241,8 @@ class Reassembler:
         elif header.flags & _URGENT:
             self.repeats.handle_first(number, 0, now_s)
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
-        return ReassembledMessage(
-            number=number,
-            flags=header.flags & SHARED_FLAGS,
-            message=message,
-            parts=1,
-            hops=max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0),
-            head=head,
-        )
+        hops = max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0)
+        return new_tuple(ReassembledMessage, (number, header.flags & SHARED_FLAGS, message, 1, hops, head))
 
     def _start(self, header: Header, frame: bytes, opener: Opener, now_s: float) -> _PartialMessage:
         """Return a new partial message; it replaces one with another number of fragments, or another salt."""

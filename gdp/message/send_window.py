@@ -122,7 +122,8 @@ class SendWindow:
             if oldest >= self.readers.least():
                 evicted.append(oldest)
             self._release([oldest])
-        self.evicted += len(evicted)
+        if evicted:
+            self.evicted += len(evicted)
         self._newest = number
         self.cache.add(number, frames, size, self._now_s if added_s is None else added_s)
         self.unsent.append((number, 0))
@@ -309,10 +310,11 @@ class SendWindow:
             frames += batch
             sent = len(batch)
             limit -= sent
-            self._sent_at += sum(map(len, batch))
             if sent == count and part + sent < len(message.frames):
+                self._sent_at += sum(map(len, batch))
                 unsent[0] = (number, part + sent)
             else:
+                self._sent_at = begin_at + message.size
                 unsent.popleft()
         if not unsent:
             self._sent_at = self.cache.end_at
@@ -366,7 +368,8 @@ class SendWindow:
         for number in numbers:
             message = self.cache.remove(number)
             end_at = message.begin_at + message.size
-        self._cancelled.difference_update(numbers)
+        if self._cancelled:
+            self._cancelled.difference_update(numbers)
         self._sent_at = end_at if end_at > self._sent_at else self._sent_at
         while self.unsent and self.unsent[0][0] <= numbers[-1]:
             self.unsent.popleft()
