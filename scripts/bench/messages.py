@@ -13,8 +13,8 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py --load half         # other processes take half of each core
 
 Messages are CDR, and go one at a time, as in a control loop; no device has offloads. A figure of a round is the median
-(or p99) of its messages. Only the whole bench writes under docs/benchmarks by itself; a part of it writes to the paths
-of --json and --plot.
+(or p99) of its messages. Only the whole bench writes under docs/benchmarks by itself; a part of it writes to the path
+of --json.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def main() -> None:
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
     parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
     options = parse(parser)
-    options.no_plot |= options.plot is None and not is_whole(options)
+    options.no_plot |= not is_whole(options)
     options.is_whole = is_whole
     perform(options, measure)
 

@@ -10,7 +10,6 @@ import``.
         for baseline in baselines:
             progress(f"round {number + 1}/{rounds}: {baseline}")
             over.add(baseline, "1400 B, 3 switches", "frames/s", 450_000.0)      # None: it could not be measured
-    over.absent("kernel", "no CAP_BPF")                              # is shown as "not here: no CAP_BPF"
     over.spread("kernel", "1400 B, 3 switches", "frames/s")          # Spread(median, low, high) | None
     target = over.ratio("kernel / bridge, frames/s", "kernel", "bridge", "1400 B, 3 switches", "frames/s", 1.3)
     show(title, state, settings, over, [target, ...])                  # tables, ratio lines
@@ -98,15 +97,10 @@ class Rounds:
     """Figures of a bench: baseline, case, column (figure and unit), one value a round."""
 
     values: dict[str, dict[str, dict[str, list[float | None]]]] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
 
     def add(self, contender: str, case: str, column: str, value: float | None) -> None:
         """Add the value of the next round; None for one that failed."""
         self.values.setdefault(contender, {}).setdefault(case, {}).setdefault(column, []).append(value)
-
-    def absent(self, contender: str, reason: str) -> None:
-        """Record why a baseline does not take part."""
-        self.reasons[contender] = reason
 
     def column(self, contender: str, case: str, column: str) -> list[float | None]:
         """Return one value a round."""
@@ -150,8 +144,6 @@ class Rounds:
         return [None if a is None or b is None else of(a, b) for a, b in pairs]
 
     def _why_not(self, contender: str, case: str) -> str:
-        if contender in self.reasons:
-            return f"{contender} is not here: {self.reasons[contender]}"
         return "" if case in self.values.get(contender, {}) else f"{contender} was not asked for"
 
 
@@ -228,8 +220,6 @@ def show(title: str, state: MachineState, settings: Settings, over: Rounds, targ
                 spreads = (over.spread(contender, case, column) for column in columns)
                 table.add_row(contender + state.mark, *("-" if spread is None else str(spread) for spread in spreads))
         console.print(table)
-    for contender, reason in over.reasons.items():
-        console.print(f"{contender} - not here: {reason}", markup=False, highlight=False, soft_wrap=True)
     for target in targets:
         console.print(str(target), markup=False, highlight=False, soft_wrap=True)
 
@@ -261,7 +251,6 @@ def write_json(
         "settings": dict(settings),
         "rounds": {**held["rounds"], **over.values},
         "measured": {**held.get("measured", {}), **dict.fromkeys(over.values, stamp)},
-        "not_here": over.reasons,
         "targets": [
             *(target for target in held["targets"] if target["what"] not in new),
             *({**asdict(target), "met": target.met} for target in targets),

@@ -3,8 +3,8 @@
 A robot behind a home NAT publishes 100 bytes a hundred times a second; a server behind another NAT reads. Both know one
 border only, and open a direct tunnel. The silence of an event is the longest time between two messages at the reader,
 from the event until half a second after the flow came back. It includes the commands of the laboratory that make the
-event, whose time is a column of its own: another address is set by netlink at once, another network or public address
-takes several programs.
+event, whose time is a column of its own: another address is set by one program, another network or public address by
+several.
 
     sudo .venv/bin/python scripts/bench/roaming.py                  # writes docs/benchmarks/roaming.json
     sudo .venv/bin/python scripts/bench/roaming.py --rounds 3 --no-save

@@ -41,7 +41,7 @@ class Outcome:
     Attributes:
         name: of the record, and of its files below ``docs/benchmarks``.
         panels: makes the picture; only called when it is drawn.
-        is_whole: False where only ``--json`` and ``--plot`` write files.
+        is_whole: False where only ``--json`` writes a file.
         keeps_rows: rows of an earlier record that were not measured now are kept.
         has_failed: ends the command with 1.
     """
@@ -113,7 +113,7 @@ def command_line(
         seconds: default of ``--seconds``; None: no such option.
         quick: what ``--quick`` sets; None: no such option.
         has_record: adds ``--json``, ``--no-save``, ``--strict`` and ``--allow-load``.
-        has_plot: adds ``--plot`` and ``--no-plot``.
+        has_plot: adds ``--no-plot``.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if rounds is not None:
@@ -130,7 +130,6 @@ def command_line(
         parser.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
         add_allow_load(parser)
     if has_plot:
-        parser.add_argument("--plot", type=Path, help="where the picture goes (default: docs/benchmarks)")
         parser.add_argument("--no-plot", action="store_true", help="no picture")
     return parser
 
@@ -192,10 +191,10 @@ def perform(options: Options, measure: Callable[[Options], Outcome]) -> None:
 def _require_page(options: Options, state: MachineState) -> None:
     """Refuse to measure for files that could not be written, or not be trusted. Raises ``RefusedError``: such files."""
     is_quick = getattr(options, "quick", False)
-    chosen = [path for path in (getattr(options, "json", None), getattr(options, "plot", None)) if path]
+    chosen: Path | None = getattr(options, "json", None)
     is_whole = getattr(options, "is_whole", None)
-    for folder in [path.parent for path in chosen] or ([] if is_quick else [OUTPUT]):
-        require_writable(folder)
+    if chosen or not is_quick:
+        require_writable(chosen.parent if chosen else OUTPUT)
     if not is_quick and (chosen or is_whole is None or is_whole(options)):
         require_trust(state, allow_load=options.allow_load)
 
@@ -208,11 +207,10 @@ def finish(
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
     own = OUTPUT if outcome.is_whole and not getattr(options, "quick", False) else None
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")
-    picture = getattr(options, "plot", None) or (own and own / f"{outcome.name}.png")
     if is_saved and record:
         write_json(record, outcome.name, state, settings, outcome.rounds, outcome.targets, keeps=outcome.keeps_rows)
-    if is_drawn and picture and outcome.panels is not None:
-        save_bars(picture, outcome.title, str(state), outcome.panels())
+    if is_drawn and own and outcome.panels is not None:
+        save_bars(own / f"{outcome.name}.png", outcome.title, str(state), outcome.panels())
     is_missed = any(target.met is False for target in outcome.targets)
     if outcome.has_failed or (getattr(options, "strict", False) and is_missed):
         sys.exit(1)

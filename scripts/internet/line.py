@@ -18,12 +18,12 @@ import time
 from typing import Final
 
 from fog.providers.local.delay import DelayLine
+from gdp.ports.sockets import large_buffers
 
 log = logging.getLogger(__name__)
 
 _ALL: Final = 3  # ETH_P_ALL
-_SOL_PACKET, _OFFLOAD_HEADER, _IGNORE_OUTGOING, _BUFFER_FORCE = 263, 15, 23, 33
-_BUFFER_BYTES: Final = 16 << 20
+_SOL_PACKET, _OFFLOAD_HEADER, _IGNORE_OUTGOING = 263, 15, 23
 _FRAME_BYTES: Final = (1 << 16) + 64
 _BATCH: Final = 32
 _MS_NS: Final = 1_000_000
@@ -48,11 +48,7 @@ def _open(device: str) -> socket.socket:
     opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
     opened.setsockopt(_SOL_PACKET, _IGNORE_OUTGOING, 1)
     opened.setsockopt(_SOL_PACKET, _OFFLOAD_HEADER, 1)
-    for option in (socket.SO_RCVBUF, _BUFFER_FORCE):
-        try:
-            opened.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
-        except PermissionError:
-            log.warning("a short buffer: not root of the machine device=%s", device)
+    large_buffers(opened)
     opened.bind((device, _ALL))
     opened.setblocking(False)
     return opened
