@@ -354,10 +354,12 @@ class Publisher:
             due_s = min(
                 due_s, protection.late.get_timer(), blocking.get_timer(), self.governing_paths.paces.slowing.get_timer()
             )
-        of_readers = self._window.get_timer(), self.matched.next_silent()
-        if not self.matched.active or self.queue.mtu is None:
-            return min(due_s, *of_readers)
-        return min(due_s, *of_readers, self._heartbeats.get_timer(), protection.copies.due_s)
+        for each_s in (self._window.get_timer(), self.matched.next_silent()):
+            due_s = each_s if each_s < due_s else due_s
+        if self.matched.active and self.queue.mtu is not None:
+            for each_s in (self._heartbeats.get_timer(), protection.copies.due_s):
+                due_s = each_s if each_s < due_s else due_s
+        return due_s
 
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.

@@ -230,7 +230,9 @@ class WriterProxy:
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
         delivery, late, data, status = self.delivery, self._late, self._data, self._status
-        due_s = min(self.schedule.due_s, delivery.gap_until_s, late.due_s, late.hold_s)
+        due_s = self.schedule.due_s
+        for each_s in (delivery.gap_until_s, late.due_s, late.hold_s):
+            due_s = each_s if each_s < due_s else due_s
         if delivery.held:
             due_s = min(due_s, delivery.held[0][0])
         if self.recovery.messages:

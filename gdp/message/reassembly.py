@@ -241,7 +241,8 @@ class Reassembler:
         elif header.flags & _URGENT:
             self.repeats.handle_first(number, 0, now_s)
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
-        hops = max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0)
+        hops = HOPS_MAX - (header.hops_left & HOPS_MASK)
+        hops = hops if hops > 0 else 0  # it states more than a source may
         return new_tuple(ReassembledMessage, (number, header.flags & SHARED_FLAGS, message, 1, hops, head))
 
     def _start(self, header: Header, frame: bytes, opener: Opener, now_s: float) -> _PartialMessage:
