@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -15,10 +16,10 @@ import pytest
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT
 from gdp.frame.kinds import Kind
-from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.name_resolver import PendingFrames
+from gdp.switch.table import Hop
 from gdp.switch.unicast import Unicast
 from lab import simulation as worlds
 from lab.network import SimLink, SimNetwork
@@ -84,27 +85,14 @@ class Ledger(SimNetwork):
 def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
     """Return a growing count of the drops of switches' machines of other kinds than DATA."""
     others: Counter[DropReason] = Counter()
-    find, send = Unicast.forward, Unicast.send
+    send = Unicast._send
 
-    def noted_find(
-        self: Unicast,
-        destination: Name,
-        source: Name,
-        frame: bytes,
-        owner: bytes,
-        now_s: float,
-        until_s: float | None = None,
-    ) -> Name | None:
-        before = self.drops.copy()
-        waits_for = find(self, destination, source, frame, owner, now_s, until_s)
-        if frame[KIND_AT] != Kind.DATA:
-            others.update(self.drops - before)
-        return waits_for
-
-    def noted_send(self: Unicast, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
-        before = self.drops.copy()
-        send(self, frames, destination, source, now_s)
-        others.update(self.drops - before)
+    def noted_send(self: Unicast, hop: Hop | DropReason, frames: Sequence[bytes]) -> None:
+        for frame in frames:
+            before = self.drops.copy()
+            send(self, hop, [frame])
+            if frame[KIND_AT] != Kind.DATA:
+                others.update(self.drops - before)
 
     expire = PendingFrames.expire
 
@@ -117,8 +105,7 @@ def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
         others[DropReason.PENDING_EXPIRED] += before - waiting()
 
     monkeypatch.setattr(PendingFrames, "expire", noted_expire)
-    monkeypatch.setattr(Unicast, "forward", noted_find)
-    monkeypatch.setattr(Unicast, "send", noted_send)
+    monkeypatch.setattr(Unicast, "_send", noted_send)
     return others
 
 
