@@ -74,8 +74,8 @@ class ReaderPaces:
             self.stated[name] = pace
         elif self.stated:
             self.stated.pop(name, None)
-        given, path = self._given.get(name), self._paths.get(name) if self._given else None
-        if given is None or path is None:
+        given = self._given.get(name)
+        if given is None or (path := self._paths.get(name)) is None:
             return pace != PACE_MAX
         model = path.controller.model
         if given.pace < PACE_MAX and given.pace == pace and now_s >= given.since_s + _MOVED_REPORTS * REPORT_DELAY_S:

@@ -75,6 +75,7 @@ class SendQueue:
         self.ledger = Ledger(past.sequence)
         self.awaited = 0
         self.mtu: int | None = None
+        self.bundle_bytes = BUNDLE_BYTES
         self._note_depth(settings.depth)
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
@@ -159,10 +160,10 @@ class SendQueue:
         Raises:
             LocalError: above the limits.
         """
-        gathered = self._gathered
+        gathered, most = self._gathered, self._frame_capacity
         if self.deferred.waiting:
             self.seal_deferred()
-        if self.depth or not gathered.is_small(message, self.bundle_bytes):
+        if self.depth or not gathered.is_small(message, most if most < self.bundle_bytes else self.bundle_bytes):
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s)
             self.ledger.next(added_s)
@@ -196,15 +197,14 @@ class SendQueue:
         reliable, urgent = self._settings.reliable, self._settings.urgent
         self.is_acknowledged = reliable or depth > 0
         self.flags = _RELIABLE * reliable | _LATCHED * (depth > 0) | _URGENT * urgent
-        self.bundle_bytes = BUNDLE_BYTES
+        self._frame_capacity = BUNDLE_BYTES
         if not self.is_acknowledged and self.mtu is not None:  # one frame: the loss of one loses the whole bundle
-            self.bundle_bytes = min(BUNDLE_BYTES, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
+            self._frame_capacity = fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES
 
     def set_mtu(self, mtu: int) -> None:
         """Set how many bytes each frame may have, from the header on."""
-        if mtu != self.mtu:
-            self.mtu = mtu
-            self._note_depth(self.depth)
+        self.mtu = mtu
+        self._note_depth(self.depth)
 
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
@@ -307,7 +307,8 @@ class SendQueue:
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(self.bundle_bytes)
+        most = min(self.bundle_bytes, self._frame_capacity)
+        first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(most)
         count = len(together)
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
 

@@ -127,5 +127,4 @@ class DiagnosticAnswers:
 
 
 def _rate(pace: int) -> Mapping[str, object]:
-    kbit_s = kbit_s_of(pace)
-    return {} if kbit_s is None else {"kbit_s": kbit_s}
+    return {} if (kbit_s := kbit_s_of(pace)) is None else {"kbit_s": kbit_s}

@@ -106,6 +106,19 @@ def test_without_space_for_bundles_each_message_has_its_own_seal() -> None:
     assert end.messages == SMALL[:100]
 
 
+@pytest.mark.parametrize("reliable", [True, False])
+def test_no_other_path_or_depth_brings_bundles_where_there_is_no_space_for_them(reliable: bool) -> None:
+    pipe, (end,) = live(publisher_of(reliable=reliable))
+    pipe.publisher.queue.bundle_bytes = 0
+    pipe.publisher.tree_stands(9_000)
+    pipe.publisher.set_depth(3)
+    pipe.publisher.set_depth(0)
+    publish(pipe.publisher, SMALL[:20])
+    pipe.run(1.0)
+    assert end.numbers == list(range(1, 21))
+    assert end.messages == SMALL[:20]
+
+
 def test_what_waits_for_its_seal_is_not_for_a_reader_that_comes_later() -> None:
     pipe, (end,) = live(publisher_of())
     publish(pipe.publisher, SMALL[:10])
