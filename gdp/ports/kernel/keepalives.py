@@ -12,8 +12,9 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from heapq import heappop, heappush
 from typing import Any, Final
 
@@ -89,6 +90,7 @@ class KeepaliveSessions:
     def __init__(self) -> None:
         self._programs: list[int] = []
         self._maps: list[KernelMap] = []
+        self._ifnames: dict[int, str] = {}  # of ports that have no link yet
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
         self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
@@ -116,7 +118,8 @@ class KeepaliveSessions:
     def close(self) -> None:
         """Detach the program and close everything."""
         for port in list(self._links):
-            self.detach(port)
+            for close in self.detach(port):
+                close()
         for opened in self._programs:
             os.close(opened)
         for each in self._maps:
@@ -124,19 +127,26 @@ class KeepaliveSessions:
         self._programs, self._maps = [], []
 
     def attach(self, port: int, ifname: str) -> None:
-        """Receive keepalives at a device; the node runs the sessions of one that is gone, or not allowed."""
-        try:
-            ifindex = socket.if_nametoindex(ifname)
-            self._links[port] = create_link(self._programs[0], ifindex, TCX_INGRESS), ifindex
-        except (OSError, LocalError) as refused:
-            log.debug("keepalives not in the kernel port=%s reason=%s", ifname, refused)
+        """Allow sessions at a device. The first one attaches the program, which takes the kernel some 15 ms."""
+        self._ifnames[port] = ifname
 
-    def detach(self, port: int) -> None:
-        """Receive no keepalives at a port; its sessions end with the next report."""
-        link, _ = self._links.pop(port, (-1, 0))
-        if link >= 0:
-            os.close(link)
+    def _receives(self, port: int) -> bool:
+        """Return whether keepalives are received at a port; not at a device that is gone, or where it is refused."""
+        ifname = self._ifnames.pop(port, None)
+        if ifname is not None:
+            try:
+                ifindex = socket.if_nametoindex(ifname)
+                self._links[port] = create_link(self._programs[0], ifindex, TCX_INGRESS), ifindex
+            except (OSError, LocalError) as refused:
+                log.debug("keepalives not in the kernel port=%s reason=%s", ifname, refused)
+        return port in self._links
+
+    def detach(self, port: int) -> list[Callable[[], object]]:
+        """Receive no keepalives at a port; its sessions end with the next report. Return what closes its link."""
+        self._ifnames.pop(port, None)
+        link = self._links.pop(port, None)
         self.has_news = self.has_news or any(each[0] == port for each in self._sessions)
+        return [] if link is None else [partial(os.close, link[0])]
 
     # sessions
 
@@ -152,7 +162,7 @@ class KeepaliveSessions:
                 session.offer = session.offer._replace(**_changing(offer))
                 self._configure(session, ports[offer.port].mac)
         for key, offer in wanted.items():
-            if key not in self._sessions and offer.port in self._links and self._free:
+            if key not in self._sessions and self._free and self._receives(offer.port):
                 runs.append(self._begin(key, offer, ports[offer.port].mac))
         return runs
 

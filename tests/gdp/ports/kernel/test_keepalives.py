@@ -67,6 +67,7 @@ def sessions() -> Iterator[KeepaliveSessions]:
         pytest.skip(str(error).partition("\n")[0])
     made._links[0] = -1, LOOPBACK
     yield made
+    made.detach(0)
     made.close()
 
 
@@ -155,6 +156,7 @@ def twin() -> Iterator[KeepaliveSessions]:
         pytest.skip(str(error).partition("\n")[0])
     made._links[0] = -1, LOOPBACK
     yield made
+    made.detach(0)
     made.close()
 
 
