@@ -12,11 +12,7 @@ from collections.abc import Mapping
 from io import BytesIO, FileIO, StringIO
 from typing import BinaryIO, Final
 
-from rosbags.rosbag2.metadata import dump_qos_v9
-from ruamel.yaml import YAML
-
 from proxy.endpoints.core.endpoint import Origin
-from proxy.recordings.channels import to_qos
 from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD, RECORD, Opcode
 from proxy.serial.channel import Channel, DefinitionFormat
 
@@ -183,6 +179,11 @@ def _map(items: Mapping[str, str]) -> bytes:
 def _offered(channel: Channel) -> str:
     if not channel.qos:
         return ""
+    from rosbags.rosbag2.metadata import dump_qos_v9  # it loads all readers of rosbags
+    from ruamel.yaml import YAML
+
+    from proxy.recordings.channels import to_qos
+
     stream = StringIO()
     yaml = YAML(typ="safe")
     yaml.default_flow_style = False
