@@ -11,21 +11,22 @@ import contextlib
 import fcntl
 import logging
 import os
+import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Origin
-from proxy.recordings.mcap_writer import McapWriter
+from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
 
 if TYPE_CHECKING:
-    from proxy.recordings.ros1_writer import Ros1Writer
+    from rosbags.interfaces import Connection
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,7 @@ _STAMPS_NS: Final = {1: (1 << 32) * 1_000_000_000, 2: 1 << 63}
 _CONNECTIONS_MAX: Final = 4_096  # each is kept, with its definition, until the file is finished
 _DEFINITIONS_MAX_BYTES: Final = 64 << 20
 _SPARE_BYTES: Final = 256 << 10  # of the disk, for what others write meanwhile and for the file system's own blocks
+_ANY_MD5: Final = "*"  # ROS 1's own value for an unknown one
 
 
 class BagWriter(ClosedOnExit):
@@ -59,7 +61,9 @@ class BagWriter(ClosedOnExit):
         _refuse_existing(self.path)
         try:
             _put_aside(self.partial)
-            self._format = _ros1_writer(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
+            self._format: McapWriter | _Ros1Format = (
+                _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
+            )
             fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _sync(self.path.parent)
         except OSError as error:
@@ -168,10 +172,68 @@ class BagWriter(ClosedOnExit):
         raise LocalError(failure)
 
 
-def _ros1_writer(path: Path) -> McapWriter | Ros1Writer:
-    from proxy.recordings.ros1_writer import Ros1Writer  # it loads rosbags' readers, too
+class _Ros1Format:
+    """A ROS 1 bag in progress, written by rosbags."""
 
-    return Ros1Writer(path)
+    def __init__(self, path: Path) -> None:
+        from rosbags.rosbag1 import Writer, WriterError  # a recorder of ROS 2 needs no module of rosbags
+
+        self._refused = WriterError, AssertionError
+        self._writer = Writer(path)
+        self._writer.chunk_threshold = sys.maxsize  # chunks are written here
+        self._writer.open()
+        if self._writer.bio is None:
+            raise LocalError(f"{path}: rosbags did not open it")
+        self.file: BinaryIO = self._writer.bio
+        self._connections: list[Connection] = []
+        self._definitions_bytes = 0
+        self._torn: OSError | None = None  # a chunk was written in part
+        self._pending = 0
+        self.written = 0
+
+    @property
+    def unwritten_bytes(self) -> int:
+        indexed = 12 * self._pending + 8 * len(self._connections)
+        chunks = len(self._writer.chunks) * (128 + 8 * len(self._connections))
+        return self._writer.chunks[-1].data.tell() + indexed + chunks + self._definitions_bytes + 8_192
+
+    def connect(self, channel: Channel) -> None:
+        self._definitions_bytes += len(channel.definition) + 1_024
+        try:
+            connection = self._writer.add_connection(
+                channel.topic,
+                channel.type_name,
+                msgdef=channel.definition,
+                md5sum=channel.hash or _ANY_MD5,
+                callerid=channel.callerid,
+                latching=1 if channel.latched else None,
+            )
+        except self._refused as error:
+            raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
+        self._connections.append(connection)
+
+    def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
+        del origin
+        self._writer.write(self._connections[number], stamp_ns, raw)
+        self._pending += 1
+        if self._writer.chunks[-1].data.tell() > CHUNK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        try:
+            self._writer.write_chunk(self._writer.chunks[-1])
+            self.file.flush()
+        except OSError as error:
+            self._torn = error
+            raise
+        self.written += self._pending
+        self._pending = 0
+
+    def finish(self) -> None:
+        if self._torn is not None:
+            raise self._torn
+        self.flush()
+        self._writer.close()
 
 
 def _refuse_existing(path: Path) -> None:

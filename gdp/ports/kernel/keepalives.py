@@ -34,7 +34,7 @@ from gdp.ports.kernel.keepalive_program import (
 from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.program import LICENCE
 from gdp.ports.kernel.sha256 import BLOCK_BYTES
-from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load_program
+from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRead, PreparedRun, create_link, load_program
 from gdp.ports.plane import Port
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 
@@ -92,6 +92,7 @@ class KeepaliveSessions:
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
         self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
+        self._reader: PreparedRead | None = None  # of the states of slots in use
         self._report_at_s = NEVER_S
         self._late_s = 0.0
         self._send_at_s, self._together_s = NEVER_S, 0.0
@@ -167,7 +168,7 @@ class KeepaliveSessions:
         self._states.put(_NUMBER.pack(slot), state)
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
-        self._sessions[key] = session
+        self._sessions[key], self._reader = session, None
         now_s = time.monotonic()
         self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
         self._plan(now_s)
@@ -186,13 +187,17 @@ class KeepaliveSessions:
         self._ends.remove(session.end)
         run = self._report(session, self._read()[session.slot])._replace(is_over=True)
         del self._sessions[key]
+        self._reader = None
         heappush(self._free, session.slot)
         self._plan(time.monotonic())
         return run
 
     def _read(self) -> list[tuple[Any, ...]]:
-        count = max((each.slot for each in self._sessions.values()), default=-1) + 1
-        return list(_STATE.iter_unpack(self._states.read_array(count)))
+        if self._reader is None:
+            count = max(each.slot for each in self._sessions.values()) + 1
+            self._reader = PreparedRead(self._states.fd, _STATE.size, count)
+        self._reader()
+        return list(_STATE.iter_unpack(self._reader.values))
 
     def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
@@ -214,12 +219,13 @@ class KeepaliveSessions:
             self._late_s = max(self._late_s, now_s - self.due_s)
             self.has_news = True
         sessions = self._sessions.values()
-        if self._send_at_s <= now_s:
+        is_sending = self._send_at_s <= now_s
+        if is_sending:
             until_s = now_s + self._together_s
             for session in sessions:
                 if session.send_at_s <= until_s:
                     self._send(session, now_s)
-        else:
+        if not is_sending or any(each.heard_s + each.offer.suspect_s <= now_s for each in sessions):
             states = self._read()
             for session in sessions:
                 session.heard_s = states[session.slot][3] * 1e-9
@@ -239,7 +245,7 @@ class KeepaliveSessions:
         session.send_at_s = now_s + session.offer.out_interval_s * (1 - (found >> 24) * JITTER)
 
     def _plan(self, now_s: float) -> None:
-        """Set when the next tick is due; keepalives due within half an interval leave together from then on."""
+        """Set when the next tick is due; what is due within half an interval waits for one tick from then on."""
         send_at_s = silent_at_s = interval_s = NEVER_S
         for session in self._sessions.values():
             offer = session.offer
@@ -249,7 +255,8 @@ class KeepaliveSessions:
         if silent_at_s <= now_s:
             self.has_news = True
         self._send_at_s, self._together_s = send_at_s, interval_s / 2
-        self.due_s = min(send_at_s, max(silent_at_s, now_s + self._together_s))
+        look_at_s = max(silent_at_s, now_s + self._together_s)
+        self.due_s = send_at_s if send_at_s <= silent_at_s + self._together_s else min(send_at_s, look_at_s)
 
     def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
         """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""
