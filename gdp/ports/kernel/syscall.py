@@ -16,7 +16,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cache
 from typing import Final
 
 from gdp.errors import LocalError
@@ -29,7 +28,7 @@ _ATTACHED_MAX: Final = 64  # BPF_MPROG_MAX: the most programs at one hook
 _SKB_BYTES: Final = 512  # more than the size of struct __sk_buff
 _PRIORITY_AT: Final = 32
 BATCH: Final = struct.Struct("=QQQQIIQQ")  # of map elements: the count is the fifth
-_COUNT_AT: Final = 8  # in words
+_COUNT_AT, _REPEAT_AT = 8, 8  # in words
 _NUMBERS: Final = {  # of the call itself; a 32-bit Python looks up the machine that it was built for
     "x86_64": 321,
     "aarch64": 280,
@@ -112,7 +111,6 @@ _libc.syscall.restype = ctypes.c_long
 _libc.syscall.argtypes = (ctypes.c_long, ctypes.c_int, ctypes.c_void_p, ctypes.c_uint)
 
 
-@cache
 def _number() -> int:
     machine = platform.machine()
     if sys.maxsize < 1 << 32:
@@ -223,7 +221,7 @@ def run(program: int, frame: bytes, repeat: int = 1) -> Run:
 
 
 class PreparedRun:
-    """Run of a program on the same frame, again and again; each run costs a few microseconds."""
+    """Runs of a program on the same frame, again and again; each run costs a few microseconds."""
 
     def __init__(self, program: int, frame: bytes) -> None:
         self._frame = bytearray(frame)
@@ -231,11 +229,11 @@ class PreparedRun:
         self._words = memoryview(self._attributes).cast("I")
         self._call = (_number(), Command.PROG_TEST_RUN, address(self._attributes), len(self._attributes))
 
-    def __call__(self) -> int:
-        """Return what the program returned, unsigned. Raises ``BpfError``."""
+    def __call__(self, repeat: int) -> None:
+        """Run it so often; each run gets the frame that the previous one left. Raises ``BpfError``."""
+        self._words[_REPEAT_AT] = repeat
         if _libc.syscall(*self._call) < 0:
             raise BpfError(ctypes.get_errno(), "run the program")
-        return self._words[1]
 
 
 class PreparedRead:

@@ -5,6 +5,7 @@ Test frames come in on the loopback device, whose index is 1 and whose address i
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -174,7 +175,9 @@ def test_the_kernel_sends_what_the_node_would_send(
     given_offer = offer(out_key=key, sequence=sequence, sent=sent, echo=echo, head=head, loss=loss)
     twin.follow([given_offer], PORTS)
     slot = next(iter(twin._sessions.values())).slot
-    frame = syscall.run(twin._programs[1], slot.to_bytes(4, "little").ljust(FRAME_BYTES, b"\0")).frame
+    twin._slots.put(bytes(4), slot.to_bytes(4, sys.byteorder))
+    twin._listed = []
+    frame = syscall.run(twin._programs[1], bytes(FRAME_BYTES)).frame
     twin.follow([], PORTS)
     assert frame[:ETHER_BYTES] == ethernet(given_offer.mac, PORTS[0].mac)
     assert decode(frame[ETHER_BYTES:]) == keepalive_header(OWN, 8, sequence + 1)
