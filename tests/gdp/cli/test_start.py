@@ -20,6 +20,7 @@ LARGE = {
     "rich",
     "rosbags.rosbag1",
     "rosbags.rosbag2",
+    "rosbags.typesys",
     "ruamel.yaml",
     "scapy",
 }
