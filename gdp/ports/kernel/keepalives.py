@@ -35,13 +35,14 @@ from gdp.ports.kernel.keepalive_program import (
 from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.program import LICENCE
 from gdp.ports.kernel.sha256 import BLOCK_BYTES
-from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load_program
+from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRead, PreparedRun, create_link, load_program
 from gdp.ports.plane import Port
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 
 log = logging.getLogger(__name__)
 
 _SESSIONS_MAX: Final = 64
+_AGAIN: Final = 0.25  # of an interval, after which keepalives that were not sent are sent
 _STATE: Final = struct.Struct(f"=7Q{REPORT.size}sB2x")
 _NUMBER: Final = struct.Struct("=I")
 _INNER, _OUTER = bytes(each ^ 0x36 for each in range(256)), bytes(each ^ 0x5C for each in range(256))
@@ -67,10 +68,10 @@ def _changing(offer: KeepaliveOffer) -> dict[str, Any]:
 class _Session:
     offer: KeepaliveOffer
     slot: int
-    run: PreparedRun
     end: bytes
     send_at_s: float
     heard_s: float
+    sent: int
     taken: int = 0
     replays: int = 0
     sent_s: list[float] = field(default_factory=list)
@@ -94,6 +95,8 @@ class KeepaliveSessions:
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
         self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
+        self._reader: PreparedRead | None = None  # of the states of slots in use
+        self._listed: list[int] = []  # slots that were sent for last
         self._report_at_s = NEVER_S
         self._late_s = 0.0
         self._send_at_s, self._together_s = NEVER_S, 0.0
@@ -103,9 +106,13 @@ class KeepaliveSessions:
             self._configured = self._make(MapKind.ARRAY, 4, SESSION_BYTES, "gdp_sessions")
             self._states = self._make(MapKind.ARRAY, 4, STATE_BYTES_OF_SESSION, "gdp_states")
             self._ends = self._make(MapKind.HASH, END_BYTES, 4, "gdp_ends")
-            maps = KeepaliveMaps(sessions=self._configured.fd, states=self._states.fd, ends=self._ends.fd)
+            self._slots = self._make(MapKind.ARRAY, 4, 4, "gdp_slots")
+            maps = KeepaliveMaps(
+                sessions=self._configured.fd, states=self._states.fd, ends=self._ends.fd, slots=self._slots.fd
+            )
             for code in receiver(maps), sender(maps):
                 self._programs.append(load_program(code, "gdp_keepalive", LICENCE))
+            self._run = PreparedRun(self._programs[1], bytes(FRAME_BYTES))
         except LocalError:
             self.close()
             raise
@@ -168,16 +175,15 @@ class KeepaliveSessions:
 
     def _begin(self, key: tuple[int, bytes], offer: KeepaliveOffer, mac: bytes) -> KeepaliveRun:
         slot, ifindex = heappop(self._free), self._links[offer.port][1]
-        run = PreparedRun(self._programs[1], _NUMBER.pack(slot).ljust(FRAME_BYTES, b"\0"))
         end = offer.name + _NUMBER.pack(ifindex)
-        session = _Session(offer, slot, run, end, offer.send_at_s, offer.heard_s)
+        session = _Session(offer, slot, end, offer.send_at_s, offer.heard_s, offer.sent)
         report = REPORT.pack(offer.echo, 0, 0, 0)
         heard_ns = int(offer.heard_s * 1e9)
         state = _STATE.pack(offer.sequence, offer.sent, offer.received, heard_ns, 0, 0, 0, report, 0)
         self._states.put(_NUMBER.pack(slot), state)
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
-        self._sessions[key] = session
+        self._sessions[key], self._reader = session, None
         now_s = time.monotonic()
         self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
         self._plan(now_s)
@@ -196,13 +202,17 @@ class KeepaliveSessions:
         self._ends.remove(session.end)
         run = self._report(session, self._read()[session.slot])._replace(is_over=True)
         del self._sessions[key]
+        self._reader = None
         heappush(self._free, session.slot)
         self._plan(time.monotonic())
         return run
 
     def _read(self) -> list[tuple[Any, ...]]:
-        count = max((each.slot for each in self._sessions.values()), default=-1) + 1
-        return list(_STATE.iter_unpack(self._states.read_array(count)))
+        if self._reader is None:
+            count = max(each.slot for each in self._sessions.values()) + 1
+            self._reader = PreparedRead(self._states.fd, _STATE.size, count)
+        self._reader()
+        return list(_STATE.iter_unpack(self._reader.values))
 
     def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
@@ -226,30 +236,32 @@ class KeepaliveSessions:
         sessions = self._sessions.values()
         if self._send_at_s <= now_s:
             until_s = now_s + self._together_s
-            for session in sessions:
-                if session.send_at_s <= until_s:
-                    self._send(session, now_s)
-        else:
-            states = self._read()
-            for session in sessions:
-                session.heard_s = states[session.slot][3] * 1e-9
+            self._send([each for each in sessions if each.send_at_s <= until_s], now_s)
+        states = self._read()
+        for session in sessions:
+            _, sent, _, heard_ns, *_ = states[session.slot]
+            session.heard_s = heard_ns * 1e-9
+            if sent != session.sent:
+                session.sent_s.append(now_s)
+                session.sent = sent
         self.has_news = self.has_news or now_s >= self._report_at_s
         self._plan(now_s)
 
-    @staticmethod
-    def _send(session: _Session, now_s: float) -> None:
+    def _send(self, sessions: list[_Session], now_s: float) -> None:
+        slots, jitter = [each.slot for each in sessions], os.urandom(1)[0] * JITTER
+        if slots != self._listed:
+            self._listed = slots
+            self._slots.put_many([_NUMBER.pack(at) for at in range(len(slots))], [*map(_NUMBER.pack, slots)])
         try:
-            found = session.run()
-        except LocalError as refused:  # without memory; the next one is sent in time
-            log.debug("keepalive not sent reason=%s", refused)
-            session.send_at_s = now_s + session.offer.out_interval_s
-            return
-        session.sent_s.append(now_s)
-        session.heard_s = now_s - (found & 0xFFFFFF) * 1e-6
-        session.send_at_s = now_s + session.offer.out_interval_s * (1 - (found >> 24) * JITTER)
+            self._run(len(slots))
+        except LocalError as refused:  # without memory, or by a signal; some may have left
+            log.debug("keepalives not sent reason=%s", refused)
+            jitter = 1 - _AGAIN
+        for session in sessions:
+            session.send_at_s = now_s + session.offer.out_interval_s * (1 - jitter)
 
     def _plan(self, now_s: float) -> None:
-        """Set when the next tick is due; keepalives due within half an interval leave together from then on."""
+        """Set when the next tick is due; what is due within half an interval waits for one tick from then on."""
         send_at_s = silent_at_s = interval_s = NEVER_S
         for session in self._sessions.values():
             offer = session.offer
@@ -259,7 +271,8 @@ class KeepaliveSessions:
         if silent_at_s <= now_s:
             self.has_news = True
         self._send_at_s, self._together_s = send_at_s, interval_s / 2
-        self.due_s = min(send_at_s, max(silent_at_s, now_s + self._together_s))
+        look_at_s = max(silent_at_s, now_s + self._together_s)
+        self.due_s = send_at_s if send_at_s <= silent_at_s + self._together_s else min(send_at_s, look_at_s)
 
     def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
         """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""
