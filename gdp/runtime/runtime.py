@@ -195,6 +195,8 @@ class Runtime:
             self._deadline_s = self._machine.get_timer()
             first_s = earliest(self._deadline_s, latest_s, self._periodic_s())
             arrivals = self._wait(None if first_s is None else max(first_s - time.monotonic(), 0.0))
+        elif self._deadline_s is None:
+            self._deadline_s = self._machine.get_timer()
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
         keepalives, has_news = self._keepalives, False
@@ -207,8 +209,8 @@ class Runtime:
                 follow()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.handle_timer(moment)
-            has_news = True
-            self._deadline_s = self._machine.get_timer()
+            self.send()  # keepalives and reports, of which most often no more follow
+            has_news, self._deadline_s = True, None
         if keepalives is not None and has_news:
             offers = self._machine.offload.offers(moment.mono_s)
             self._take_runs(keepalives.follow(offers, self._plane.ports), 0.0, moment)
