@@ -130,6 +130,9 @@ class KeepaliveOffload(Protocol):
     def take_runs(self, runs: list[KeepaliveRun], late_s: float, now: Timestamps) -> None:
         """Note what a data plane did in sessions; it was called so much later than it had requested."""
 
+    def frames_came(self) -> None:
+        """Note that frames were received: a neighbour that was heard is silent later than it was to be."""
+
 
 class ProtocolCore(Protocol):
     """A switch, a RIB or a participant, as an I/O layer or a simulated network drives it."""

@@ -91,6 +91,10 @@ class SessionOffload:
             suspect_s=SUSPECT_AFTER * session.in_interval_s,
         )
 
+    def frames_came(self) -> None:
+        """Let the timers be read again, so that the node is not woken for a silence that has ended."""
+        self.has_changed = True
+
     def take_runs(self, runs: list[KeepaliveRun], late_s: float, now: Timestamps) -> None:
         """Note what a data plane did in sessions.
 

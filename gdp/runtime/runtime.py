@@ -205,6 +205,8 @@ class Runtime:
             self._take_runs(*keepalives.poll(moment.mono_s), moment)
         if arrivals:
             self._machine.receive(arrivals, moment)
+            if len(self._plane.ports) == 1:  # of many neighbours, timers cost more than a wake now and then
+                self._machine.offload.frames_came()
             for follow in self._after_receive:
                 follow()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:

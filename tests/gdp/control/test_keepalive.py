@@ -13,6 +13,7 @@ from gdp.control.keepalive import QUEUED_S, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbour import NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
+from gdp.control.neighbour_table import Change
 from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity
@@ -102,6 +103,26 @@ def up(pair: Pair) -> Pair:
     assert pair.is_up("b")
     pair.frames.clear()
     return pair
+
+
+def test_a_node_is_called_for_what_it_sends_and_not_for_a_silence_that_has_ended() -> None:
+    pair = up(Pair())
+    calls = 0
+    drop_silent = pair.ends["a"].drop_silent
+
+    def counted(now_s: float) -> list[Change]:
+        nonlocal calls
+        calls += 1
+        return drop_silent(now_s)
+
+    def passes(_sender: str, _frame: bytes) -> bool:
+        pair.ends["a"].offload.frames_came()
+        return True
+
+    pair.ends["a"].drop_silent = counted  # type: ignore[method-assign]
+    pair.passes = passes
+    pair.run(14.0)
+    assert calls <= sum(sender == "a" for sender, _ in pair.frames)
 
 
 def test_a_silent_cut_is_noticed_within_the_detection_time() -> None:
