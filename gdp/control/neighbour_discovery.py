@@ -30,7 +30,7 @@ from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, Tim
 from gdp.control.hello_port import UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
-from gdp.control.keepalive import KeepaliveSession
+from gdp.control.keepalive import TOGETHER, KeepaliveSession
 from gdp.control.keepalive_offload import SessionOffload
 from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourEvent, NeighbourState
@@ -50,7 +50,6 @@ from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
-_TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 
 class HelloProtocol:
@@ -382,6 +381,7 @@ class HelloProtocol:
         if known.keepalives.is_final_due or self.liveness.is_probing:
             self._next_s = None  # any other change only delays timers
         self.liveness.note_alive(known, now.mono_s - arrival.waited_s)
+        self.offload.has_heard = True
         return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
@@ -442,7 +442,7 @@ class HelloProtocol:
                 if session is None or session.is_offloaded:
                     continue
                 is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
-                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
+                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * TOGETHER:
                     if is_suspect:
                         session.note_poll(now_s)
                     self.liveness.note_silence(neighbour, session, now_s)
@@ -470,7 +470,7 @@ class HelloProtocol:
 
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
-        self.together_s = self.liveness.longest_s * _TOGETHER
+        self.together_s = self.liveness.longest_s * TOGETHER
         for port in self.ports.values():
             if port.is_up:
                 due_s = min(due_s, port.hello_at_s, port.answer_at_s)
