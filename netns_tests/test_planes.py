@@ -20,6 +20,7 @@ from weakref import WeakKeyDictionary
 import pytest
 
 from gdp.errors import DropReason, LocalError
+from gdp.frame.codec import decode
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.ports import raw, sockets
 from gdp.ports.kernel.plane import KernelPlane
@@ -258,6 +259,14 @@ def test_a_broadcast_hello_is_punted(switch: Plane, ends: dict[int, socket.socke
     hello = BROADCAST + frame(bytes(32), kind=Kind.HELLO)[6:]
     ends[IN].send(hello)
     assert take_in(switch, 1) == [ReceivedFrame(IN, PEER_MACS[IN], hello[14:])]
+
+
+def test_what_a_neighbour_sends_after_its_hello_comes_after_it(node: Plane, ends: dict[int, socket.socket]) -> None:
+    node.set_neighbours(IN, [PEER_MACS[IN]])
+    kinds = [Kind.HELLO, Kind.ADVERTISE]  # the hello opens the session that the advertisement belongs to
+    for kind in kinds:
+        ends[IN].send(frame(ONE, kind=kind))
+    assert [decode(arrival.frame).kind for arrival in take_in(node, len(kinds))] == kinds
 
 
 def test_a_plane_does_not_hear_itself(node: Plane, ends: dict[int, socket.socket]) -> None:

@@ -125,6 +125,26 @@ def test_a_killed_wireguard_go_heals_and_the_link_stays(sites: tuple[Site, Site]
         until(crosses(two, one), *ends)
 
 
+def test_no_thread_of_wireguard_go_interrupts_a_sender_also_after_a_restart(
+    sites: tuple[Site, Site], ends: Ends
+) -> None:
+    def classes() -> set[int]:
+        """Return the scheduling classes of all threads of the program of the first site."""
+        return {
+            os.sched_getscheduler(int(each.name))
+            for each in Path(f"/proc/{process_of(sites[0].ifname)}/task").iterdir()
+        }
+
+    frames = [site.frames() for site in sites]
+    until(crosses(*frames), *ends)
+    assert classes() == {os.SCHED_BATCH}
+    pid = process_of(sites[0].ifname)
+    os.kill(pid, signal.SIGKILL)
+    until(lambda: not is_alive(pid))
+    until(crosses(*frames), *ends)
+    assert classes() == {os.SCHED_BATCH}
+
+
 def test_wireguard_go_gets_large_receive_buffers_also_after_a_rebind(sites: tuple[Site, Site], ends: Ends) -> None:
     def has_large_buffers() -> bool:
         with sites[0].entered():

@@ -169,7 +169,7 @@ def bodies() -> dict[str, list[type[FieldSet]]]:
         kinds += kind.__subclasses__()
         if kind.__module__.startswith("gdp."):
             found.setdefault(kind.TYPE.value, []).append(kind)
-    return found | {"join-unknown": found["join-refresh"]}
+    return found
 
 
 def _with_forms(section: re.Match[str], known: dict[str, list[type[FieldSet]]]) -> str:

@@ -303,6 +303,8 @@ class Attachment:
             StatementError: MALFORMED, or REPLAYED.
         """
         switch, refresh = self.switch, JoinRefresh.from_fields(statement.fields)
+        if refresh.is_reply:
+            raise StatementError(DropReason.MALFORMED, "an attached node refreshes no joins")
         if switch is None:
             return []
         port = self.hello_protocol.ports[switch.port]

@@ -58,7 +58,7 @@ class ReaderPath:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
         self.controller.rate.forget_all()
         self.controller = PathController(self.mtu)
-        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
+        self.is_silent = self.is_behind = self.may_probe = self._has_probed = self._awaits_tree = False
         self._late_reports = 0  # in a row
         self._hops: int | None = None
         self._confirmed_s = now_s
@@ -196,11 +196,16 @@ class ReaderPath:
             self.controller.path_changed(now_s)
         self._hops = hops
 
+    def attachment_changed(self, now_s: float) -> None:
+        """Start again: frames leave by another switch, which no tree reaches yet."""
+        self.controller.path_changed(now_s)
+        self._awaits_tree = True
+
     def tree_stands(self, mtu: int) -> None:
-        """Note that a tree leads there, with the bytes of a full frame; after a silence, nothing did so before."""
-        if not self.governs_others:
+        """Note that a tree leads there, with the bytes of a full frame; after a silence or a move, none did before."""
+        if self._awaits_tree or not self.governs_others:
             self.controller.rate.forget_all()
-            self._timeouts = min(self._timeouts, 1)
+            self._timeouts, self._awaits_tree = min(self._timeouts, 1), False
         if mtu != self.mtu:
             self.mtu = mtu
             self.controller.set_mtu(mtu)
@@ -317,9 +322,9 @@ class ReaderPaths:
         return order, all(path.carries(size, within_s) for path in paths.values())
 
     def attachment_changed(self, now_s: float) -> None:
-        """Start every path again: frames leave by another switch."""
+        """Start every path again, as ``ReaderPath.attachment_changed``."""
         for path in self._paths.values():
-            path.controller.path_changed(now_s)
+            path.attachment_changed(now_s)
 
     def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Annotated, Final
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
-from gdp.crypto.schema import Body, Keyed, joined, octets, uint
+from gdp.crypto.schema import FLAG, Body, Keyed, joined, octets, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 
@@ -38,12 +38,7 @@ class JoinRefresh(Body):
     session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
     sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))]
     sequence: Annotated[int, Keyed("s", uint())]
-    is_reply: bool = False
-
-    @property
-    def statement_type(self) -> StatementType:
-        """Return the type of its statement."""
-        return StatementType.JOIN_UNKNOWN if self.is_reply else self.TYPE
+    is_reply: Annotated[bool, Keyed("u", FLAG, absent=False, is_omitted=True)] = False
 
     def check(self) -> None:
         """Return if there are numbers. Raises ``StatementError``: MALFORMED."""

@@ -210,11 +210,6 @@ class Body(FieldSet):
     __slots__ = ()
     TYPE: ClassVar[StatementType]
 
-    @property
-    def statement_type(self) -> StatementType:
-        """Return the type of its statement."""
-        return self.TYPE
-
     @classmethod
     def given_by(cls, _statement: Statement) -> dict[str, object]:
         """Return the fields that do not travel, as the statement gives them."""
@@ -235,7 +230,7 @@ class Body(FieldSet):
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes | None = None) -> bytes:
         """Return the signed statement, with the signer's certificate if given. Raises ``LocalError``: too long."""
         certificate = {} if membership is None else {CERTIFICATE.key: membership}
-        return sign(self.statement_type, self.to_fields() | certificate, signer, key)
+        return sign(self.TYPE, self.to_fields() | certificate, signer, key)
 
 
 def _marks(kind: type[FieldSet]) -> _Marks:

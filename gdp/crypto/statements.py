@@ -35,8 +35,7 @@ class StatementType(str, Enum):
     QUERY = "query"
     ANSWER = "answer"
     JOIN = "join"
-    JOIN_REFRESH = "join-refresh"  # to a neighbour: these joins stand
-    JOIN_UNKNOWN = "join-unknown"  # ... and back: these of them are not known
+    JOIN_REFRESH = "join-refresh"  # to a neighbour: these joins stand; or back: these of them are not known
     PACE = "pace"  # a reader to its switch: which messages of a publisher its branch gets
     LINK_STATE = "link-state"
     HELLO = "hello"

@@ -89,7 +89,7 @@ class NetdevPlane(ABC):
         """Open the port's device and watch it; a device that cannot be opened raises ``LocalError``."""
 
     @abstractmethod
-    def _shut(self, index: int) -> None:
+    def _shut(self, port: Port) -> None:
         """Close everything that ``_open`` opened; nothing may be open."""
 
     @abstractmethod
@@ -97,7 +97,7 @@ class NetdevPlane(ABC):
 
     def _widen(self, port: Port) -> None:
         """Prepare an open device for larger frames; reopening it loses the frames that wait at its socket."""
-        self._close_device(port.index)
+        self._close_device(port)
         self._open(port)
 
     @abstractmethod
@@ -197,9 +197,10 @@ class NetdevPlane(ABC):
 
     def remove_port(self, index: int) -> None:
         """Close a port; does nothing if no port has this index."""
-        if self._ports.pop(index, None) is not None:
+        port = self._ports.pop(index, None)
+        if port is not None:
             self._unopened.pop(index, None)
-            self._close_device(index)
+            self._close_device(port)
             self._mtus.pop(index, None)
             self._came.pop(index, None)
             self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
@@ -229,10 +230,10 @@ class NetdevPlane(ABC):
 
     # links
 
-    def _close_device(self, index: int) -> None:
+    def _close_device(self, port: Port) -> None:
         """Close a device after adding the kernel's drops to the counters."""
         self._audit()
-        self._shut(index)
+        self._shut(port)
 
     def _audit(self) -> None:
         """Add the kernel's own drops to the counters."""
@@ -279,7 +280,7 @@ class NetdevPlane(ABC):
         """Synchronise a port with its device."""
         if link.gone:
             self._unopened.pop(port.index, None)
-            self._close_device(port.index)
+            self._close_device(port)
             del self._devices[link.ifindex]
         after = replace(port, up=False)
         if not link.gone and link.mtu >= MTU_MIN_BYTES and len(link.mac) == MAC_BYTES:

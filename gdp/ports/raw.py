@@ -31,6 +31,7 @@ from gdp.frame.codec import (
 from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
+from gdp.ports.closing import Closing
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import Port, ReceivedFrame
@@ -49,12 +50,12 @@ from gdp.token_bucket import TokenBucket
 _ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
 _URGENT: Final = int(Flag.URGENT)
 _CLASSES: Final = (
-    TrafficClass.CONTROL,
     TrafficClass.HELLO,
+    TrafficClass.CONTROL,
     TrafficClass.URGENT,
     TrafficClass.ORDINARY,
     TrafficClass.GUEST,
-)  # in the order of service
+)  # in the order of service: what follows a hello needs the session that it opens
 _GREETINGS: Final = Rate(500.0, burst=128.0)  # per second, and at once; each costs at most 30 us before its rejection
 
 
@@ -81,16 +82,18 @@ class RawPlane(NetdevPlane):
         }  # by port
         self._batch: MmsgBatch = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
+        self._closing = Closing()
         self._resting: dict[int, tuple[socket.socket, float]] = {}  # sockets that pause until then, by file descriptor
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
+        self._closing.wait(port.ifname)
         self._widen(port)
         try:
             for rank, traffic_class in enumerate(_CLASSES):
                 self._open_traffic_class(port, traffic_class, rank)
         except LocalError:
-            self._shut(port.index)
+            self._shut(port)
             raise
 
     def _open_traffic_class(self, port: Port, traffic_class: TrafficClass, rank: int) -> None:
@@ -132,6 +135,11 @@ class RawPlane(NetdevPlane):
                 timeout_s = left_s if timeout_s is None else min(timeout_s, left_s)
         return super().poll(timeout_s)
 
+    def close(self) -> None:
+        """Close every port, the link monitor and the epoll."""
+        super().close()
+        self._closing.wait()
+
     def remove_port(self, index: int) -> None:
         """Close a port and forget its neighbours."""
         super().remove_port(index)
@@ -156,14 +164,14 @@ class RawPlane(NetdevPlane):
         if port.mtu + ETHER_BYTES > self._batch.slot_bytes:
             self._batch = make_batch(port.mtu + ETHER_BYTES)
 
-    def _shut(self, index: int) -> None:
-        self._finish([sockets[index] for sockets in self._sockets_by_class.values() if index in sockets])
-        for sockets in self._sockets_by_class.values():
-            opened = sockets.pop(index, None)
-            if opened is not None:
-                self._end_rest(opened.fileno())
-                self.unwatch(opened)
-                opened.close()
+    def _shut(self, port: Port) -> None:
+        held = [sockets for sockets in self._sockets_by_class.values() if port.index in sockets]
+        self._finish([sockets[port.index] for sockets in held])
+        opened = [sockets.pop(port.index) for sockets in held]
+        for each in opened:
+            self._end_rest(each.fileno())
+            self.unwatch(each)
+        self._closing.close(port.ifname, [each.close for each in opened])
 
     def _finish(self, sources: Sequence[socket.socket]) -> None:
         """Receive the frames at sockets before they are closed, because closing loses them uncounted."""

@@ -61,8 +61,8 @@ class ScapyPlane(NetdevPlane):
     def _widen(self, port: Port) -> None:
         """Do nothing: Scapy's sockets take frames of any size."""
 
-    def _shut(self, index: int) -> None:
-        opened, fd = self._sockets.pop(index, (None, -1))
+    def _shut(self, port: Port) -> None:
+        opened, fd = self._sockets.pop(port.index, (None, -1))
         if opened is None:
             return
         if opened.closed:  # closed by Scapy after an error; the kernel has released the descriptor
@@ -108,7 +108,7 @@ class ScapyPlane(NetdevPlane):
             chainCC=True,
         )
         if opened.closed:  # Scapy closed it because of an error
-            self._shut(index)
+            self._shut(self._ports[index])
             self._know(self._reopen_if_needed(self._ports[index], self._ports[index]))
 
     def _consider(self, index: int, packet: Packet) -> None:

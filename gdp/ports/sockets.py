@@ -10,7 +10,7 @@ multicast, an echo of our own sending, and a broadcast data frame (which every s
 again).
 
 A port may have a socket for each *traffic class*, so that no frame queues after less important ones. The
-classes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
+classes in order are: hellos of neighbours, their control frames, urgent frames, ordinary frames, and control frames of
 strangers. A flood of one class fills only the queue of that class. A neighbour is identified by its address, which the
 filters get with each change. Frames of neighbours and urgent ones carry a priority. Every
 queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).

@@ -193,7 +193,7 @@ class Runtime:
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.get_timer()
-            first_s = earliest(self._deadline_s, latest_s, *(each.next_s for each in self._periodic))
+            first_s = earliest(self._deadline_s, latest_s, self._periodic_s())
             arrivals = self._wait(None if first_s is None else max(first_s - time.monotonic(), 0.0))
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
@@ -213,7 +213,16 @@ class Runtime:
             offers = self._machine.offload.offers(moment.mono_s)
             self._take_runs(keepalives.follow(offers, self._plane.ports), 0.0, moment)
         for each in self._periodic:
-            each.handle(moment)
+            if moment.mono_s >= each.due_s:
+                each.handle(moment)
+
+    def _periodic_s(self) -> float | None:
+        """Return when the next periodic function is due; None: all wait for work."""
+        first_s: float | None = None
+        for each in self._periodic:
+            if first_s is None or each.due_s < first_s:
+                first_s = earliest(first_s, each.next_s)
+        return first_s
 
     def _take_runs(self, runs: list[KeepaliveRun], late_s: float, moment: Timestamps) -> None:
         """Tell the core what the plane did in keepalive sessions; of one that is over, timers may be due now."""
@@ -233,7 +242,7 @@ class Runtime:
         """Return the monotonic second at which a step has work without frames, or None."""
         keepalives = self._keepalives
         tick_s = None if keepalives is None or keepalives.due_s == NEVER_S else keepalives.due_s
-        return earliest(self._machine.get_timer(), tick_s, *(each.next_s for each in self._periodic))
+        return earliest(self._machine.get_timer(), tick_s, self._periodic_s())
 
     def _wait(self, timeout_s: float | None) -> Sequence[ReceivedFrame]:
         """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""

@@ -64,14 +64,12 @@ class JoinHandler:
         Raises:
             StatementError: as ``handle_join``.
         """
-        is_reply = statement.type is StatementType.JOIN_UNKNOWN
-        expected = StatementType.JOIN_UNKNOWN if is_reply else StatementType.JOIN_REFRESH
-        refresh = JoinRefresh.from_fields(statement.expect(expected), is_reply=is_reply)
-        if statement.signer != neighbour.name or not (is_reply or neighbour.role.is_switch):
+        refresh = JoinRefresh.from_statement(statement)
+        if statement.signer != neighbour.name or not (refresh.is_reply or neighbour.role.is_switch):
             raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
         self._check(neighbour, statement, now.mono_s, _REFRESH_TOKENS)
         self._state.neighbours.ports[neighbour.port].receive_join(refresh, neighbour)
-        if is_reply:
+        if refresh.is_reply:
             self._multicast.upstream.join_unknown(refresh, neighbour, now.mono_s)
         else:
             self._multicast.refresh(refresh, neighbour, now.mono_s)

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import struct
 from functools import cache
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 GET: Final = ("get_parameters", "rcl_interfaces/srv/GetParameters")
 SET: Final = ("set_parameters", "rcl_interfaces/srv/SetParameters")
@@ -30,6 +30,8 @@ _TYPES: Final = {
 
 @cache
 def _store() -> Typestore:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _TYPES.items():
         store.register(get_types_from_msg(text, name))

@@ -13,7 +13,6 @@ import typer
 from gdp.cli.program import Program
 from gdp.intervals import TICK_S
 from gdp.names import Name
-from gdp.trust.right import Right
 from proxy.cli.tool_options import Node, ToolOptions, complete_callable, print_json, print_text, running_tool
 
 if TYPE_CHECKING:
@@ -64,6 +63,7 @@ def call(
     is reachable, or none answers in time.
     """
     with running_tool(options):
+        from gdp.trust.right import Right
         from proxy.endpoints.probe import Probe
         from proxy.node.tool_member import NoAnswerError, Wanted, run_probe
         from proxy.tools.message_text import MessageText, request_tree

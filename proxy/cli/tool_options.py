@@ -19,7 +19,6 @@ from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
 from gdp.errors import GdpError
 from gdp.terminal import echo, for_stdout
-from gdp.trust.right import Right
 from proxy.cli.node_options import Delegations, Iface
 
 if TYPE_CHECKING:
@@ -40,23 +39,24 @@ TypeName = Annotated[str, typer.Option("--type", metavar="TYPE", help="Its type,
 
 def complete_readable(context: typer.Context, incomplete: str) -> list[str]:
     """Return the topics that the line's node may read."""
-    return _held(context, incomplete, Right.READ)
+    return _held(context, incomplete, "read")
 
 
 def complete_callable(context: typer.Context, incomplete: str) -> list[str]:
     """Return the services that the line's node may call."""
-    return _held(context, incomplete, Right.CALL)
+    return _held(context, incomplete, "call")
 
 
-def _held(context: typer.Context, incomplete: str, right: Right) -> list[str]:
+def _held(context: typer.Context, incomplete: str, right: str) -> list[str]:
     """Return names from delegations; none where the line has no readable node, since a completion prints no error."""
     node = context.params.get("node") or os.environ.get("GDP_NODE")
     if not node:
         return []
+    from gdp.trust.right import Right
     from proxy.node.tool_member import names_held
 
     try:
-        return sorted({name for name in names_held(Path(node), right) if name.startswith(incomplete)})
+        return sorted({name for name in names_held(Path(node), Right(right)) if name.startswith(incomplete)})
     except GdpError:
         return []
 

@@ -17,7 +17,6 @@ from gdp import terminal
 from gdp.cli.program import Program
 from gdp.errors import RemoteError
 from gdp.intervals import REPORT_S
-from gdp.trust.right import Right
 from proxy.cli.tool_options import Node, ToolOptions, TypeName, complete_readable, print_json, print_text, running_tool
 
 if TYPE_CHECKING:
@@ -204,6 +203,7 @@ class _Hint:
 
 
 def _readable(node: Path, name: str, type_name: str, options: ToolOptions) -> Access:
+    from gdp.trust.right import Right
     from proxy.node.tool_member import Wanted
 
     return options.find_access(node, Wanted(name, type_name, Right.READ))

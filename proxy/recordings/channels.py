@@ -1,4 +1,4 @@
-"""Channels of a recording: conversion from and to rosbags' connections.
+"""Channels of a recording: conversion from rosbags' connections.
 
 Sans-I/O.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from enum import Enum
-from typing import TypeVar
 
 from rosbags.interfaces import (
     Connection,
@@ -16,10 +14,6 @@ from rosbags.interfaces import (
     ConnectionExtRosbag2,
     MessageDefinitionFormat,
     QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
 )
 from rosbags.interfaces import Qos as RosbagsQos
 from rosbags.rosbag2.errors import ReaderError
@@ -43,7 +37,6 @@ _FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
     MessageDefinitionFormat.IDL: "idl",
     MessageDefinitionFormat.NONE: "",
 }
-_Policy = TypeVar("_Policy", bound=Enum)
 
 
 def from_connection(connection: Connection) -> Channel:
@@ -164,22 +157,3 @@ def _from_qos(profile: RosbagsQos) -> Qos:
         lease=(profile.liveliness_lease_duration.sec, profile.liveliness_lease_duration.nsec),
         plain_names=profile.avoid_ros_namespace_conventions,
     )
-
-
-def to_qos(profile: Qos) -> RosbagsQos:
-    """Return rosbags' form of a profile; values it does not know become ``unknown``."""
-    return RosbagsQos(
-        history=_policy(QosHistory, profile.history, QosHistory.UNKNOWN),
-        depth=profile.depth,
-        reliability=_policy(QosReliability, profile.reliability, QosReliability.UNKNOWN),
-        durability=_policy(QosDurability, profile.durability, QosDurability.UNKNOWN),
-        deadline=QosTime(*profile.deadline),
-        lifespan=QosTime(*profile.lifespan),
-        liveliness=_policy(QosLiveliness, profile.liveliness, QosLiveliness.UNKNOWN),
-        liveliness_lease_duration=QosTime(*profile.lease),
-        avoid_ros_namespace_conventions=profile.plain_names,
-    )
-
-
-def _policy(policies: type[_Policy], word: str, unknown: _Policy) -> _Policy:
-    return next((policy for policy in policies if policy.name.lower() == word), unknown)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import (
@@ -22,11 +22,13 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.in_process import InProcessEndpoint
-from proxy.recordings.reader import BagReader
-from proxy.recordings.split import SplitWriter
-from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
+
+if TYPE_CHECKING:  # what records loads nothing that reads, and the reverse
+    from proxy.recordings.reader import BagReader
+    from proxy.recordings.split import SplitWriter
+    from proxy.recordings.writer import BagWriter
 
 
 class RecordedMessage(NamedTuple):

@@ -9,16 +9,15 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
+from enum import Enum
 from io import BytesIO, FileIO, StringIO
 from typing import BinaryIO, Final
 
-from rosbags.rosbag2.metadata import dump_qos_v9
-from ruamel.yaml import YAML
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
 from proxy.endpoints.core.endpoint import Origin
-from proxy.recordings.channels import to_qos
 from proxy.recordings.mcap_format import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_HEAD, RECORD, Opcode
-from proxy.serial.channel import Channel, DefinitionFormat
+from proxy.serial.channel import Channel, DefinitionFormat, Qos
 
 CHUNK_BYTES: Final = 1 << 20  # a chunk is written when it has more
 _ENCODINGS: Final[dict[DefinitionFormat, str]] = {"msg": "ros2msg", "idl": "ros2idl", "": ""}
@@ -183,8 +182,30 @@ def _map(items: Mapping[str, str]) -> bytes:
 def _offered(channel: Channel) -> str:
     if not channel.qos:
         return ""
+    from ruamel.yaml import YAML
+
     stream = StringIO()
     yaml = YAML(typ="safe")
     yaml.default_flow_style = False
-    yaml.dump(dump_qos_v9([to_qos(profile) for profile in channel.qos]), stream)
+    yaml.dump([_profile(each) for each in channel.qos], stream)
     return stream.getvalue().strip()
+
+
+def _profile(qos: Qos) -> dict[str, object]:
+    """Return a profile as version 9 of rosbag2's metadata has it."""
+    deadline, lifespan, lease = ({"sec": sec, "nsec": nsec} for sec, nsec in (qos.deadline, qos.lifespan, qos.lease))
+    return {
+        "history": _policy(QosHistory, qos.history),
+        "depth": qos.depth,
+        "reliability": _policy(QosReliability, qos.reliability),
+        "durability": _policy(QosDurability, qos.durability),
+        "deadline": deadline,
+        "lifespan": lifespan,
+        "liveliness": _policy(QosLiveliness, qos.liveliness),
+        "liveliness_lease_duration": lease,
+        "avoid_ros_namespace_conventions": qos.plain_names,
+    }
+
+
+def _policy(policies: type[Enum], word: str) -> str:
+    return word if word in map(str.lower, policies.__members__) else "unknown"

@@ -15,11 +15,7 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final
-
-from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag1 import WriterError as WriterError1
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
@@ -28,6 +24,9 @@ from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
 from proxy.serial.bounded_cache import digest_of
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.schema import definition_bytes
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
 
 log = logging.getLogger(__name__)
 
@@ -95,10 +94,7 @@ class BagWriter(ClosedOnExit):
             if len(self._handles) >= _CONNECTIONS_MAX or size > _DEFINITIONS_MAX_BYTES:
                 raise LocalError(f"{channel.topic} cannot be recorded: the recording has too many channels")
             self._check_open()
-            try:
-                self._format.connect(channel)
-            except (WriterError1, AssertionError) as error:
-                raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
+            self._format.connect(channel)
             self._definitions_bytes = size
             self._handles[reporter] = len(self._handles)
         return self._handles[reporter]
@@ -180,7 +176,10 @@ class _Ros1Format:
     """A ROS 1 bag in progress, written by rosbags."""
 
     def __init__(self, path: Path) -> None:
-        self._writer = Writer1(path)
+        from rosbags.rosbag1 import Writer, WriterError  # a recorder of ROS 2 needs no module of rosbags
+
+        self._refused = WriterError, AssertionError
+        self._writer = Writer(path)
         self._writer.chunk_threshold = sys.maxsize  # chunks are written here
         self._writer.open()
         if self._writer.bio is None:
@@ -200,8 +199,8 @@ class _Ros1Format:
 
     def connect(self, channel: Channel) -> None:
         self._definitions_bytes += len(channel.definition) + 1_024
-        self._connections.append(
-            self._writer.add_connection(
+        try:
+            connection = self._writer.add_connection(
                 channel.topic,
                 channel.type_name,
                 msgdef=channel.definition,
@@ -209,7 +208,9 @@ class _Ros1Format:
                 callerid=channel.callerid,
                 latching=1 if channel.latched else None,
             )
-        )
+        except self._refused as error:
+            raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
+        self._connections.append(connection)
 
     def write(self, number: int, stamp_ns: int, raw: bytes, origin: Origin) -> None:
         del origin

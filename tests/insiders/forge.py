@@ -398,7 +398,7 @@ class Forge:
         numbers = [self._number(rng), *range(newest - rng.choice((0, 1, 20, 127)), newest)][:128]
         return {
             "i": self._echo(place), "o": self._own_nonce(identity, place), "s": next(self._numbers),
-            "k": b"".join(min(max(number, 0), _U64).to_bytes(8, "big") for number in numbers),
+            "k": b"".join(min(max(number, 0), _U64).to_bytes(8, "big") for number in numbers), "u": rng.random() < 0.5,
         }  # fmt: skip
 
     def _pace(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
@@ -811,7 +811,7 @@ _T = StatementType
 _Make = Callable[[Forge, random.Random, Identity, Place], _Body]
 _BODIES: Final[dict[StatementType, _Make]] = {
     _T.HELLO: Forge._hello, _T.LINK_STATE: Forge._link_state, _T.JOIN: Forge._join,
-    _T.JOIN_REFRESH: Forge._join_refresh, _T.JOIN_UNKNOWN: Forge._join_refresh, _T.PACE: Forge._pace,
+    _T.JOIN_REFRESH: Forge._join_refresh, _T.PACE: Forge._pace,
     _T.ADVERTISE: Forge._advertisement,
     _T.WITHDRAW: Forge._withdraw, _T.RELAY: Forge._relay, _T.QUERY: Forge._query, _T.ANSWER: Forge._answer,
     _T.ADVERTISE_ACK: Forge._ack, _T.PRESENCE: Forge._presence, _T.SYNC: Forge._sync, _T.REVOKE: Forge._revoke,
@@ -823,7 +823,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
 _K = Kind
 _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.HELLO: (_K.HELLO,), _T.LINK_STATE: (_K.LINK_STATE,), _T.JOIN: (_K.JOIN, _K.JOIN, _K.LEAVE),
-    _T.JOIN_REFRESH: (_K.JOIN_REFRESH,), _T.JOIN_UNKNOWN: (_K.JOIN_REFRESH,), _T.PACE: (_K.PACE,),
+    _T.JOIN_REFRESH: (_K.JOIN_REFRESH,), _T.PACE: (_K.PACE,),
     _T.ADVERTISE: (_K.ADVERTISE,), _T.WITHDRAW: (_K.WITHDRAW,),
     _T.RELAY: (_K.RIB_REQUEST, _K.RIB_REQUEST, _K.RELOCATE, _K.REDIRECT), _T.QUERY: (_K.RIB_REQUEST, _K.WHERE),
     _T.ANSWER: (_K.RIB_ANSWER, _K.RIB_ANSWER, _K.ADVERTISE_ACK, _K.REDIRECT),

@@ -61,8 +61,8 @@ def neighbour(world: Simulation, at: str, label: str) -> tuple[Neighbour, Identi
 
 
 def inject(world: Simulation, at: str, sender: Neighbour, wire: bytes) -> None:
-    """Let a neighbour say this to a switch."""
-    for frame in world.switches[at].state.outbox.fragmenter.split(Kind.JOIN_REFRESH, wire, 1_500):
+    """Let a neighbour say this to a switch, or an attached node."""
+    for frame in world.switches["s1"].state.outbox.fragmenter.split(Kind.JOIN_REFRESH, wire, 1_500):
         world.network.inject(at, sender.port, frame, sender.mac)
 
 
@@ -223,4 +223,23 @@ def test_x03_a_reply_about_unknown_joins_works_once_for_each_refresh() -> None:
     world.network.run(0.05)
     assert len(joins.whole) == 1
     assert counted(world) - before == Counter()
+    flow.outlive()
+
+
+def test_an_attached_node_refuses_a_reply_about_unknown_joins() -> None:
+    world, (flow,) = two_switches()
+    attachment = world.members[ROBOT].attachment
+    above = attachment.switch
+    assert above is not None
+    (identity,) = (each for each in world.identities.values() if each.name == above.name)
+    reply = JoinRefresh(
+        numbers=(7,),
+        session=attachment.hello_protocol.ports[above.port].echo,
+        sender_session=above.nonce,
+        sequence=1 << 60,
+        is_reply=True,
+    )
+    before = counted(world)
+    inject(world, ROBOT, above, reply.to_wire(identity.name, identity.key))
+    assert counted(world) - before == Counter({DropReason.MALFORMED: 1})
     flow.outlive()

@@ -12,8 +12,9 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from heapq import heappop, heappush
 from typing import Any, Final
 
@@ -34,13 +35,14 @@ from gdp.ports.kernel.keepalive_program import (
 from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.program import LICENCE
 from gdp.ports.kernel.sha256 import BLOCK_BYTES
-from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load_program
+from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRead, PreparedRun, create_link, load_program
 from gdp.ports.plane import Port
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 
 log = logging.getLogger(__name__)
 
 _SESSIONS_MAX: Final = 64
+_AGAIN: Final = 0.25  # of an interval, after which keepalives that were not sent are sent
 _STATE: Final = struct.Struct(f"=7Q{REPORT.size}sB2x")
 _NUMBER: Final = struct.Struct("=I")
 _INNER, _OUTER = bytes(each ^ 0x36 for each in range(256)), bytes(each ^ 0x5C for each in range(256))
@@ -66,10 +68,10 @@ def _changing(offer: KeepaliveOffer) -> dict[str, Any]:
 class _Session:
     offer: KeepaliveOffer
     slot: int
-    run: PreparedRun
     end: bytes
     send_at_s: float
     heard_s: float
+    sent: int
     taken: int = 0
     replays: int = 0
     sent_s: list[float] = field(default_factory=list)
@@ -89,9 +91,12 @@ class KeepaliveSessions:
     def __init__(self) -> None:
         self._programs: list[int] = []
         self._maps: list[KernelMap] = []
+        self._ifnames: dict[int, str] = {}  # of ports that have no link yet
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
         self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
+        self._reader: PreparedRead | None = None  # of the states of slots in use
+        self._listed: list[int] = []  # slots that were sent for last
         self._report_at_s = NEVER_S
         self._late_s = 0.0
         self._send_at_s, self._together_s = NEVER_S, 0.0
@@ -101,9 +106,13 @@ class KeepaliveSessions:
             self._configured = self._make(MapKind.ARRAY, 4, SESSION_BYTES, "gdp_sessions")
             self._states = self._make(MapKind.ARRAY, 4, STATE_BYTES_OF_SESSION, "gdp_states")
             self._ends = self._make(MapKind.HASH, END_BYTES, 4, "gdp_ends")
-            maps = KeepaliveMaps(sessions=self._configured.fd, states=self._states.fd, ends=self._ends.fd)
+            self._slots = self._make(MapKind.ARRAY, 4, 4, "gdp_slots")
+            maps = KeepaliveMaps(
+                sessions=self._configured.fd, states=self._states.fd, ends=self._ends.fd, slots=self._slots.fd
+            )
             for code in receiver(maps), sender(maps):
                 self._programs.append(load_program(code, "gdp_keepalive", LICENCE))
+            self._run = PreparedRun(self._programs[1], bytes(FRAME_BYTES))
         except LocalError:
             self.close()
             raise
@@ -116,7 +125,8 @@ class KeepaliveSessions:
     def close(self) -> None:
         """Detach the program and close everything."""
         for port in list(self._links):
-            self.detach(port)
+            for close in self.detach(port):
+                close()
         for opened in self._programs:
             os.close(opened)
         for each in self._maps:
@@ -124,19 +134,26 @@ class KeepaliveSessions:
         self._programs, self._maps = [], []
 
     def attach(self, port: int, ifname: str) -> None:
-        """Receive keepalives at a device; the node runs the sessions of one that is gone, or not allowed."""
-        try:
-            ifindex = socket.if_nametoindex(ifname)
-            self._links[port] = create_link(self._programs[0], ifindex, TCX_INGRESS), ifindex
-        except (OSError, LocalError) as refused:
-            log.debug("keepalives not in the kernel port=%s reason=%s", ifname, refused)
+        """Allow sessions at a device. The first one attaches the program, which takes the kernel some 15 ms."""
+        self._ifnames[port] = ifname
 
-    def detach(self, port: int) -> None:
-        """Receive no keepalives at a port; its sessions end with the next report."""
-        link, _ = self._links.pop(port, (-1, 0))
-        if link >= 0:
-            os.close(link)
+    def _receives(self, port: int) -> bool:
+        """Return whether keepalives are received at a port; not at a device that is gone, or where it is refused."""
+        ifname = self._ifnames.pop(port, None)
+        if ifname is not None:
+            try:
+                ifindex = socket.if_nametoindex(ifname)
+                self._links[port] = create_link(self._programs[0], ifindex, TCX_INGRESS), ifindex
+            except (OSError, LocalError) as refused:
+                log.debug("keepalives not in the kernel port=%s reason=%s", ifname, refused)
+        return port in self._links
+
+    def detach(self, port: int) -> list[Callable[[], object]]:
+        """Receive no keepalives at a port; its sessions end with the next report. Return what closes its link."""
+        self._ifnames.pop(port, None)
+        link = self._links.pop(port, None)
         self.has_news = self.has_news or any(each[0] == port for each in self._sessions)
+        return [] if link is None else [partial(os.close, link[0])]
 
     # sessions
 
@@ -152,22 +169,21 @@ class KeepaliveSessions:
                 session.offer = session.offer._replace(**_changing(offer))
                 self._configure(session, ports[offer.port].mac)
         for key, offer in wanted.items():
-            if key not in self._sessions and offer.port in self._links and self._free:
+            if key not in self._sessions and self._free and self._receives(offer.port):
                 runs.append(self._begin(key, offer, ports[offer.port].mac))
         return runs
 
     def _begin(self, key: tuple[int, bytes], offer: KeepaliveOffer, mac: bytes) -> KeepaliveRun:
         slot, ifindex = heappop(self._free), self._links[offer.port][1]
-        run = PreparedRun(self._programs[1], _NUMBER.pack(slot).ljust(FRAME_BYTES, b"\0"))
         end = offer.name + _NUMBER.pack(ifindex)
-        session = _Session(offer, slot, run, end, offer.send_at_s, offer.heard_s)
+        session = _Session(offer, slot, end, offer.send_at_s, offer.heard_s, offer.sent)
         report = REPORT.pack(offer.echo, 0, 0, 0)
         heard_ns = int(offer.heard_s * 1e9)
         state = _STATE.pack(offer.sequence, offer.sent, offer.received, heard_ns, 0, 0, 0, report, 0)
         self._states.put(_NUMBER.pack(slot), state)
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
-        self._sessions[key] = session
+        self._sessions[key], self._reader = session, None
         now_s = time.monotonic()
         self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
         self._plan(now_s)
@@ -186,13 +202,17 @@ class KeepaliveSessions:
         self._ends.remove(session.end)
         run = self._report(session, self._read()[session.slot])._replace(is_over=True)
         del self._sessions[key]
+        self._reader = None
         heappush(self._free, session.slot)
         self._plan(time.monotonic())
         return run
 
     def _read(self) -> list[tuple[Any, ...]]:
-        count = max((each.slot for each in self._sessions.values()), default=-1) + 1
-        return list(_STATE.iter_unpack(self._states.read_array(count)))
+        if self._reader is None:
+            count = max(each.slot for each in self._sessions.values()) + 1
+            self._reader = PreparedRead(self._states.fd, _STATE.size, count)
+        self._reader()
+        return list(_STATE.iter_unpack(self._reader.values))
 
     def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
@@ -216,30 +236,32 @@ class KeepaliveSessions:
         sessions = self._sessions.values()
         if self._send_at_s <= now_s:
             until_s = now_s + self._together_s
-            for session in sessions:
-                if session.send_at_s <= until_s:
-                    self._send(session, now_s)
-        else:
-            states = self._read()
-            for session in sessions:
-                session.heard_s = states[session.slot][3] * 1e-9
+            self._send([each for each in sessions if each.send_at_s <= until_s], now_s)
+        states = self._read()
+        for session in sessions:
+            _, sent, _, heard_ns, *_ = states[session.slot]
+            session.heard_s = heard_ns * 1e-9
+            if sent != session.sent:
+                session.sent_s.append(now_s)
+                session.sent = sent
         self.has_news = self.has_news or now_s >= self._report_at_s
         self._plan(now_s)
 
-    @staticmethod
-    def _send(session: _Session, now_s: float) -> None:
+    def _send(self, sessions: list[_Session], now_s: float) -> None:
+        slots, jitter = [each.slot for each in sessions], os.urandom(1)[0] * JITTER
+        if slots != self._listed:
+            self._listed = slots
+            self._slots.put_many([_NUMBER.pack(at) for at in range(len(slots))], [*map(_NUMBER.pack, slots)])
         try:
-            found = session.run()
-        except LocalError as refused:  # without memory; the next one is sent in time
-            log.debug("keepalive not sent reason=%s", refused)
-            session.send_at_s = now_s + session.offer.out_interval_s
-            return
-        session.sent_s.append(now_s)
-        session.heard_s = now_s - (found & 0xFFFFFF) * 1e-6
-        session.send_at_s = now_s + session.offer.out_interval_s * (1 - (found >> 24) * JITTER)
+            self._run(len(slots))
+        except LocalError as refused:  # without memory, or by a signal; some may have left
+            log.debug("keepalives not sent reason=%s", refused)
+            jitter = 1 - _AGAIN
+        for session in sessions:
+            session.send_at_s = now_s + session.offer.out_interval_s * (1 - jitter)
 
     def _plan(self, now_s: float) -> None:
-        """Set when the next tick is due; keepalives due within half an interval leave together from then on."""
+        """Set when the next tick is due; what is due within half an interval waits for one tick from then on."""
         send_at_s = silent_at_s = interval_s = NEVER_S
         for session in self._sessions.values():
             offer = session.offer
@@ -249,7 +271,8 @@ class KeepaliveSessions:
         if silent_at_s <= now_s:
             self.has_news = True
         self._send_at_s, self._together_s = send_at_s, interval_s / 2
-        self.due_s = min(send_at_s, max(silent_at_s, now_s + self._together_s))
+        look_at_s = max(silent_at_s, now_s + self._together_s)
+        self.due_s = send_at_s if send_at_s <= silent_at_s + self._together_s else min(send_at_s, look_at_s)
 
     def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
         """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""

@@ -14,10 +14,11 @@ import struct
 import sys
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from typing import Final
 
-from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
+from gdp.ports.kernel.syscall import BATCH, NAME_MAX, BpfError, Command, PreparedRead, address, bpf
 
 # BPF_F_NO_PREALLOC: an entry costs memory only while it exists. From Linux 6.1 on, the kernel may reuse a removed or
 # replaced element at once, while a frame in progress still reads it. For some nanoseconds that frame may see the port
@@ -26,7 +27,6 @@ from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
 # cost 18 MB.
 _NO_PREALLOC: Final = 1
 _POSSIBLE: Final = Path("/sys/devices/system/cpu/possible")
-_BATCH: Final = struct.Struct("=QQQQIIQQ")
 _STOPPED: Final = (errno.E2BIG, errno.ENOENT)
 _NO_BATCH: Final = (errno.EINVAL, 524)  # ENOTSUPP: arrays, before Linux 5.13
 _CHUNK: Final = 1 << 14  # entries per call: the kernel copies each one during the call
@@ -40,6 +40,7 @@ class MapKind(IntEnum):
     PERCPU_ARRAY = 6
 
 
+@cache
 def possible_cpus() -> int:
     """Return how many CPUs this kernel is prepared for, present or not."""
     ranges = (part.partition("-") for part in _POSSIBLE.read_text(encoding="ascii").strip().split(","))
@@ -131,25 +132,24 @@ class KernelMap:
 
     def read_array(self, count: int) -> bytes:
         """Return the first ``count`` values of an array, concatenated. Safe in any thread."""
-        keys, values, following = bytearray(4 * count), bytearray(self.value_bytes * count), bytearray(8)
-        places = (0, address(following), address(keys), address(values), count, self.fd, 0, 0)
+        if not count:
+            return b""
+        read = PreparedRead(self.fd, self.value_bytes, count)
         try:
-            if count:
-                bpf(Command.MAP_LOOKUP_BATCH, bytearray(_BATCH.pack(*places)), self._tried)
+            read()
         except BpfError as error:
             if error.number in _NO_BATCH:
                 return b"".join(self.get(index.to_bytes(4, sys.byteorder)) or b"" for index in range(count))
-            if error.number != errno.ENOENT:  # ENOENT only marks the end of the map
-                raise
-        return bytes(values)
+            raise
+        return bytes(read.values)
 
     def _batch(self, command: Command, keys: bytes, values: bytes, count: int) -> int:
         """Return how many were done, from the first on; the kernel reports it only if it refused one."""
-        attributes = bytearray(_BATCH.pack(0, 0, address(keys), address(values), count, self.fd, 0, 0))
+        attributes = bytearray(BATCH.pack(0, 0, address(keys), address(values), count, self.fd, 0, 0))
         try:
             bpf(command, attributes, self._tried)
         except BpfError as error:
-            return int(_BATCH.unpack(attributes)[4]) if error.number in _STOPPED else 0
+            return int(BATCH.unpack(attributes)[4]) if error.number in _STOPPED else 0
         return count
 
 

@@ -168,7 +168,7 @@ class KernelPlane(RawPlane):
             attach = FilterAttachment if self._loaded.is_leased else LinkAttachment
             self._attachments[port.index] = attach(self._loaded.program_of(port.index), ifindex, self._questions)
         except LocalError as error:
-            self._shut(port.index)
+            self._shut(port)
             raise LocalError(f"port {port.ifname}: {error}") from error
         if self._sessions is not None:
             self._sessions.attach(port.index, port.ifname)  # behind the forwarder, which passes on what is for us
@@ -184,14 +184,16 @@ class KernelPlane(RawPlane):
         sessions.has_news = True
         ready()
 
-    def _shut(self, index: int) -> None:
-        self._loaded.set_port(index, 0, 0, 0)
-        attachment = self._attachments.pop(index, None)
-        if attachment is not None:
+    def _shut(self, port: Port) -> None:
+        self._loaded.set_port(port.index, 0, 0, 0)
+        attachment = self._attachments.pop(port.index, None)
+        if isinstance(attachment, LinkAttachment):
+            self._closing.close(port.ifname, [attachment.close])
+        elif attachment is not None:
             attachment.close()
         if self._sessions is not None:
-            self._sessions.detach(index)
-        super()._shut(index)
+            self._closing.close(port.ifname, self._sessions.detach(port.index))
+        super()._shut(port)
 
     def _know(self, port: Port) -> None:
         self._tell_kernel(port)

@@ -77,7 +77,6 @@ class _Child:
     begun_s: float
     buffers: SocketBuffers
     said: bytes = b""
-
     has_output: bool = True
 
     @property
@@ -348,8 +347,6 @@ class _Keeper:
 
     def _serves(self) -> bool:
         """Return whether the program replies and has opened its UDP sockets."""
-        if not socket_path(self._ifname).exists():
-            return False
         try:
             return self._control.state().listen_port != 0
         except ControlLostError:
@@ -409,9 +406,12 @@ class _Keeper:
     def _spawn(self, program: str, environment: dict[str, str]) -> _Child:
         keeper_pid = os.getpid()
 
-        def die_with_keeper() -> None:
-            """Let the kernel end the program when this process dies."""
+        def prepare() -> None:
+            """Let the kernel end the program when this process dies, and let its threads interrupt no sender."""
             prctl(_DEATH_SIGNAL, signal.SIGTERM)
+            with contextlib.suppress(OSError):  # where a container refuses, each frame interrupts its sender
+                if os.sched_getscheduler(0) == os.SCHED_OTHER:  # a real-time class stays
+                    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
             if os.getppid() != keeper_pid:
                 os._exit(1)
 
@@ -422,7 +422,7 @@ class _Keeper:
             stderr=subprocess.STDOUT,
             env={"LOG_LEVEL": "error", **environment},
             pass_fds=[self._tun] if environment else [],
-            preexec_fn=die_with_keeper,  # noqa: PLW1509  this process has one thread
+            preexec_fn=prepare,  # noqa: PLW1509  this process has one thread
         )
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)

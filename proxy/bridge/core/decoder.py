@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from proxy.bridge.core.reduction import Restore
 from proxy.serial.channel import Channel, RosVersion
-from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
 from proxy.serial.serializer import Encoding, Serializer
+
+if TYPE_CHECKING:  # most proxies convert nothing
+    from proxy.serial.converter import MessageConverter
 
 
 class MessageDecoder:
@@ -50,11 +53,15 @@ class MessageDecoder:
             DefinitionError: the definitions differ, or this ROS has no such type.
         """
         if source.ros != ros:
+            from proxy.serial.converter import MessageConverter, translated_channel
+
             target = translated_channel(source, ros) if known is None else known
             return cls(source, encoding, target, MessageConverter(source, target, is_strict=is_strict))
         if known is None:
             return cls(source, encoding, source, None)
         if source.hash and known.hash and source.hash != known.hash:
+            from proxy.serial.converter import MessageConverter
+
             converter = MessageConverter(source, known, is_strict=is_strict)  # or its error names the first difference
             if converter.differences:
                 return cls(source, encoding, replace(known, qos=source.qos), converter)

@@ -14,10 +14,8 @@ from proxy.bridge.core.decoder import MessageDecoder
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import RosEndpoint
 from proxy.serial.channel import Channel
-from proxy.serial.converter import translated_channel
 from proxy.serial.serializer import Encoding
 from proxy.serial.service import Service
-from proxy.serial.service_converter import translated_service
 from proxy.wire.service import Exchange
 
 
@@ -84,6 +82,9 @@ class RemoteServer:
 
 def _ours(theirs: Exchange, parts: ActionInterface, endpoint: RosEndpoint, encoding: Encoding) -> Exchange:
     """Return this machine's description of the service, built from the remote definitions where it has none."""
+    from proxy.serial.converter import translated_channel
+    from proxy.serial.service_converter import translated_service
+
     services = list[Service]()
     for (name, type_name), their in zip(parts.services, theirs.services, strict=True):
         try:

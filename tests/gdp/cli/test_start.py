@@ -12,8 +12,25 @@ import pytest
 from gdp.cli.rib import rib
 from proxy.cli.proxy import proxy
 
-LARGE = {"networkx", "prometheus_client", "pyroute2", "rich", "rosbags.rosbag1", "rosbags.rosbag2", "scapy"}
-OF_NODES = {"asyncio", "cryptography.x509", "numpy", "pydantic", "yaml"}  # a short command needs none
+LARGE = {
+    "apsw",
+    "networkx",
+    "prometheus_client",
+    "pyroute2",
+    "rich",
+    "rosbags.rosbag1",
+    "rosbags.rosbag2",
+    "rosbags.typesys",
+    "ruamel.yaml",
+    "scapy",
+}
+OF_NODES = {
+    "asyncio",
+    "cryptography.hazmat.primitives.serialization",
+    "numpy",
+    "pydantic",
+    "yaml",
+}  # a short command needs none
 TUNNELS = {"gdp.links.tunnels", "gdp.ports.tunnel.wireguard"}
 
 
@@ -26,6 +43,7 @@ TUNNELS = {"gdp.links.tunnels", "gdp.ports.tunnel.wireguard"}
         ),
         ("gdp.cli.rib, gdp.nodes.rib", {"numpy", "gdp.client.participant", "gdp.diagnosis.facts", "gdp.switch.core"}),
         ("proxy.cli.proxy, proxy.node.bridge_node", {"numpy", "gdp.rib", "gdp.diagnosis.facts", "gdp.switch.core"}),
+        ("proxy.cli.proxy, proxy.node.recorder", {"numpy", "gdp.rib", "proxy.recordings.reader"}),
         ("gdp.cli.relay, gdp.nodes.relay", {"numpy", "gdp.client", "gdp.rib", "gdp.switch.core"}),
         ("fog.host.cli", set[str]()),
     ],
@@ -45,6 +63,8 @@ def test_a_node_starts_without_large_libraries_and_parts_of_other_nodes(modules:
         ("gdp.cli.gdp", ["name", "--kind", "topic", "--name", "/scan"]),
         ("gdp.cli.gdp", ["status", "--help"]),
         ("gdp.cli.gdp", ["topic", "list"]),
+        ("gdp.cli.gdp", ["topic", "--help"]),
+        ("gdp.cli.gdp", ["service", "--help"]),
         ("gdp.cli.switch", ["--help"]),
         ("gdp.cli.rib", ["--help"]),
         ("gdp.cli.relay", ["--help"]),

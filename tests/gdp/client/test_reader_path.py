@@ -38,6 +38,19 @@ def test_another_path_begins_with_no_larger_window_than_the_one_before_it() -> N
     assert path.controller.window == thin == 2 * MTU
 
 
+def test_what_left_by_another_switch_before_a_tree_reached_it_does_not_fill_the_window() -> None:
+    paths, now_s = ReaderPaths(), 10.0
+    path = paths.path(READER, now_s)
+    paths.tree_stands([READER], MTU)
+    path.acknowledged([path.sent(MTU, 1, now_s)], 0, 0.0, now_s + TRIP_S)
+    paths.attachment_changed(now_s + TRIP_S)
+    for stands in (True, False):  # a tree that is renewed frees nothing
+        path.sent(20 * MTU, 20, now_s + TRIP_S)
+        assert path.allowance(now_s + TRIP_S) == 0
+        paths.tree_stands([READER], MTU)
+        assert (path.allowance(now_s + TRIP_S) > 0) is stands
+
+
 def test_the_lost_end_of_a_full_window_lets_one_frame_out_whose_report_frees_it() -> None:
     paths, now_s = ReaderPaths(), 10.0
     path = paths.path(READER, now_s)

@@ -5,6 +5,7 @@ Test frames come in on the loopback device, whose index is 1 and whose address i
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -67,6 +68,7 @@ def sessions() -> Iterator[KeepaliveSessions]:
         pytest.skip(str(error).partition("\n")[0])
     made._links[0] = -1, LOOPBACK
     yield made
+    made.detach(0)
     made.close()
 
 
@@ -155,6 +157,7 @@ def twin() -> Iterator[KeepaliveSessions]:
         pytest.skip(str(error).partition("\n")[0])
     made._links[0] = -1, LOOPBACK
     yield made
+    made.detach(0)
     made.close()
 
 
@@ -174,7 +177,9 @@ def test_the_kernel_sends_what_the_node_would_send(
     given_offer = offer(out_key=key, sequence=sequence, sent=sent, echo=echo, head=head, loss=loss)
     twin.follow([given_offer], PORTS)
     slot = next(iter(twin._sessions.values())).slot
-    frame = syscall.run(twin._programs[1], slot.to_bytes(4, "little").ljust(FRAME_BYTES, b"\0")).frame
+    twin._slots.put(bytes(4), slot.to_bytes(4, sys.byteorder))
+    twin._listed = []
+    frame = syscall.run(twin._programs[1], bytes(FRAME_BYTES)).frame
     twin.follow([], PORTS)
     assert frame[:ETHER_BYTES] == ethernet(given_offer.mac, PORTS[0].mac)
     assert decode(frame[ETHER_BYTES:]) == keepalive_header(OWN, 8, sequence + 1)
@@ -189,7 +194,10 @@ def test_what_is_due_leaves_in_one_tick_and_a_silent_neighbour_is_handed_back(se
     sessions.follow([offer(), late], PORTS)
     now_s = time.monotonic()
     assert sessions.due_s <= now_s
+    calls, send = list[int](), sessions._run
+    sessions._run = lambda repeat: calls.append(repeat) or send(repeat)  # type: ignore[assignment,func-returns-value]
     sessions.tick(now_s)
+    assert calls == [2]
     assert [len(each.sent_s) for each in sessions._sessions.values()] == [1, 1]
     assert now_s < sessions.due_s <= now_s + INTERVAL_S
     silent_s = now_s + 2 * INTERVAL_S
@@ -199,6 +207,19 @@ def test_what_is_due_leaves_in_one_tick_and_a_silent_neighbour_is_handed_back(se
     assert [each.is_over for each in runs] == [True, True]
     assert late_s > 0
     assert sessions.due_s == float("inf")
+
+
+def test_a_second_tick_in_an_interval_is_rare(sessions: KeepaliveSessions) -> None:
+    begun_s = now_s = time.monotonic()
+    sessions.follow([offer(heard_s=begun_s, send_at_s=begun_s)], PORTS)
+    ticks, intervals = 0, 200
+    while now_s < begun_s + intervals * INTERVAL_S:
+        heard_s = now_s - (now_s - begun_s) % INTERVAL_S
+        sessions._read = lambda heard_s=heard_s: [(0, 0, 0, int(heard_s * 1e9))]  # type: ignore[method-assign,misc]
+        sessions.tick(now_s)
+        ticks += 1
+        now_s = max(now_s, sessions.due_s)
+    assert ticks < 1.5 * intervals
 
 
 def test_a_number_of_a_frame_is_where_the_program_expects_it() -> None:
