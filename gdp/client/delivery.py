@@ -44,6 +44,7 @@ class Delivered(NamedTuple):
     place: int = 0  # index among the messages of one number: a bundle has several
     # which message of its publisher's incarnation this is, from 1; a skipped number is a lost message
     sequence: int = 0
+    head: bytes = b""  # of the message, where its reader asked for it apart; bundled messages have none
 
 
 class Ended(NamedTuple):
@@ -167,7 +168,7 @@ class Delivery:
             else:
                 self.gap_until_s = NEVER_S
         elif self._put(reassembled):
-            self.known = max(self.known, min(int.from_bytes(reassembled.head, "big"), NUMBER_MAX) + 1)
+            self.known = max(self.known, min(int.from_bytes(reassembled.head[:SEQUENCE_BYTES], "big"), NUMBER_MAX) + 1)
             if not self.is_reliable:
                 self._deliver(now_s)
         elif self.is_live:
@@ -308,14 +309,15 @@ class Delivery:
     def _unpack(self, reassembled: ReassembledMessage) -> None:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
         number, flags, body, parts, hops, head = reassembled
-        sequence, messages, count = int.from_bytes(head, "big"), [body], 1
-        self.delivered_bytes += len(body)
+        sequence, messages, count = int.from_bytes(head[:SEQUENCE_BYTES], "big"), [body], 1
+        begin = head[SEQUENCE_BYTES:]
+        self.delivered_bytes += len(begin) + len(body)
         if len(head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
             self._data.drops[DropReason.MALFORMED] += 1
             return
         if flags & _BUNDLE:
             try:
-                messages = unpack(body)
+                begin, messages = b"", unpack(begin + body)
             except RemoteError as error:
                 self._data.drops[error.reason] += 1
                 return
@@ -328,7 +330,7 @@ class Delivery:
         self.delivered += count
         publisher, incarnation = self._publisher, self._incarnation
         for place, message in enumerate(messages):
-            delivered = publisher, incarnation, number, message, parts, hops, place, sequence + place
+            delivered = publisher, incarnation, number, message, parts, hops, place, sequence + place, begin
             self.ready.append(new_tuple(Delivered, delivered))
 
     @property

@@ -23,7 +23,7 @@ from gdp.client.reader_proxies import CALLS, TOPICS
 from gdp.client.reception import Reception
 from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
 from gdp.client.services import Services, StallClock
-from gdp.client.subscription import Message, Subscriptions, Topic
+from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.client.unicast_stream import PeerIncarnation
 from gdp.client.writer_proxy import WriterProxy
 from gdp.control.boundary import ErrorBoundary
@@ -213,10 +213,12 @@ class Participant:
             self._close(self.subscriptions.remove(name))
         self._control.touch().withdraw(name, right)
 
-    def subscribe(self, topic: Topic, *, paths: int = 1) -> None:
-        """Read a topic from now on, from every publisher of it; ``paths`` 2: by two paths from those that want two."""
+    def subscribe(self, topic: Topic, *, paths: int = 1, head_bytes: int = 0) -> None:
+        """Read a topic from now on, from every publisher of it; the others as in ``Subscription``."""
         self._check(topic, Right.READ, is_free=self.subscriptions.get(topic.name) is None)
-        self.subscriptions.add(topic, Right.READ, self._clock.now_s, paths)
+        self.subscriptions.add(
+            Subscription(topic=topic, right=Right.READ, since_s=self._clock.now_s, paths=paths, head_bytes=head_bytes)
+        )
         self._control.touch().advertisement(
             topic.delegation.subject, Right.READ, topic.delegation.chain, is_global=False, paths=paths
         )
@@ -389,7 +391,9 @@ class Participant:
         settings = PublisherSettings(urgent=urgent, patience=patience, paths=paths, options=options)
         publisher = self.publications.add(topic.name, topic.own_secrets, description, settings)
         self.publications.enable_unicast(topic.name, topic.own_secrets, settings)
-        self.subscriptions.add(topic, right, self._clock.now_s, paths, is_session=is_session)
+        self.subscriptions.add(
+            Subscription(topic=topic, right=right, since_s=self._clock.now_s, paths=paths, is_session=is_session)
+        )
         self._control.touch().advertisement(
             topic.delegation.subject,
             right,

@@ -255,25 +255,27 @@ class Publisher:
             self.acknowledgements.renumber(move)
         return is_resealed or move is not None
 
-    def publish(self, message: bytes, now_s: float | None = None) -> int | None:
+    def publish(self, message: bytes, now_s: float | None = None, head: bytes = b"") -> int | None:
         """Queue a message; return the count of published messages, or None when there is no reader.
 
         The message is confirmed when ``acknowledged`` reaches that count.
 
         Args:
             now_s: from when it ages, on a best-effort topic; None: from when frames are polled next.
+            head: first bytes of the message, so that a large one need not be copied; shorter than a frame.
 
         Raises:
             LocalError: above the limits.
         """
         if not self.is_wanted:
             if self.queue.kept:
-                self.queue.defer(message, now_s)
+                self.queue.defer(head + message, now_s)
             else:
                 self.drops[DropReason.NO_READER] += 1
                 self.skip(LossReason.NO_READER, now_s)
             return None
-        self.queue.add(message, gather_bytes=WINDOW_BYTES if self.matched.active else BUNDLE_BYTES, added_s=now_s)
+        gather_bytes = WINDOW_BYTES if self.matched.active else BUNDLE_BYTES
+        self.queue.add(message, gather_bytes=gather_bytes, added_s=now_s, head=head)
         self.published(self)
         return self.queue.ledger.messages
 

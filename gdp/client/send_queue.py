@@ -151,11 +151,12 @@ class SendQueue:
             self._window.release_aged(now_s)
             self.deferred.drop_beyond(self.kept, self.options, now_s, is_latched=self.depth > 0)
 
-    def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None) -> None:
+    def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None, head: bytes = b"") -> None:
         """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
 
         Args:
             added_s: when it is published; None: when frames are polled next.
+            head: goes before it under the seal.
 
         Raises:
             LocalError: above the limits.
@@ -163,12 +164,13 @@ class SendQueue:
         gathered, most = self._gathered, self._frame_capacity
         if self.deferred.waiting:
             self.seal_deferred()
-        if self.depth or not gathered.is_small(message, most if most < self.bundle_bytes else self.bundle_bytes):
+        most = most if most < self.bundle_bytes else self.bundle_bytes
+        if self.depth or not gathered.is_small(len(head) + len(message), most):
             self.seal_gathered()
-            self._seal_message(message, self.ledger.last + 1, added_s=added_s)
+            self._seal_message(message, self.ledger.last + 1, added_s=added_s, head=head)
             self.ledger.next(added_s)
             return
-        gathered.add(self.ledger.next(added_s), message, added_s)
+        gathered.add(self.ledger.next(added_s), head + message, added_s)
         if gathered.held_bytes > gather_bytes:
             self._seal_next()
 
@@ -312,11 +314,13 @@ class SendQueue:
         count = len(together)
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
 
-    def _seal_message(self, body: bytes, sequence: int, messages: int = 1, added_s: float | None = None) -> None:
+    def _seal_message(
+        self, body: bytes, sequence: int, messages: int = 1, added_s: float | None = None, head: bytes = b""
+    ) -> None:
         """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
         assert self.mtu is not None
         number, ledger = self.next_number, self.ledger
-        prefix = sequence.to_bytes(SEQUENCE_BYTES, "big")
+        prefix = sequence.to_bytes(SEQUENCE_BYTES, "big") + head
         frames = self._seal(number, body, self.mtu, is_bundle=messages > 1, prefix=prefix)
         self.next_number += 1
         if not self.is_acknowledged:

@@ -79,6 +79,7 @@ class Subscription:
     Attributes:
         paths: over how many paths frames come, and reports go, where the peer wants the same.
         is_session: a session secret authenticates the unicast streams of this name, where the peer wants the same.
+        head_bytes: of each message, delivered apart, so that the rest need not be copied; a bundled message is whole.
         private: by writer.
         absent: publishers whose route has ended, with their incarnation, and where their writer proxies ended.
         past_losses: of closed writer proxies.
@@ -90,6 +91,7 @@ class Subscription:
     since_s: float
     paths: int = 1
     is_session: bool = False
+    head_bytes: int = 0
     writer_proxies: dict[Name, WriterProxy] = field(default_factory=dict)
     private: dict[Name, UnicastReceiver] = field(default_factory=dict)
     absent: dict[Name, tuple[int, Ended]] = field(default_factory=dict)
@@ -212,16 +214,9 @@ class Subscriptions:
         is_session = subscription.has_session(writer_proxy)
         return Party(incarnation_id, writer_proxy.exchange, writer_proxy.second_path_s, is_session)
 
-    def add(self, topic: Topic, right: Right, now_s: float, paths: int = 1, *, is_session: bool = False) -> None:
-        """Read a name from now on.
-
-        Args:
-            paths: over how many paths its frames are to come.
-            is_session: a session secret may authenticate its unicast streams.
-        """
-        self._by_name[topic.name] = Subscription(
-            topic=topic, right=right, since_s=now_s, paths=paths, is_session=is_session
-        )
+    def add(self, subscription: Subscription) -> None:
+        """Read a name from now on."""
+        self._by_name[subscription.topic.name] = subscription
 
     def remove(self, name: Name) -> list[WriterProxy]:
         """Stop reading a name; return the writer proxies to close."""
@@ -318,6 +313,7 @@ class Subscriptions:
             before=ended._replace(is_restarted=incarnation_id != advertisement.incarnation),
             waits_since_s=subscription.since_s,
         )
+        writer_proxy.set_head(subscription.head_bytes)
         subscription.writer_proxies[party] = writer_proxy
         subscription.set_advertisement(writer_proxy, advertisement)
         if subscription.right is Right.SERVE:

@@ -118,7 +118,8 @@ class WriterProxy:
             topic=topic, reader=reader, publisher=publisher, secrets=secrets, introduces=introduces, now_s=now_s
         )
         key, budget, opener = publisher.key, reader.budget, self._keys.opener
-        self._data = Reassembler(name, partial(opener, Kind.DATA), key, budget, head_bytes=SEQUENCE_BYTES)
+        self._data = Reassembler(name, partial(opener, Kind.DATA), key, budget)
+        self.set_head(0)
         self._status = Reassembler(name, partial(opener, Kind.HEARTBEAT), key, budget)
         self.schedule = AckNackSchedule(self._data, now_s)
         self._copies: SecondCopies | StripedPaths | None = None
@@ -157,6 +158,10 @@ class WriterProxy:
             self._striped = StripedPaths() if paths == SPREAD else None
             self._copies = SecondCopies() if paths > 1 and self._striped is None else self._striped
             self._data.copies, self._status.copies = self._copies, SecondCopies() if paths > 1 else None
+
+    def set_head(self, head_bytes: int) -> None:
+        """Deliver so many bytes of each message apart."""
+        self._data.head_bytes = SEQUENCE_BYTES + head_bytes
 
     @property
     def drops(self) -> Counter[DropReason]:

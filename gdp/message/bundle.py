@@ -58,9 +58,9 @@ class Gathered:
         self.held_bytes = 0
 
     @staticmethod
-    def is_small(message: bytes, capacity: int) -> bool:
+    def is_small(size: int, capacity: int) -> bool:
         """Return whether several messages of this size fit into a bundle of ``capacity`` bytes."""
-        return _SMALL * (len(message) + _LENGTH.size) <= capacity
+        return _SMALL * (size + _LENGTH.size) <= capacity
 
     @property
     def oldest_bytes(self) -> int:

@@ -94,9 +94,9 @@ class Reassembler:
         writer: the key that must have signed; None: the openers are of a session secret, whose seals prove the writer.
         budget: shared by all reassemblers of the node.
         patience_s: an unfinished message is dropped this long after its last new fragment.
-        head_bytes: how many bytes come before each message; fewer than any first fragment has.
 
     Attributes:
+        head_bytes: how many bytes come before each message; fewer than any first fragment has.
         copies: delay of the second copies, of a source that sends each frame over two paths; None: it does not.
         repeats: copies of urgent frames over one path.
         unfinished_bytes: memory that unfinished messages hold.
@@ -111,9 +111,8 @@ class Reassembler:
         budget: ReassemblyQuota,
         *,
         patience_s: float = JOIN_PATIENCE_S,
-        head_bytes: int = 0,
     ) -> None:
-        self._head_bytes = head_bytes
+        self.head_bytes = 0
         self._source = source
         self._opener_of = opener_of
         self._writer = writer
@@ -240,7 +239,7 @@ class Reassembler:
             self.copies.handle_first(number, 0, now_s)
         elif header.flags & _URGENT:
             self.repeats.handle_first(number, 0, now_s)
-        head, message = plain[: self._head_bytes], plain[self._head_bytes :]
+        head, message = plain[: self.head_bytes], plain[self.head_bytes :]
         hops = HOPS_MAX - (header.hops_left & HOPS_MASK)
         hops = hops if hops > 0 else 0  # it states more than a source may
         return new_tuple(ReassembledMessage, (number, header.flags & SHARED_FLAGS, message, 1, hops, head))
@@ -287,7 +286,7 @@ class Reassembler:
         if in_order:
             if not header.part:
                 message.plain = burst.PLAINTEXT(header.parts * len(plain))
-                message.before, plain = plain[: self._head_bytes], plain[self._head_bytes :]
+                message.before, plain = plain[: self.head_bytes], plain[self.head_bytes :]
             message.append(plain, sealed)
             while message.early and (early := message.early.pop(message.hashed, None)) is not None:
                 message.append(*early)

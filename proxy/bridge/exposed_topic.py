@@ -223,16 +223,17 @@ class ExposedTopic:
             publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
             return
         body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)
-        message = RosMessage(event.channel, event.stamp_ns, body, steps).to_wire()
+        head = RosMessage(event.channel, event.stamp_ns, body, steps).head
+        size = len(head) + len(body)
         try:
-            count = publisher.publish(message, now_s)
+            count = publisher.publish(body, now_s, head)
         except LocalError as error:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
         if count is not None:
-            adaptation.handle_sent(count, len(message), now_s)
-        traffic.sent(len(message))
+            adaptation.handle_sent(count, size, now_s)
+        traffic.sent(size)
         self._count(event)
 
     def _count(self, event: MessageReceived) -> None:

@@ -32,7 +32,7 @@ from proxy.endpoints.core.qos import unmatched
 from proxy.serial.channel import Channel
 from proxy.serial.frames import FrameRewriter
 from proxy.serial.schema import DefinitionError
-from proxy.wire.message import RosMessage, TopicDescription
+from proxy.wire.message import HEAD_BYTES, RosMessage, TopicDescription
 
 _HEARD_MAX = 1_024  # publishers
 _SAMPLES_MAX = 4_096  # latencies kept of a live topic
@@ -88,7 +88,8 @@ class ImportedTopic:
         self._tell_unmatched(ends)
         if ends and not self.is_joined:
             self.is_joined = True
-            self._context.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
+            paths = paths_value(self._flow_spec.rule.paths)
+            self._context.member.subscribe(self._topic, paths=paths, head_bytes=HEAD_BYTES)
         elif not ends and self.is_joined:
             self._leave()
             self._output.drop_kept()
@@ -187,7 +188,7 @@ class ImportedTopic:
             traffic.thinned += 1
             self.thinned += 1
             return
-        ros_message = RosMessage.from_wire(delivered.message)
+        ros_message = RosMessage.from_wire(delivered.message, delivered.head)
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
@@ -204,7 +205,7 @@ class ImportedTopic:
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.stats.add(latency_ms, delivered.parts, delivered.hops, len(raw))
         traffic.latency.observe(latency_ms / 1e3)
-        traffic.received(len(delivered.message))
+        traffic.received(len(delivered.head) + len(delivered.message))
 
     def _describe(self, publisher: bytes, description: TopicDescription) -> tuple[_Decoded, ...] | None:
         """Prepare the decoders of a publisher's channels; None if this graph cannot have them."""

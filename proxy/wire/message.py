@@ -27,6 +27,7 @@ VERSION: Final = 1
 CHANNELS_MAX: Final = 256
 DESCRIPTION_MAX_BYTES: Final = 4 << 20  # many channels of one topic may contain the same definition
 _HEAD: Final = struct.Struct("!BBBQ")
+HEAD_BYTES: Final = _HEAD.size
 
 
 def _known(form: Form[_T], what: str) -> Form[_T]:
@@ -70,21 +71,27 @@ class RosMessage(NamedTuple):
     body: bytes
     steps: Step = Step(0)
 
+    @property
+    def head(self) -> bytes:
+        """Return the wire form without the body, which follows."""
+        return _HEAD.pack(VERSION, self.steps, self.channel, self.stamp_ns)
+
     def to_wire(self) -> bytes:
         """Return the wire form."""
-        return _HEAD.pack(VERSION, self.steps, self.channel, self.stamp_ns) + self.body
+        return self.head + self.body
 
     @classmethod
-    def from_wire(cls, wire: bytes) -> RosMessage:
-        """Read the wire form."""
-        if len(wire) < _HEAD.size:
+    def from_wire(cls, wire: bytes, head: bytes = b"") -> RosMessage:
+        """Read the wire form, of which ``head`` came apart: at most ``HEAD_BYTES``, and the body is not copied then."""
+        begin = HEAD_BYTES - len(head)
+        if len(wire) < begin:
             raise RemoteError(DropReason.MALFORMED, "parcel")
-        version, steps, channel, stamp_ns = _HEAD.unpack_from(wire)
+        version, steps, channel, stamp_ns = _HEAD.unpack(head + wire[:begin])
         if version != VERSION:
             raise RemoteError(DropReason.BAD_VERSION, f"parcel version {version}")
         if steps & ~_STEPS:
             raise RemoteError(DropReason.BAD_VERSION, f"steps {steps:#x} that are unknown here")
-        return cls(channel, stamp_ns, wire[_HEAD.size :], Step(steps))
+        return cls(channel, stamp_ns, wire[begin:], Step(steps))
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,10 +54,6 @@ class Source(Protocol):
         """Return the handle of the entity at the endpoint."""
 
     @property
-    def entity(self) -> Entity:
-        """Return rclpy's object."""
-
-    @property
     def kind(self) -> Kind:
         """Return the kind of entity in a wait set."""
 
