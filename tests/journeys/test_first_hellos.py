@@ -25,8 +25,8 @@ def test_no_frame_comes_before_the_hello_that_makes_its_sender_a_neighbour(late_
     with patch.object(late, "add_port", lambda *port: seen.append(port)):
         network.set_link(link, up=True)
     network.run(late_s)
-    ((*port, _),) = seen
-    late.add_port(*port, network.now)
+    ((index, mac, mtu, cost, _),) = seen
+    late.add_port(index, mac, mtu, cost, network.now)
     network._settle("nuc3")
     network.run(1)
     assert not sum(switch.drops()[DropReason.UNKNOWN_SENDER] for switch in world.switches.values())
