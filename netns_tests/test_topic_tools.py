@@ -106,7 +106,8 @@ def rows(text: str) -> list[dict[str, object]]:
 
 def test_echo_prints_a_message_as_ros2_does(lab: SessionLab) -> None:
     code, out, errors = gdp(lab, "topic", "echo", "/chat", "--node", "viewer", "--once", "-l", "12")
-    assert (code, errors) == (0, "")
+    # on a busy machine DDS takes seconds to find the robot
+    assert (code, [line for line in errors.splitlines() if not line.endswith("; still waiting")]) == (0, [])
     text, end = out.split("---\n")
     assert yaml.safe_load(text)["data"].startswith("message ")
     assert len(yaml.safe_load(text)["data"]) == 12 + len("...")
