@@ -130,6 +130,12 @@ class KeepaliveOffload(Protocol):
     def take_runs(self, runs: list[KeepaliveRun], late_s: float, now: Timestamps) -> None:
         """Note what a data plane did in sessions; it was called so much later than it had requested."""
 
+    def frames_came(self, now_s: float) -> bool:
+        """Note that frames were received; return whether the core's timers are to run now, before they are due."""
+
+    def latest_s(self, due_s: float) -> float:
+        """Return until when a timer that is due at a monotonic second may wait for frames."""
+
 
 class ProtocolCore(Protocol):
     """A switch, a RIB or a participant, as an I/O layer or a simulated network drives it."""

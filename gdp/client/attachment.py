@@ -250,6 +250,7 @@ class Attachment:
         statement = parse(wire)
         if header.kind == Kind.HELLO:
             if self.hello_protocol.receive(arrival, statement, now) is not None:
+                self.outgoing += self.hello_protocol.hellos_to_send(now.mono_s)  # ahead of all else
                 self._choose_switch(now.mono_s)
             return None
         assert switch is not None  # checked above
@@ -392,7 +393,7 @@ class Attachment:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
             # frames before our echo are dropped
-            advertisement_at_s = echo_at_s if echo_at_s <= now_s + ANSWER_S else now_s
+            advertisement_at_s = echo_at_s if echo_at_s <= now_s + 2 * ANSWER_S else now_s
             for each in self._advertisements.values():
                 # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
                 # first. Without a RIB the others are valid on this switch only.

@@ -329,6 +329,7 @@ class Participant:
         timers, own_s = self._reception.timers, self.publications.next_due()
         read_s = timers.next_due() if timers.touched else timers.due_s
         own_s = own_s if own_s < read_s else read_s
+        self.offload.urgent_s = own_s
         return own_s if due_s is None or own_s < due_s else due_s
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:

@@ -29,7 +29,7 @@ _CREDIT_MAX_BYTES: Final = 16 << 10
 _QUALITIES_MAX: Final = 128  # neighbours and former ones; above all that a port has at once
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
-ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
+ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but on average not more often than this
 _EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
 UNREACHABLE: Final = (-1, -1)
 
@@ -54,7 +54,7 @@ class HelloPort:
     answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` allow
     credit_bytes: int = 0  # received from them, and not answered yet
     owes_answer: bool = False  # an answer waits for credit
-    said_s: float = float("-inf")
+    said_s: tuple[float, float] = (float("-inf"),) * 2  # of the last hello but one, and of the last
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
     ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
     # joins that were accepted, by session of the far end
@@ -102,10 +102,14 @@ class HelloPort:
         """Send a hello at ``at_s`` or before, and then often for a while: its content has changed."""
         self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
 
+    def next_hello_s(self, now_s: float) -> float:
+        """Return when a hello may leave that something asks for: two at once, as a handshake needs them."""
+        return max(now_s, self.said_s[0] + 2 * ANSWER_S)
+
     def schedule_hello(self, received_bytes: int, now_s: float) -> None:
         """Send a hello to candidates soon, with at most as many bytes as came from candidates."""
         self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
-        self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + ANSWER_S))
+        self.answer_at_s = min(self.answer_at_s, self.next_hello_s(now_s))
 
     def note_address(self, mac: bytes) -> bool:
         """Note that a neighbour has this address; return whether that is news."""

@@ -48,6 +48,7 @@ _DIGEST: Final = "sha256"
 _PURPOSE: Final = b"gdp-keepalive-1"
 _SAME_MIN: Final = 2
 SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
+TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 _POLLS_PER_INTERVAL: Final = 4
 QUEUED_S: Final = 3.0  # longest time in which a neighbour whose other frames come may be silent
 _FORGET_S: Final = 10.0
@@ -121,6 +122,7 @@ class KeepaliveSession:
         out_interval_s: between those that are sent.
         in_interval_s: between those that the neighbour sends.
         detect_s: the neighbour is down after this time of silence.
+        latest_s: when an interval ends after the last one that was sent.
         received: highest sequence number that came.
         is_alive: one has come.
         hears_us: the neighbour reports that it receives ours.
@@ -142,6 +144,7 @@ class KeepaliveSession:
     detect_s: float
     received: int
     send_at_s: float
+    latest_s: float = 0.0
     poll_at_s: float = 0.0
     is_final_due: bool = False
     is_alive: bool = False
@@ -223,6 +226,7 @@ class KeepaliveSession:
         header = keepalive_header(name, incarnation, sequence)
         frame = seal_keepalive(self.out_key, header, flags, multiplier, digest, self.quality.report_to_send(now_s))
         self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * JITTER)
+        self.latest_s = now_s + self.out_interval_s
         is_queued = self.arrivals is not None and now_s - self.arrived_s < self.detect_s
         self.poll_at_s = now_s + self.in_interval_s / (1 if is_queued else _POLLS_PER_INTERVAL)
         return frame

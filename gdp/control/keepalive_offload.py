@@ -8,18 +8,18 @@ keepalive that brings news, or when the neighbour is silent; polls and loss are 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from gdp.control.hello import Timing
 from gdp.control.hello_port import HelloPort
-from gdp.control.keepalive import SUSPECT_AFTER, KeepaliveSession, keepalive_header
+from gdp.control.keepalive import SUSPECT_AFTER, TOGETHER, KeepaliveSession, keepalive_header
 from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import encode
 from gdp.frame.kinds import KeepaliveFlag
-from gdp.intervals import UPKEEP_S
+from gdp.intervals import NEVER_S, SCHEDULED_S, UPKEEP_S
 from gdp.limits import COST_AUTO
 from gdp.names import Name
 from gdp.sansio import KeepaliveOffer, KeepaliveRun, Timestamps
@@ -36,6 +36,8 @@ class SessionOffload:
     Attributes:
         refused: keepalives that data planes refused, by reason.
         has_changed: timers have changed since the node's protocol set this to False.
+        has_heard: a keepalive has come since ``frames_came``.
+        urgent_s: monotonic second of the node's first timer that waits for no frames.
         on_runs: called with the neighbours that were heard after each report.
     """
 
@@ -53,7 +55,8 @@ class SessionOffload:
         self._policy = policy
         self._head_for = head_for
         self.refused: Counter[DropReason] = Counter()
-        self.has_changed = False
+        self.has_changed = self.has_heard = False
+        self.urgent_s = NEVER_S
         self.on_runs: Callable[[list[Neighbour], Timestamps], object] = lambda _heard, _now: None
 
     def offers(self, now_s: float) -> list[KeepaliveOffer]:
@@ -90,6 +93,27 @@ class SessionOffload:
             out_interval_s=session.out_interval_s,
             suspect_s=SUSPECT_AFTER * session.in_interval_s,
         )
+
+    def frames_came(self, now_s: float) -> bool:
+        """Return whether a keepalive came, and one of ours may leave now; timers are read again then."""
+        has_heard, self.has_heard = self.has_heard, False
+        if not has_heard:
+            return False
+        self.has_changed = True
+        return any(each.send_at_s <= now_s + each.out_interval_s * TOGETHER for each in self._own_sessions())
+
+    def latest_s(self, due_s: float) -> float:
+        """Return until when a timer that is due then may wait for frames: one is that of a keepalive of ours."""
+        latest = (each.latest_s for each in self._own_sessions() if each.send_at_s == due_s)
+        return min(max(latest, default=due_s), due_s + SCHEDULED_S / 2, max(self.urgent_s, due_s))
+
+    def _own_sessions(self) -> Iterator[KeepaliveSession]:
+        """Yield the steady sessions that the node runs itself."""
+        for port in self._neighbours.ports.values():
+            for neighbour in port.neighbours.values():
+                session = neighbour.keepalives
+                if session is not None and session.is_steady and not session.is_offloaded:
+                    yield session
 
     def take_runs(self, runs: list[KeepaliveRun], late_s: float, now: Timestamps) -> None:
         """Note what a data plane did in sessions.

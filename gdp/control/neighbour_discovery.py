@@ -27,10 +27,10 @@ from gdp.control.admission import Admission, read_cookie, seal_cookie
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
-from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
+from gdp.control.hello_port import UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
-from gdp.control.keepalive import KeepaliveSession
+from gdp.control.keepalive import TOGETHER, KeepaliveSession
 from gdp.control.keepalive_offload import SessionOffload
 from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourEvent, NeighbourState
@@ -50,7 +50,6 @@ from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
-_TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 
 class HelloProtocol:
@@ -169,7 +168,7 @@ class HelloProtocol:
         if endpoint is not None:
             port.observed[name] = endpoint
         self._next_s = None
-        port.hurry(port.said_s + ANSWER_S)
+        port.hurry(port.next_hello_s(port.said_s[1]))
 
     @property
     def drops(self) -> Counter[DropReason]:
@@ -189,7 +188,7 @@ class HelloProtocol:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a cookie")
         self._next_s = None
         known.cookie = cookie
-        port.hello_at_s = min(port.hello_at_s, port.said_s + self._hello_s)
+        port.hello_at_s = min(port.hello_at_s, port.said_s[1] + self._hello_s)
 
     def receive(self, arrival: ReceivedFrame, statement: Statement, now: Timestamps) -> Change | None:
         """Process a hello; return what it changed.
@@ -230,7 +229,7 @@ class HelloProtocol:
             if not has_news:
                 port.schedule_hello(received_bytes, now.mono_s)
         if has_news:
-            port.hurry(max(now.mono_s, port.said_s + ANSWER_S))
+            port.hurry(port.next_hello_s(now.mono_s))
         if is_new_session and not is_two_way and known.is_proven:
             known.candidate, known.candidate_sequence = hello.nonce, hello.sequence
             # a restart, or a replayed hello: only an echo of our nonce decides
@@ -358,7 +357,7 @@ class HelloProtocol:
             return
         own, far = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
         if self.preshared_keys.receive(port.index, neighbour.name, hello.preshared, own, far):
-            port.hurry(max(now_s, port.said_s + ANSWER_S))
+            port.hurry(port.next_hello_s(now_s))
 
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
         """Process a keepalive; return the neighbour that sent it.
@@ -382,6 +381,7 @@ class HelloProtocol:
         if known.keepalives.is_final_due or self.liveness.is_probing:
             self._next_s = None  # any other change only delays timers
         self.liveness.note_alive(known, now.mono_s - arrival.waited_s)
+        self.offload.has_heard = True
         return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
@@ -442,7 +442,7 @@ class HelloProtocol:
                 if session is None or session.is_offloaded:
                     continue
                 is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
-                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
+                if is_suspect or session.send_at_s <= now_s + session.out_interval_s * TOGETHER:
                     if is_suspect:
                         session.note_poll(now_s)
                     self.liveness.note_silence(neighbour, session, now_s)
@@ -470,7 +470,7 @@ class HelloProtocol:
 
     def _find_next(self) -> float:
         due_s = self.liveness.find_next()
-        self.together_s = self.liveness.longest_s * _TOGETHER
+        self.together_s = self.liveness.longest_s * TOGETHER
         for port in self.ports.values():
             if port.is_up:
                 due_s = min(due_s, port.hello_at_s, port.answer_at_s)
@@ -513,7 +513,7 @@ class HelloProtocol:
 
     def _hello(self, port: HelloPort, now_s: float) -> list[bytes]:
         port.sequence += 1
-        port.said_s, port.answer_at_s = now_s, NEVER_S
+        port.said_s, port.answer_at_s = (port.said_s[1], now_s), NEVER_S
         heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(

@@ -61,6 +61,7 @@ CALLS: Final[Mapping[str, tuple[Callable[[Any], Any], ...]]] = {  # each argumen
     "add_port": (int, _octets, int, int, _moment),
     "port_changed": (int, bool, _moment),
     "receive": (_arrivals, _moment),
+    "offload.frames_came": (float,),
     "offload.take_runs": (lambda value: [KeepaliveRun.from_fields(each) for each in value], float, _moment),
     "handle_timer": (_moment,),
     "revoke": (_octets, _moment),

@@ -193,8 +193,13 @@ class Runtime:
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.get_timer()
-            first_s = earliest(self._deadline_s, latest_s, self._periodic_s())
+            due_s = self._deadline_s
+            if due_s is not None and len(self._plane.ports) == 1:
+                due_s = self._machine.offload.latest_s(due_s)
+            first_s = earliest(due_s, latest_s, self._periodic_s())
             arrivals = self._wait(None if first_s is None else max(first_s - time.monotonic(), 0.0))
+        elif self._deadline_s is None:
+            self._deadline_s = self._machine.get_timer()
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
         keepalives, has_news = self._keepalives, False
@@ -203,12 +208,14 @@ class Runtime:
             self._take_runs(*keepalives.poll(moment.mono_s), moment)
         if arrivals:
             self._machine.receive(arrivals, moment)
+            if len(self._plane.ports) == 1 and self._machine.offload.frames_came(moment.mono_s):
+                self._deadline_s = moment.mono_s  # a node with one link is woken once for what comes and what leaves
             for follow in self._after_receive:
                 follow()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.handle_timer(moment)
-            has_news = True
-            self._deadline_s = self._machine.get_timer()
+            self.send()  # keepalives and reports, of which most often no more follow
+            has_news, self._deadline_s = True, None
         if keepalives is not None and has_news:
             offers = self._machine.offload.offers(moment.mono_s)
             self._take_runs(keepalives.follow(offers, self._plane.ports), 0.0, moment)

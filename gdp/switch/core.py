@@ -394,6 +394,8 @@ class SwitchCore:
         if kind == Kind.HELLO:
             change = self.hello_protocol.receive(arrival, statement, now)
             if change is not None:
+                # ahead of all that the far end takes only from a neighbour that is up
+                self.state.outbox.waiting += self.hello_protocol.hellos_to_send(now.mono_s)
                 self._neighbour_changed(change, now.mono_s)
             known = self.hello_protocol.neighbours.get(arrival.port, statement.signer)
             if known is not None and known.role.is_switch and not self._flooding.is_in_step(known):

@@ -9,6 +9,7 @@ PSS, in which processes share what they have in common.
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
@@ -96,6 +97,7 @@ def star() -> Topology:
 def measure(options: Options) -> Outcome:
     """Measure the commands, then the nodes, in each round."""
     over = Rounds()
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a second start finds its modules compiled, as on any machine
     for _ in range(options.rounds):
         with new_run() as run:
             figures: Figures = {text: command(text) for text in COMMANDS} | nodes(Lab(run, chain(3)), options.seconds)

@@ -33,6 +33,7 @@ _PROXY: Final = {
 }
 _NODE: Final = {"talk": "rclpy.publisher:Publisher.publish", "hear": "ros_topics:_Listener._take"}
 _SENDER, _RECEIVER = {"seal", "send"}, {"receive", "open", "verify"}
+_ORDER: Final = ("talk", "take", "expose", "send", "import", "publish", "hear")
 _IMAGES: Final = 60  # the last ones: the first ones fill caches and heap
 
 
@@ -48,7 +49,7 @@ def read_calls(stem: Path, pids: Iterable[int]) -> Calls:
 
 def steps_of(calls: Mapping[str, Sequence[Call]]) -> dict[str, float]:
     """Return the medians of the steps of the last images, in ms, each after whose it is."""
-    images = [_steps(image) for image in _images(calls) if all(image.values())][-_IMAGES:]
+    images = [_steps(image) for image in _images(calls) if _is_whole(image)][-_IMAGES:]
     return {step: statistics.median(image[step] for image in images) / 1e6 for step in images[0]} if images else {}
 
 
@@ -56,6 +57,14 @@ def _images(calls: Mapping[str, Sequence[Call]]) -> Iterable[Calls]:
     """Yield the calls of each image: it arrives before the next one is published."""
     for (begin, _), (end, _) in pairwise(calls["talk"]):
         yield {seam: [each for each in every if begin <= each[1] < end] for seam, every in calls.items()}
+
+
+def _is_whole(image: Calls) -> bool:
+    """Return whether an image passed all seams in their order; a late one meets the next one."""
+    if not all(image.values()):
+        return False
+    begun = [image[seam][0][0] for seam in _ORDER if seam in image]
+    return begun == sorted(begun)
 
 
 def _steps(image: Calls) -> dict[str, float]:

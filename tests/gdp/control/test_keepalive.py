@@ -11,7 +11,7 @@ from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
 from gdp.control.keepalive import QUEUED_S, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
-from gdp.control.neighbour import NeighbourState
+from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
@@ -19,11 +19,11 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, decode
+from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import KeepaliveFlag, Kind
 from gdp.intervals import HELLO_IDLE, NEIGHBOUR
 from gdp.limits import CLOCK_SKEW_S, COST_AUTO
-from gdp.sansio import ReceivedFrame
+from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 
 A, B = node("a"), node("b")
@@ -102,6 +102,38 @@ def up(pair: Pair) -> Pair:
     assert pair.is_up("b")
     pair.frames.clear()
     return pair
+
+
+def test_a_node_with_one_neighbour_wakes_once_for_what_comes_and_what_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{__name__}.STEP_S", 0.001)
+    pair = up(Pair())
+    end, wakes = pair.ends["a"], 0
+    receive, get_timer, send = end.receive_keepalive, end.get_timer, end.hellos_to_send
+
+    def received(arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
+        nonlocal wakes
+        wakes += 1
+        known = receive(arrival, header, now)
+        if end.offload.frames_came(now.mono_s):
+            end.drop_silent(now.mono_s)
+            for transmit in send(now.mono_s):
+                for frame in transmit.frames:
+                    pair.frames.append(("a", frame))
+                    pair.hear("b", frame)
+        return known
+
+    def ran(now_s: float) -> list[OutgoingFrames]:
+        nonlocal wakes
+        wakes += 1
+        return send(now_s)
+
+    end.receive_keepalive, end.hellos_to_send = received, ran  # type: ignore[method-assign]
+    end.get_timer = lambda: None if (due_s := get_timer()) is None else end.offload.latest_s(due_s)  # type: ignore[method-assign]
+    pair.run(14.0)
+    intervals = 14.0 / FAST.interval_s(FAST)
+    sent = sum(sender == "a" for sender, _ in pair.frames)
+    assert intervals <= sent <= intervals * 1.2
+    assert wakes <= sent * 1.2
 
 
 def test_a_silent_cut_is_noticed_within_the_detection_time() -> None:
