@@ -18,12 +18,14 @@ round ``image`` and ``small`` run for a minute.
 
     sudo .venv/bin/python scripts/bench/ros.py                     # topics; writes docs/benchmarks/ros.*
     sudo .venv/bin/python scripts/bench/ros.py --calls             # a service; writes docs/benchmarks/services.*
+    sudo .venv/bin/python scripts/bench/ros.py --trace --no-save   # where the time of an image goes, step by step
     sudo .venv/bin/python scripts/bench/ros.py --quick --no-save   # a few seconds each: does it work?
     sudo .venv/bin/python scripts/bench/ros.py --rounds 1 --seconds 60 --mtu 1500 --no-save
 """
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,6 +38,7 @@ from typing import Final
 from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_row import READY_S, Row
+from ros_trace import read_calls, steps_of
 from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
 from lab.credentials import Carried
@@ -131,6 +134,36 @@ def measure_calls(row: Row, case: str, who: str, options: Options, _: int) -> di
     return _figures(said, used) | {"calls": said["sent"], UNANSWERED: said["lost"], WRONG: said["wrong"]}
 
 
+def measure_trace(options: Options) -> Outcome:
+    """Measure the steps of images on their way over both proxies, and directly."""
+    stream, over = STREAMS["image"], Rounds()
+    count = round(options.seconds / stream.every_s)
+    settings = json.dumps({"kind": "image", "topics": stream.topics, "count": count, "every_s": stream.every_s})
+    for mtu in options.mtu:
+        with new_run() as run:
+            stem, pids = run.directory / "calls", {}
+            program = ("-m", "ros_trace", str(stem))
+            with Row(run, CARRIED, mtu=mtu, program=(*program, "proxy")) as row:
+                for who in (DIRECT, OVERLAY):
+                    ends = [(RIGHT, "listen"), (LEFT, "talk")]
+                    with ExitStack() as stack:
+                        nodes = [
+                            row.process(side, role, [*program, role, settings], direct=who == DIRECT)
+                            for side, role in ends
+                        ]
+                        listener, talker = map(stack.enter_context, nodes)
+                        listener.read(READY_S)
+                        os.kill(talker.pid, signal.SIGUSR1)
+                        for node in (listener, listener, talker):  # what it received; its calls are written
+                            node.read(options.seconds + _DONE_S)
+                        pids[who] = [node.pid for node in nodes]
+                pids[OVERLAY] += row.proxies
+            for who, each in pids.items():
+                for step, took_ms in steps_of(read_calls(stem, each)).items():
+                    over.add(f"{who}: {step}", f"image, MTU {mtu}", MEDIAN, took_ms)
+    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {}, is_whole=False)
+
+
 def _figures(said: Mapping[str, float], cores: float) -> dict[str, float]:
     if "p50_s" not in said:
         raise FailedError("nothing was received")
@@ -208,10 +241,13 @@ def command(words: Sequence[str] | None = None) -> Options:
     parser = command_line(__doc__, rounds=3, seconds=6.0, quick=quick, has_record=True, has_plot=True)
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--calls", action="store_true", help="a service in place of topics")
+    parser.add_argument("--trace", action="store_true", help="the steps of images, by medians of the last 60")
     options = parse(parser, words)
     options.mtu = tuple(dict.fromkeys(options.mtu or (MTUS[:1] if options.calls else MTUS)))
+    options.is_whole = lambda chosen: not chosen.trace
     return options
 
 
 if __name__ == "__main__":
-    perform(command(), measure)
+    chosen = command()
+    perform(chosen, measure_trace if chosen.trace else measure)

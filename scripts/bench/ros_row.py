@@ -56,6 +56,7 @@ class Row:
         ring: the overlay in place of the row: A and B are its first and its last switch.
         cores: of each machine of the ring; None: the machines share all cores.
         shared_memory: whether the processes of one machine share memory; else they use UDP there too.
+        program: of the proxies, before ``--config``.
 
     Raises:
         LocalError: the kernel refuses.
@@ -72,6 +73,7 @@ class Row:
         ring: Topology | None = None,
         cores: Mapping[str, int] | None = None,
         shared_memory: bool = True,
+        program: Sequence[str] = ("-m", "proxy.cli.proxy"),
     ) -> None:
         overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
         switches = ring.nodes if ring else MIDDLE
@@ -92,7 +94,7 @@ class Row:
             self._nodes = undo.enter_context(nodes)
             proxies = []
             for side, node in self._machines.items():
-                argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]
+                argv = [*program, "--config", self._admit(side, carried)]
                 environment = self._environment(node, _DOMAINS[side])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
