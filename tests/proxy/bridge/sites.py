@@ -144,7 +144,7 @@ class Sites:
     """
 
     def __init__(
-        self, folder: Path, seed: int = 1, topology: Topology | None = None, look_s: float = 0.01, **options: Any
+        self, folder: Path, seed: int = 1, topology: Topology | None = None, look_s: float = 0.005, **options: Any
     ) -> None:
         self.world = Simulation(topology=topology or _ROW, seed=seed, keepalive_ms=500, **options)
         self.world.owner = Owner(OWNER, bytes(range(32)))
