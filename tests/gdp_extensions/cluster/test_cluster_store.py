@@ -120,7 +120,10 @@ def test_a_rib_brings_its_functions_again_to_servers_that_lost_them(
     for later_s, is_answered in ((0.0, False), (2.0, True)):
         rib.receive_all([(site.query("/a"), site.switch.name)], site.now(later_s))
         assert bool(rib.statements_to_send()) == is_answered
-        upkeep.work(site.now(later_s + 1.0))
+        for more_s in (0.0, 0.2, 0.4, 0.6):  # a busy server answers late
+            upkeep.work(site.now(later_s + 1.0 + more_s))
+            if upkeep.is_complete:
+                break
         assert upkeep.is_complete
     assert "a primary lacks the RIB's functions" in caplog.text
     upkeep.close()
