@@ -18,7 +18,7 @@ from typing import Final, TypeAlias
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
-from gdp.control.hello_port import ANSWER_S
+from gdp.control.hello_port import TWO_HELLOS_S
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
@@ -393,7 +393,7 @@ class Attachment:
                 self._former, self._last, self._moved_s = self._last, best.name, now_s
             echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
             # frames before our echo are dropped
-            advertisement_at_s = echo_at_s if echo_at_s <= now_s + 2 * ANSWER_S else now_s
+            advertisement_at_s = echo_at_s if echo_at_s <= now_s + TWO_HELLOS_S else now_s
             for each in self._advertisements.values():
                 # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
                 # first. Without a RIB the others are valid on this switch only.

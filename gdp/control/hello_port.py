@@ -29,7 +29,7 @@ _CREDIT_MAX_BYTES: Final = 16 << 10
 _QUALITIES_MAX: Final = 128  # neighbours and former ones; above all that a port has at once
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
-ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but on average not more often than this
+TWO_HELLOS_S: Final = 0.04  # in which two hellos may be asked for, both at once: a handshake needs them
 _EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
 UNREACHABLE: Final = (-1, -1)
 
@@ -103,8 +103,8 @@ class HelloPort:
         self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
 
     def next_hello_s(self, now_s: float) -> float:
-        """Return when a hello may leave that something asks for: two at once, as a handshake needs them."""
-        return max(now_s, self.said_s[0] + 2 * ANSWER_S)
+        """Return when a hello may leave that something asks for."""
+        return max(now_s, self.said_s[0] + TWO_HELLOS_S)
 
     def schedule_hello(self, received_bytes: int, now_s: float) -> None:
         """Send a hello to candidates soon, with at most as many bytes as came from candidates."""

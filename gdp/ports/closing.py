@@ -16,7 +16,9 @@ class Closing:
         self._threads: list[tuple[str, threading.Thread]] = []  # each with its device
 
     def close(self, ifname: str, closes: Sequence[Callable[[], object]]) -> None:
-        """Call these, which belong to one device, one after the other in a thread."""
+        """Call these, which belong to one device, one after the other in a thread; none of none."""
+        if not closes:
+            return
         thread = threading.Thread(target=lambda: [close() for close in closes], name="closing", daemon=True)
         self._threads.append((ifname, thread))
         thread.start()

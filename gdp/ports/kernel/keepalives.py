@@ -124,14 +124,11 @@ class KeepaliveSessions:
 
     def close(self) -> None:
         """Detach the program and close everything."""
-        for port in list(self._links):
-            for close in self.detach(port):
-                close()
-        for opened in self._programs:
+        for opened in (*self._programs, *(link for link, _ in self._links.values())):
             os.close(opened)
         for each in self._maps:
             each.close()
-        self._programs, self._maps = [], []
+        self._programs, self._maps, self._links = [], [], {}
 
     def attach(self, port: int, ifname: str) -> None:
         """Allow sessions at a device. The first one attaches the program, which takes the kernel some 15 ms."""

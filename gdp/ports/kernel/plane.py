@@ -187,12 +187,12 @@ class KernelPlane(RawPlane):
     def _shut(self, port: Port) -> None:
         self._loaded.set_port(port.index, 0, 0, 0)
         attachment = self._attachments.pop(port.index, None)
+        links = [] if self._sessions is None else self._sessions.detach(port.index)
         if isinstance(attachment, LinkAttachment):
-            self._closing.close(port.ifname, [attachment.close])
+            links.insert(0, attachment.close)  # which forwards
         elif attachment is not None:
             attachment.close()
-        if self._sessions is not None:
-            self._closing.close(port.ifname, self._sessions.detach(port.index))
+        self._closing.close(port.ifname, links)
         super()._shut(port)
 
     def _know(self, port: Port) -> None:
