@@ -56,7 +56,7 @@ class ReaderPath:
 
     def restart(self, now_s: float) -> None:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
-        self.controller.rate.forget_all()
+        self.controller.rate.forget_before()
         self.controller = PathController(self.mtu)
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = self._awaits_tree = False
         self._late_reports = 0  # in a row
@@ -140,7 +140,7 @@ class ReaderPath:
         """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
         if self.is_silent:
             self.is_silent = False
-            self.controller.rate.forget_all()
+            self.controller.rate.forget_before()
 
     @property
     def trip_s(self) -> float:
@@ -204,7 +204,7 @@ class ReaderPath:
     def tree_stands(self, mtu: int) -> None:
         """Note that a tree leads there, with the bytes of a full frame; after a silence or a move, none did before."""
         if self._awaits_tree or not self.governs_others:
-            self.controller.rate.forget_all()
+            self.controller.rate.forget_before()
             self._timeouts, self._awaits_tree = min(self._timeouts, 1), False
         if mtu != self.mtu:
             self.mtu = mtu

@@ -172,7 +172,7 @@ class PathController:
         if held_s is not None:
             model.add_hold(newest.sent_s - first_s + held_s, now_s)
             model.add_rtt(max(now_s - newest.sent_s - held_s, _LEAST_RTT_S), now_s)
-        rate = self.rate.acknowledged(newest, size, now_s, model.base_rtt_s)
+        rate = self.rate.acknowledged(newest, size, now_s - (held_s or 0.0), model.base_rtt_s)
         if model.rtt_s is None:  # it may be of what was given up before: nothing is known of the path yet
             return
         self._round_frames += frames
@@ -216,7 +216,7 @@ class PathController:
 
     def timed_out(self, now_s: float) -> None:
         """Start again with two frames: nothing that is under way was confirmed."""
-        self.rate.forget_all()
+        self.rate.forget_before()
         self._signal(Signal.PATH_CHANGED, now_s)
         self.window = float(_LEAST_FRAMES * self._mtu)
         self._set_limits()

@@ -74,25 +74,22 @@ class DeliveryRate:
         for flight in flights:
             self.remove(flight)
 
-    def forget_before(self, sent_s: float) -> None:
-        """Take flights off the account that left before ``sent_s``."""
+    def forget_before(self, sent_s: float = float("inf")) -> None:
+        """Take flights off the account that left before ``sent_s``, or all."""
         self.forget(list(takewhile(lambda flight: flight.sent_s < sent_s, self._flights)))
 
-    def forget_all(self) -> None:
-        """Take everything under way off the account."""
-        self.forget(list(self._flights))
-
-    def acknowledged(self, newest: Flight, size: int, now_s: float, least_s: float) -> float | None:
+    def acknowledged(self, newest: Flight, size: int, at_s: float, least_s: float) -> float | None:
         """Return the bytes a second of one acknowledgement; None if its interval is shorter than ``least_s``.
 
         Args:
             newest: of the frames that it confirms, the one that left last.
             size: bytes of all of them.
+            at_s: when it would have come if the reader had not held it back.
         """
         self.delivered += size
-        self._delivered_s = now_s
+        self._delivered_s = max(self._delivered_s, at_s)
         self._first_sent_s = newest.sent_s
-        interval_s = max(newest.sent_s - newest.first_sent_s, now_s - newest.delivered_s)
+        interval_s = max(newest.sent_s - newest.first_sent_s, self._delivered_s - newest.delivered_s)
         if interval_s <= 0 or interval_s < least_s:
             return None
         return (self.delivered - newest.delivered) / interval_s

@@ -19,6 +19,7 @@ class Pacer:
         due_s: monotonic second of the next frame.
         bytes_s: rate at which frames may leave; none is limited before the first round trip.
         is_paced: a frame waits only for the pace, so a late sender may catch up.
+        credit_s: with how much time of the pace it may then.
     """
 
     def __init__(self, mtu: int) -> None:
@@ -26,23 +27,18 @@ class Pacer:
         self.due_s = 0.0
         self.bytes_s = float("inf")
         self.is_paced = False
-        self._credit_s = 0.0
-
-    @property
-    def credit_s(self) -> float:
-        """Return how much time of the pace a sender that was scheduled late may catch up with."""
-        return self._credit_s if self.is_paced else 0.0
+        self.credit_s = 0.0
 
     def set_rate(self, bytes_s: float, rtt_s: float) -> None:
         """Set the rate, and the smoothed round trip; 0: none yet."""
-        self.bytes_s, self._credit_s = bytes_s, min(_CREDIT_SHARE * rtt_s, _CREDIT_MOST_S)
+        self.bytes_s, self.credit_s = bytes_s, min(_CREDIT_SHARE * rtt_s, _CREDIT_MOST_S)
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take.
 
         The delay has a bound, because what leaves while another path governs may exceed this one's pace for long.
         """
-        from_s = now_s - self._credit_s if self.is_paced else now_s
+        from_s = now_s - self.credit_s if self.is_paced else now_s
         due_s = (self.due_s if self.due_s > from_s else from_s) + size / self.bytes_s
         if due_s > now_s + _DELAY_MOST_S:
             due_s = min(due_s, now_s + max(_DELAY_MOST_S, self.mtu / self.bytes_s))

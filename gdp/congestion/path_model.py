@@ -7,12 +7,14 @@ scheduled, and read many frames at once.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final
 
 from gdp.congestion.filters import WindowedExtreme
 
 FIRST_RTT_S: Final = 0.02  # until one is measured
 _NOISE_S: Final = 0.002
+_STANDING_REPORTS: Final = 4  # that all show a queue, where the empty path is shorter than that noise
 _HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come
 _BASE_WINDOW_S: Final = 10.0  # Copa, section 2
 _RATE_ROUNDS: Final = 10
@@ -28,7 +30,7 @@ class PathModel:
         rtt_s: smoothed round trip; None before the first one.
         base_rtt_s: round trip of the empty path.
         empty_path_s: longest round trip of a path whose queue is empty.
-        standing_s: lowest round trip of the last half of one.
+        standing_s: lowest round trip of the last half of one, and of four where programs take most of it.
         queue_s: standing queue, in seconds.
         highest_s: highest round trip of the last four; 0: none.
         hold_s: how long the reader holds back reports.
@@ -49,6 +51,7 @@ class PathModel:
         self.rtt_s: float | None = None
         self._base = WindowedExtreme(is_lowest=True)
         self._standing = WindowedExtreme(is_lowest=True)
+        self._trips = deque[float](maxlen=_STANDING_REPORTS)
         self._highest = WindowedExtreme(is_lowest=False)
         self._hold = WindowedExtreme(is_lowest=False)
         self.base_rtt_s = self.standing_s = FIRST_RTT_S
@@ -70,6 +73,9 @@ class PathModel:
         self.rtt_s = rtt_s if self.rtt_s is None else self.rtt_s + (rtt_s - self.rtt_s) / 8
         self.base_rtt_s = self._base.add(now_s, rtt_s, float("-inf") if self.is_hidden else now_s - _BASE_WINDOW_S)
         self.standing_s = self._standing.add(now_s, rtt_s, now_s - self.rtt_s / 2)
+        self._trips.append(rtt_s)
+        if self.base_rtt_s < _NOISE_S:
+            self.standing_s = min(self.standing_s, *self._trips)
         self.highest_s = self._highest.add(now_s, rtt_s, now_s - 4 * self.rtt_s)
         self.empty_path_s = self.base_rtt_s + _NOISE_S
         self.queue_s = max(self.standing_s - self.empty_path_s, 0.0)

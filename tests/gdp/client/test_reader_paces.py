@@ -43,7 +43,7 @@ def hold_back(paths: ReaderPaths, paces: ReaderPaces, *names: bytes) -> None:
         paces.record(ALL, at_s)
     paces.slow_down(0.6)
     for name in names:
-        paths.path(name, 0.0).controller.rate.forget_all()
+        paths.path(name, 0.0).controller.rate.forget_before()
 
 
 def test_readers_that_hold_back_others_get_the_paces_of_their_rates() -> None:

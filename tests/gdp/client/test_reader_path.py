@@ -135,6 +135,6 @@ def test_what_leaves_while_another_path_governs_delays_this_one_for_a_moment_onl
     for _ in range(600):  # 30 MB to all readers, while this one does not govern
         path.sent(50_000, 34, now_s)
         now_s += 0.01
-    path.controller.rate.forget_all()
+    path.controller.rate.forget_before()
     assert path.next_send_s() <= now_s + 0.25
     assert path.allowance(now_s + 0.25) > 0

@@ -9,6 +9,7 @@ import pytest
 from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import DeliveryRate
 from gdp.congestion.filters import WindowedExtreme
+from gdp.congestion.path_model import PathModel
 from gdp.congestion.states import State
 from tests.gdp.congestion.simulated_path import MTU, CubicSender, Flow, SimulatedPath
 from tests.lanes import nightly
@@ -275,6 +276,31 @@ def test_another_path_forgets_its_measurements_and_keeps_what_is_under_way() -> 
     assert controller.state is State.STARTUP
     assert controller.rate.inflight == 3 * MTU
     assert controller.model.bytes_s == 0
+
+
+def test_on_a_path_shorter_than_the_waits_of_programs_four_late_reports_are_a_queue_and_three_are_none() -> None:
+    model = PathModel()
+    queues_s = []
+    for number, rtt_s in enumerate([0.0005, 0.012, 0.012, 0.012, 0.0005, 0.012, 0.012, 0.012, 0.012]):
+        model.add_rtt(rtt_s, number * 0.02)
+        queues_s.append(model.queue_s)
+    assert not any(queues_s[:-1])
+    assert queues_s[-1] > 0.009
+
+
+def test_on_a_longer_path_the_first_late_report_is_a_queue() -> None:
+    model = PathModel()
+    model.add_rtt(0.01, 0.0)
+    model.add_rtt(0.03, 0.03)
+    assert model.queue_s > 0
+
+
+@pytest.mark.parametrize("held_s", [0.0, 0.02])
+def test_the_delivery_rate_is_that_of_arrivals_however_long_reports_are_held_back(held_s: float) -> None:
+    controller = PathController(MTU)
+    for number in range(3):
+        controller.acknowledged([controller.sent(8 * MTU, 0.1 * number)], 0.1 * number + 0.001 + held_s, held_s=held_s)
+    assert controller.model.bytes_s == pytest.approx(8 * MTU / 0.001)
 
 
 def test_a_burst_of_acknowledgements_is_no_high_delivery_rate() -> None:
