@@ -65,6 +65,7 @@ def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
     yield made
     made.run("down", "--all")
     made.host.close()
+    assert not left_of(made)
 
 
 def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(fog: Fog) -> None:
