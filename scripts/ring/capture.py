@@ -5,10 +5,7 @@
 I/O; a process in the namespace of the devices. It reports when it begins and, after SIGINT or SIGTERM, how many frames
 it has written. It holds every EtherType and both directions. With several devices, a frame of one may precede an
 earlier frame of another; the stamps come from the kernel and are correct.
-Source: packet(7); the pcap format, draft-ietf-opsawg-pcap, with nanosecond stamps (magic A1B23C4D)::
-
-    file    magic (4)  2 (2)  4 (2)  zero (4)  zero (4)  longest frame (4)  link type 1, Ethernet (4)
-    frame   seconds (4)  nanoseconds (4)  bytes here (4)  bytes on the wire (4)  frame
+Source: packet(7).
 """
 
 from __future__ import annotations
@@ -17,10 +14,12 @@ import signal
 import socket
 import struct
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from threading import Event
-from typing import BinaryIO, Final
+from typing import Final
+
+from scapy.utils import RawPcapWriter
 
 from gdp.ports.readiness import readable
 from gdp.ports.sockets import kernel_drops, large_buffers
@@ -29,9 +28,7 @@ from ring.nodes.node import say
 _ETH_P_ALL: Final = 0x0003
 _SO_TIMESTAMPNS: Final = 35
 _STAMP: Final = struct.Struct("@qq")
-_FILE_HEAD: Final = struct.Struct("=IHHiIII")
-_FRAME_HEAD: Final = struct.Struct("=IIII")
-_MAGIC_NS: Final = 0xA1B23C4D
+_ETHERNET: Final = 1  # link type of a pcap file
 _LONGEST_BYTES: Final = 1 << 18
 _BURST: Final = 256  # frames of one device before the next device is read
 _LOOK_S: Final = 0.1
@@ -45,8 +42,8 @@ def capture(path: Path, devices: list[str], is_over: Event) -> tuple[int, int]:
     frames, buffer = 0, bytearray(_LONGEST_BYTES)
     with ExitStack() as stack:
         sources = [stack.enter_context(_listen(device)) for device in devices]
-        file = stack.enter_context(path.open("wb"))
-        file.write(_FILE_HEAD.pack(_MAGIC_NS, 2, 4, 0, 0, _LONGEST_BYTES, 1))
+        file = stack.enter_context(closing(RawPcapWriter(str(path), _ETHERNET, nano=True, snaplen=_LONGEST_BYTES)))
+        file.write_header(None)
         file.flush()
         say("ready", file=str(path))
         while not is_over.is_set():
@@ -68,7 +65,7 @@ def _listen(device: str) -> socket.socket:
     return opened
 
 
-def _write_burst(source: socket.socket, buffer: bytearray, file: BinaryIO) -> int:
+def _write_burst(source: socket.socket, buffer: bytearray, file: RawPcapWriter) -> int:
     """Write up to a burst of frames; return how many."""
     for count in range(_BURST):
         try:
@@ -76,8 +73,7 @@ def _write_burst(source: socket.socket, buffer: bytearray, file: BinaryIO) -> in
         except OSError:  # no more frames, or the device went down; it is read again when it is up
             return count
         seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (0, 0)
-        file.write(_FRAME_HEAD.pack(seconds, nanoseconds, size, size))
-        file.write(memoryview(buffer)[:size])
+        file.write_packet(bytes(memoryview(buffer)[:size]), seconds, nanoseconds)
     return _BURST
 
 
