@@ -243,7 +243,5 @@ def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
-    parser.add_argument(
-        "--passes", type=int, default=2, help="messages of a figure, in 60; 0: each once (default: %(default)s)"
-    )
+    parser.set_defaults(passes=2)  # messages of a figure, in 60; 0: each once
     run_bench(parser, measure)
