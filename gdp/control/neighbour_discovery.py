@@ -415,9 +415,7 @@ class HelloProtocol:
         self._due_s, self._next_s = NEVER_S, None
         self.reception.drop_expired(now_s)
         changes: list[Change] = []
-        if is_settled:
-            return changes
-        for port in self.ports.values():
+        for port in () if is_settled else self.ports.values():
             silent = self.liveness.silent(port, now_s)
             if silent:
                 self.liveness.note_failed(port, silent, now_s)

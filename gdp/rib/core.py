@@ -117,8 +117,7 @@ class RibCore:
     def handle_timer(self, now: Timestamps) -> None:
         """Expire routes and notify their watchers; repeat open queries upstream."""
         state, now_s = self.state, now.mono_s
-        state.now_s = now_s
-        self._is_moved = True
+        state.now_s, self._is_moved = now_s, True
         for route in state.store.expire(now_s, now.unix_s):
             if not keep_of_silent_rib(state, route, now):
                 state.former.note_gone(route, is_lapsed=True)

@@ -101,8 +101,7 @@ class KeepaliveSessions:
             self._configured = self._make(MapKind.ARRAY, 4, SESSION_BYTES, "gdp_sessions")
             self._states = KernelMap(MapKind.ARRAY, 4, _STATE.size, _SESSIONS_MAX, "gdp_states", is_mapped=True)
             self._maps.append(self._states)
-            self._values = self._states.values()
-            self._words = self._values.cast("Q")
+            self._words = self._states.words
             self._ends = self._make(MapKind.HASH, END_BYTES, 4, "gdp_ends")
             self._slots = self._make(MapKind.ARRAY, 4, 4, "gdp_slots")
             maps = KeepaliveMaps(
@@ -203,7 +202,7 @@ class KeepaliveSessions:
         return run
 
     def _report(self, session: _Session) -> KeepaliveRun:
-        state = _STATE.unpack_from(self._values, session.slot * _STATE.size)
+        state = _STATE.unpack_from(self._words, session.slot * _STATE.size)
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
         offer = session.offer
         sent_s, session.sent_s = tuple(session.sent_s), []

@@ -56,10 +56,11 @@ class KernelMap:
         kind: a hash starts empty and takes memory as it grows; an array is complete at once, and all zero.
         value_bytes: size of one value; for a per-CPU map, on one CPU.
         name: shown by diagnostic tools.
-        is_mapped: of an array: ``values`` can be called.
+        is_mapped: of an array: it has ``words``.
 
     Attributes:
         value_bytes: bytes of one value as user space sees it: the values of all CPUs.
+        words: of 64 bits, of all values; they follow what programs write.
 
     Raises:
         BpfError: the kernel refuses it.
@@ -80,16 +81,15 @@ class KernelMap:
         self._one = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(self._key), address(self._value), 0))
         self._one_key = self._one[:16]  # an operation without a value must get none
         self._tried = f"map {name}"
+        mapped = mmap.mmap(self.fd, max_entries * self.value_bytes, access=mmap.ACCESS_READ) if is_mapped else b""
+        self.words = memoryview(mapped).cast("Q")
 
     def close(self) -> None:
         """Close the descriptor; a program that uses the map keeps it."""
         if self.fd >= 0:
+            self.words.release()
             os.close(self.fd)
             self.fd = -1
-
-    def values(self) -> memoryview[int]:
-        """Return the values of an array as bytes that follow what programs write; reading them calls no kernel."""
-        return memoryview(mmap.mmap(self.fd, self.max_entries * self.value_bytes, access=mmap.ACCESS_READ))
 
     def put(self, key: bytes, value: bytes) -> None:
         """Put or replace one entry. Raises ``BpfError``: E2BIG if the map is full."""
