@@ -236,10 +236,9 @@ class KeepaliveSessions:
         except LocalError as refused:  # without memory, or by a signal; some may have left
             log.debug("keepalives not sent reason=%s", refused)
             jitter = 1 - _AGAIN
-        words = self._words
         for session in sessions:
             session.send_at_s = now_s + session.offer.out_interval_s * (1 - jitter)
-            sent = words[session.slot * _WORDS + _COUNT_AT]
+            sent = self._words[session.slot * _WORDS + _COUNT_AT]
             if sent != session.sent:
                 session.sent_s.append(now_s)
                 session.sent = sent
@@ -247,10 +246,9 @@ class KeepaliveSessions:
     def _plan(self, now_s: float) -> None:
         """Set when the next tick is due: silence is looked at when keepalives leave, half an interval late at most."""
         send_at_s = silent_at_s = interval_s = NEVER_S
-        words = self._words
         for session in self._sessions.values():
             offer = session.offer
-            silent_s = words[session.slot * _WORDS + _HEARD_AT] * 1e-9 + offer.suspect_s
+            silent_s = self._words[session.slot * _WORDS + _HEARD_AT] * 1e-9 + offer.suspect_s
             send_at_s, silent_at_s = min(send_at_s, session.send_at_s), min(silent_at_s, silent_s)
             interval_s = min(interval_s, offer.out_interval_s)
         if silent_at_s <= now_s:
