@@ -31,6 +31,7 @@ class KeyEpochs:
 
     Attributes:
         epoch: the newest.
+        secret: its secret.
         data: seals messages.
         status: seals Heartbeats.
 
@@ -42,14 +43,8 @@ class KeyEpochs:
         self._topic = topic
         self._writer = writer
         self._address = address
-        self._secrets = _checked(secrets)
         self._former = (-1, b"", _NEVER)  # the epoch before, its secret, and until when readers use it
-        self._use(max(secrets))
-
-    @property
-    def secret(self) -> bytes:
-        """Return the secret of the newest epoch."""
-        return self._secrets[self.epoch]
+        self._use(_checked(secrets))
 
     def renew(self, secrets: Secrets, now_s: float) -> bool:
         """Replace the secrets; return whether there is a new epoch, which seals from now on.
@@ -58,11 +53,11 @@ class KeyEpochs:
             LocalError: there is no secret.
         """
         former = self.epoch, self.secret, now_s + EPOCH_GRACE_S
-        self._secrets = _checked(secrets)
-        if max(secrets) == self.epoch:
+        if max(_checked(secrets)) == self.epoch:
+            self.secret = secrets[self.epoch]
             return False
         self._former = former
-        self._use(max(secrets))
+        self._use(secrets)
         return True
 
     def secret_of(self, epoch: int, now_s: float) -> bytes:
@@ -78,8 +73,8 @@ class KeyEpochs:
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
         return secret
 
-    def _use(self, epoch: int) -> None:
-        self.epoch = epoch
+    def _use(self, secrets: Secrets) -> None:
+        self.epoch, self.secret = max(secrets.items())
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
         self._parity: ParitySealer | None = None

@@ -250,7 +250,7 @@ class SendQueue:
         window, best_effort, messages = self._window, self._best_effort, self._gathered.messages
         left = limit if limit > 0 else 1
         frames = best_effort.poll_frames(left, self.pace_of) if best_effort.waiting else []
-        if not messages or window.has_frames:
+        if window.cache.messages and (not messages or window.has_frames):
             frames += window.frames_to_send(now_s, max(left - len(frames), 1) if frames else left)
         while messages:
             left = limit - len(frames) if frames else limit
