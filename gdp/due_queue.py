@@ -51,21 +51,22 @@ class DueQueue(Generic[K]):
         if at_s is None or at_s == NEVER_S:
             self.discard(key)
             return
-        entry = self._entries[key] if key in self._entries else None
-        if entry is None or entry[_DUE] == NEVER_S:
+        if key not in self._entries:
             self._waiting += 1
-            if entry is not None:  # the order is that in which keys began to wait
-                self._entries[key] = self._entries.pop(key)
-        if entry is None or at_s < entry[_PLACE]:
-            if entry is not None:
-                entry[_DUE] = _VOID
-            self._rank += 1
-            entry = self._entries[key] = [at_s, key if self._is_sorted else self._rank, key, at_s]
-            heapq.heappush(self._heap, entry)
-            if len(self._heap) > 4 * self._waiting + _SLACK:
-                self._rebuild()
         else:
-            entry[_DUE] = at_s
+            entry = self._entries[key]
+            if entry[_DUE] == NEVER_S:
+                self._waiting += 1
+                self._entries[key] = self._entries.pop(key)  # the order is that in which keys began to wait
+            if at_s >= entry[_PLACE]:
+                entry[_DUE] = at_s
+                return
+            entry[_DUE] = _VOID
+        self._rank += 1
+        entry = self._entries[key] = [at_s, key if self._is_sorted else self._rank, key, at_s]
+        heapq.heappush(self._heap, entry)
+        if len(self._heap) > 4 * self._waiting + _SLACK:
+            self._rebuild()
 
     def discard(self, key: K) -> None:
         """Remove a key, if it waits."""

@@ -74,7 +74,8 @@ class KeyEpochs:
         return secret
 
     def _use(self, secrets: Secrets) -> None:
-        self.epoch, self.secret = max(secrets.items())
+        self.epoch = max(secrets)
+        self.secret = secrets[self.epoch]
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
         self._parity: ParitySealer | None = None
@@ -124,11 +125,10 @@ class Openers:
 
     def opener(self, kind: Kind, epoch: int) -> Opener:
         """Return the opener of messages or Heartbeats. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""
-        opener = self._openers.get((kind, epoch))
-        if opener is None:
+        if (kind, epoch) not in self._openers:
             secret = self._secret(epoch)
-            opener = self._openers[kind, epoch] = Opener(secret, kind, *self._ends, is_signed=self._is_signed)
-        return opener
+            self._openers[kind, epoch] = Opener(secret, kind, *self._ends, is_signed=self._is_signed)
+        return self._openers[kind, epoch]
 
     def parity(self, epoch: int) -> ParityOpener:
         """Return the opener of parity frames. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""

@@ -76,6 +76,7 @@ class Protection:
         self.parity = ParitySender(keys=keys, budget=source.parity, is_enabled=self._has_one_path and fec)
         self._striper = Striper() if settings.paths == SPREAD else None
         self._loss: float | None = None  # of frames, where parity may save time
+        self._entered = -1  # changes of the readers when frames were last entered
         self.has_more = False
 
     @property
@@ -143,8 +144,9 @@ class Protection:
             if parity.waiting:
                 self.has_more = left <= len(parity.waiting)
                 after = parity.poll_frames(max(left, 0))
-            if not is_doubled:
+            if not is_doubled and (sent or self._entered != self._readers.changes):
                 self._sent_frames.leaving = sent, paths.confirming(sent, again), now_s, again
+                self._entered = self._readers.changes
             if paths.limit_bytes_s is not None:
                 paths.charge_limit(chain(before, sent, after), now_s)
         frames = heartbeats + before + sent + after

@@ -53,7 +53,7 @@ class Publications:
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
         self._reader_paths = ReaderPaths()
-        self.scheduler = SendScheduler(self._timers.reschedule)
+        self.scheduler = SendScheduler(self._timers)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
 

@@ -32,7 +32,7 @@ from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES, PACE_MAX, SPREAD, WINDOW_BYTES
-from gdp.message.acknack import AckNack, AckNackFlag
+from gdp.message.acknack import AckNackFlag
 from gdp.message.bundle import BUNDLE_BYTES
 from gdp.message.loss import LossReason
 from gdp.message.send_window import SendWindow

@@ -98,11 +98,6 @@ class ReaderPath:
         next_s = self.controller.next_send_s(self.mtu)
         return NEVER_S if next_s is None else next_s
 
-    def note_idle(self) -> None:
-        """Note that nothing waits, though more might leave."""
-        if self.controller.rate.inflight < self.controller.limit:
-            self.controller.app_limited()
-
     def sent(self, size: int, frames: int, now_s: float) -> Flight:
         """Count frames that leave at once; return the flight as which they are confirmed."""
         if not self.controller.rate.inflight:
