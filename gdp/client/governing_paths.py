@@ -40,7 +40,6 @@ class GoverningPaths:
         paces: of the readers of a best-effort topic, each of which has its own.
         share: of what the path carries, 0 to 1; the other topics that wait have the rest.
         seen_s: when ``allowance`` was last asked.
-        asked: the paths of its answer.
         second_until_s: monotonic second until which there is a second path, as far as known here.
         limit_bytes_s: bytes a second that may leave by the settings; None: any.
     """
@@ -65,7 +64,6 @@ class GoverningPaths:
         self._may_pace = settings.paths == 1 and not settings.urgent and not settings.patience.fastest_governs
         queue.pace_of = self._begin
         self.seen_s = 0.0
-        self.asked: list[ReaderPath] = []
         self.share = 1.0
         self.second_until_s = float("-inf")
         self.limit_bytes_s: float | None = None
@@ -101,9 +99,9 @@ class GoverningPaths:
         if self._limit is not None and self._limit.left(now_s) <= 0:
             return 0
         self.seen_s, urgent = now_s, self._is_urgent
-        paths = self.asked = self._governing()
         if self._count > 1 and self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
+        paths = self._governing()
         may_slow = self._may_pace and self._queue.options.own_pace and not self._queue.is_acknowledged
         if paths and not paths[1:] and not self.blocking.blocks and not (may_slow and self.paces.stated):
             return paths[0].allowance(now_s, urgent=urgent)
@@ -150,7 +148,7 @@ class GoverningPaths:
 
     def note_idle(self) -> None:
         """Note that nothing waits, though the paths may permit more."""
-        for path in self.asked:
+        for path in self._governing():
             path.controller.app_limited()
 
     @property

@@ -75,7 +75,7 @@ class KeyEpochs:
 
     def _use(self, secrets: Secrets) -> None:
         self.epoch = max(secrets)
-        self.secret = secrets[self.epoch]
+        self.secret: bytes = secrets[self.epoch]
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
         self._parity: ParitySealer | None = None

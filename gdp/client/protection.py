@@ -32,6 +32,7 @@ from gdp.client.send_options import PublisherSettings
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.frame.codec import second_path_copy
+from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES, SPREAD
 from gdp.message.acknack import AckNack
 from gdp.message.send_window import SendWindow
@@ -83,6 +84,15 @@ class Protection:
     def repairs(self) -> int:
         """Return how many fragments were sent again because a reader lacked them."""
         return self._window.retransmissions + self.late.retransmissions
+
+    @property
+    def has_work(self) -> bool:
+        """Return whether a turn without new frames may change something."""
+        paces = self._paths.paces
+        is_changed = self._entered != self._readers.changes or self._window.governing is not None
+        is_protected = self._loss is not None or self.copies.is_enabled or self.copies.due_s < NEVER_S
+        waits = self.late.messages or self.parity.waiting or paces.stated or paces.slowing.blocks
+        return is_changed or is_protected or bool(waits)
 
     def set_options(self) -> None:
         """Follow the options of the queue, which have changed."""

@@ -154,6 +154,14 @@ class Publisher:
         return queue.mtu is not None and bool(is_read)
 
     @property
+    def has_work(self) -> bool:
+        """Return whether ``poll_frames`` may return frames, or has to drop some."""
+        queue, window, heartbeats = self.queue, self._window, self._heartbeats
+        if not self.matched.active or heartbeats.wanted or heartbeats.is_reminder_wanted or not queue.is_empty:
+            return True
+        return bool(window.cache.messages and window.has_frames) or self.protection.has_work
+
+    @property
     def confirms(self) -> bool:
         """Return whether readers acknowledge messages; those of a best-effort topic do not."""
         return self.queue.is_acknowledged
@@ -384,7 +392,7 @@ class Publisher:
         if queue.deferred.waiting:
             queue.seal_deferred()
         if not queue.is_acknowledged:
-            queue.bytes_s = self.governing_paths.bytes_s
+            queue.bytes_s = None if queue.options.deadline_s is None else self.governing_paths.bytes_s
             self._heartbeats.is_reminder_wanted |= queue.drop_expired(now_s)
         heartbeats: list[bytes] = []
         schedule = self._heartbeats

@@ -32,6 +32,7 @@ from gdp.message.ledger import Ledger
 from gdp.message.loss import LossReason
 from gdp.message.renumbering import MOVES_MAX, Renumbering
 from gdp.message.send_window import SendWindow
+from gdp.sansio import new_tuple
 
 _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
@@ -60,7 +61,7 @@ class SendQueue:
         bundle_bytes: largest bundle; 0: each message has a seal of its own.
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
-        bytes_s: bytes of frames per second that this topic may send now; None: unknown.
+        bytes_s: bytes of frames per second that this topic may send now; None: unknown, or there is no deadline.
         pace_of: returns the pace of a best-effort message of so many bytes that begins to leave.
         has_parity: messages sealed from now on leave space for parity frames, and announce them.
     """
@@ -309,7 +310,7 @@ class SendQueue:
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        most = min(self.bundle_bytes, self._frame_capacity)
+        most = self._frame_capacity if self._frame_capacity < self.bundle_bytes else self.bundle_bytes
         first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(most)
         count = len(together)
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
@@ -324,7 +325,7 @@ class SendQueue:
         frames = self._seal(number, body, self.mtu, is_bundle=messages > 1, prefix=prefix)
         self.next_number += 1
         if not self.is_acknowledged:
-            for dropped in self._best_effort.add(frames, Carried(number, sequence, messages, added_s)):
+            for dropped in self._best_effort.add(frames, new_tuple(Carried, (number, sequence, messages, added_s))):
                 self._lose(dropped.sequence, dropped.messages, DropReason.MEMORY_FULL, LossReason.QUEUE_OVERFLOW)
             return
         ledger.put(number, sequence, messages)

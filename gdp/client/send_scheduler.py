@@ -59,6 +59,15 @@ class SendScheduler:
         elif publisher not in self._ordinary:
             self._new[publisher] = None
 
+    def handle_report(self, publisher: Publisher, now_s: float) -> None:
+        """Note that a reader reported: its publisher may have frames, and others may wait for the same path."""
+        is_waiting = self._urgent or self._new or self._ordinary or self.uncounted is not None
+        if is_waiting or publisher.has_work or publisher.governing_paths.allowance(now_s) <= 0:
+            self.add(publisher)
+        else:
+            self.uncounted, self._is_idle = publisher, True
+            self._timers.touched[publisher] = None
+
     def resume(self) -> None:
         """Note that paths may permit more than before."""
         self._hold(None)
@@ -99,11 +108,8 @@ class SendScheduler:
         allowance = publisher.governing_paths.allowance(now_s)
         frames = publisher.poll_frames(now_s, allowance if allowance < self._at_once else self._at_once)
         self._timers.touched[publisher] = None
-        self._is_idle, self._new = allowance > 0 and not publisher.has_more, {}
-        if publisher.sent_frames.leaving is not None:
-            self.uncounted = publisher
-        elif self._is_idle:
-            publisher.governing_paths.note_idle()
+        self.uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
+        self._new = {}
         if self._is_idle:
             self._ordinary, self._is_held, self.is_ready, self.due_s = {}, False, False, NEVER_S
             return frames

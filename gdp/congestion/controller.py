@@ -165,7 +165,7 @@ class PathController:
                 newest = flight
         if newest is None:
             return
-        self.confirmed_sent_s = max(self.confirmed_sent_s, newest.sent_s)
+        self.confirmed_sent_s = newest.sent_s if newest.sent_s > self.confirmed_sent_s else self.confirmed_sent_s
         if newest.sent_s < self._changed_s:  # it says nothing about this path
             self.rate.acknowledged(newest, size, now_s, 0.0)
             self._round_end = self.rate.delivered

@@ -209,7 +209,8 @@ class SendWindow:
             position = self.cache.end_at
         else:
             position = self.cache.begin_of(acknack.next_number)
-        next_number = min(acknack.next_number, max(self._sent_before, self.sent[0]))  # no reader has more
+        sent = max(self._sent_before, self.unsent[0][0] if self.unsent else self._newest + 1)
+        next_number = acknack.next_number if acknack.next_number < sent else sent  # no reader has more
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
             # the others must not wait for it
@@ -247,12 +248,13 @@ class SendWindow:
         least = readers.least_number if self.governing is None else readers.most_number
         if self.unsent and self.unsent[0][0] < least:
             self._skip_unwanted()
-        if readers.least_at >= self._sent_at:
+        acked_at = readers.least_at if readers.least_at < self._sent_at else self._sent_at
+        if acked_at == self._sent_at:
             self._flow.restart_probe(now_s)
         if self.unsent:
             if readers.most_at >= self._sent_at:
                 readers.reset_stall_timers(self._sent_at, now_s)
-            first_at = self._acked_at() if self.governing is None else readers.most_at
+            first_at = acked_at if self.governing is None else readers.most_at
             may_reach, below = first_at + self._flow.window_bytes, least + FLIGHT_MESSAGES_MAX
             frames += self._new_frames(may_reach, below, limit - len(frames) if frames else limit)
         if frames and not self.cache.repaired and not self._flow.round_trip.is_sampling:
