@@ -43,6 +43,7 @@ class KeyEpochs:
         self._topic = topic
         self._writer = writer
         self._address = address
+        self.secret = b""
         self._former = (-1, b"", _NEVER)  # the epoch before, its secret, and until when readers use it
         self._use(_checked(secrets))
 
@@ -75,7 +76,7 @@ class KeyEpochs:
 
     def _use(self, secrets: Secrets) -> None:
         self.epoch = max(secrets)
-        self.secret: bytes = secrets[self.epoch]
+        self.secret = secrets[self.epoch]
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
         self._parity: ParitySealer | None = None

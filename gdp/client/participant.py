@@ -360,7 +360,10 @@ class Participant:
 
     def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: sealing them took time."""
-        self.publications.frames_sent(now_s)
+        if self._scheduler.uncounted is not None:
+            self._scheduler.count_sent()
+        if self.publications.reader_paths.leaving:
+            self.publications.reader_paths.frames_sent(now_s)
 
     def poll_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each writer proxy."""

@@ -32,7 +32,6 @@ from gdp.client.send_options import PublisherSettings
 from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.frame.codec import second_path_copy
-from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES, SPREAD
 from gdp.message.acknack import AckNack
 from gdp.message.send_window import SendWindow
@@ -51,6 +50,7 @@ class Protection:
         copies: of urgent frames.
         parity: parity frames of large messages.
         has_more: the last ``poll_frames`` reached its limit.
+        entered: changes of the readers when frames were last entered.
     """
 
     def __init__(
@@ -77,22 +77,13 @@ class Protection:
         self.parity = ParitySender(keys=keys, budget=source.parity, is_enabled=self._has_one_path and fec)
         self._striper = Striper() if settings.paths == SPREAD else None
         self._loss: float | None = None  # of frames, where parity may save time
-        self._entered = -1  # changes of the readers when frames were last entered
+        self.entered = -1
         self.has_more = False
 
     @property
     def repairs(self) -> int:
         """Return how many fragments were sent again because a reader lacked them."""
         return self._window.retransmissions + self.late.retransmissions
-
-    @property
-    def has_work(self) -> bool:
-        """Return whether a turn without new frames may change something."""
-        paces = self._paths.paces
-        is_changed = self._entered != self._readers.changes or self._window.governing is not None
-        is_protected = self._loss is not None or self.copies.is_enabled or self.copies.due_s < NEVER_S
-        waits = self.late.messages or self.parity.waiting or paces.stated or paces.slowing.blocks
-        return is_changed or is_protected or bool(waits)
 
     def set_options(self) -> None:
         """Follow the options of the queue, which have changed."""
@@ -154,9 +145,9 @@ class Protection:
             if parity.waiting:
                 self.has_more = left <= len(parity.waiting)
                 after = parity.poll_frames(max(left, 0))
-            if not is_doubled and (sent or self._entered != self._readers.changes):
+            if not is_doubled and (sent or self.entered != self._readers.changes):
                 self._sent_frames.leaving = sent, paths.confirming(sent, again), now_s, again
-                self._entered = self._readers.changes
+                self.entered = self._readers.changes
             if paths.limit_bytes_s is not None:
                 paths.charge_limit(chain(before, sent, after), now_s)
         frames = heartbeats + before + sent + after

@@ -218,13 +218,6 @@ class Publications:
         if self.holding:
             self.release_requests(now_s)
 
-    def frames_sent(self, now_s: float) -> None:
-        """Count the frames polled last, which left at ``now_s``."""
-        if self.scheduler.uncounted is not None:
-            self.scheduler.count_sent()
-        if self.reader_paths.leaving:
-            self.reader_paths.frames_sent(now_s)
-
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
         self.reader_paths.attachment_changed(now_s)

@@ -156,10 +156,10 @@ class Publisher:
     @property
     def has_work(self) -> bool:
         """Return whether ``poll_frames`` may return frames, or has to drop some."""
-        queue, window, heartbeats = self.queue, self._window, self._heartbeats
-        if not self.matched.active or heartbeats.wanted or heartbeats.is_reminder_wanted or not queue.is_empty:
-            return True
-        return bool(window.cache.messages and window.has_frames) or self.protection.has_work
+        window, heartbeats, protection = self._window, self._heartbeats, self.protection
+        is_changed = protection.entered != self.matched.changes or heartbeats.wanted or heartbeats.is_reminder_wanted
+        is_held = self._fastest_governs or self.governing_paths.paces.slowing.blocks or protection.late.messages
+        return bool(is_changed or is_held or not self.queue.is_empty or (window.cache.messages and window.has_frames))
 
     @property
     def confirms(self) -> bool:

@@ -27,7 +27,7 @@ from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
 from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
-from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
+from gdp.message.bundle import BUNDLE_BYTES, LENGTH_BYTES, SMALL, Gathered, pack
 from gdp.message.ledger import Ledger
 from gdp.message.loss import LossReason
 from gdp.message.renumbering import MOVES_MAX, Renumbering
@@ -166,7 +166,7 @@ class SendQueue:
         if self.deferred.waiting:
             self.seal_deferred()
         most = most if most < self.bundle_bytes else self.bundle_bytes
-        if self.depth or not gathered.is_small(len(head) + len(message), most):
+        if self.depth or SMALL * (len(head) + len(message) + LENGTH_BYTES) > most:
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s, head=head)
             self.ledger.next(added_s)

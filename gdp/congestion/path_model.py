@@ -72,8 +72,7 @@ class PathModel:
         self.standing_s = self._standing.add(now_s, rtt_s, now_s - self.rtt_s / 2)
         self.highest_s = self._highest.add(now_s, rtt_s, now_s - 4 * self.rtt_s)
         self.empty_path_s = self.base_rtt_s + _NOISE_S
-        standing_s = self.standing_s - self.empty_path_s
-        self.queue_s = standing_s if standing_s > 0.0 else 0.0
+        self.queue_s = max(self.standing_s - self.empty_path_s, 0.0)
 
     def rest_at_standing(self, now_s: float) -> None:
         """Take the standing round trip for that of the empty path, which has changed."""

@@ -191,9 +191,7 @@ class Sealer:
         """
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
-        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
-        plain, origin = (message, None) if isinstance(message, bytes) else (b"", message._origin or message)
-        size = len(prefix) + (len(plain) if origin is None else origin.message_bytes)
+        size = len(prefix) + (len(message) if isinstance(message, bytes) else message.message_bytes)
         if self._capacity[0] != mtu:
             self._capacity = mtu, fragment_capacity(mtu)
         capacity = self._capacity[1]
@@ -210,17 +208,13 @@ class Sealer:
         head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
         cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
         return Sealed(
-            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=plain, origin=origin,
-            size=size, capacity=capacity,
+            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, size=size,
+            capacity=capacity,
         )  # fmt: skip
 
 
 class Sealed(Sequence[bytes]):
-    """The frames of one message, sealed in order and on request; always the same bytes.
-
-    Attributes:
-        parts: how many they are.
-    """
+    """The frames of one message, ``parts`` of them, sealed in order and on request; always the same bytes."""
 
     def __init__(
         self,
@@ -230,8 +224,7 @@ class Sealed(Sequence[bytes]):
         head: bytes,
         parts: int,
         prefix: bytes,
-        message: bytes,
-        origin: Sealed | None,
+        message: bytes | Sealed,
         size: int,
         capacity: int,
     ) -> None:
@@ -239,7 +232,13 @@ class Sealed(Sequence[bytes]):
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._head, self.parts, self._prefix = head, parts, prefix
-        self._message, self._origin = message, origin
+        self._origin: Sealed | None = None
+        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
+        if isinstance(message, bytes):
+            self._message = message
+        else:
+            self._message = b""
+            self._origin = message._origin or message
         self._capacity = capacity
         self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []

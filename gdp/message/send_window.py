@@ -257,7 +257,7 @@ class SendWindow:
             first_at = acked_at if self.governing is None else readers.most_at
             may_reach, below = first_at + self._flow.window_bytes, least + FLIGHT_MESSAGES_MAX
             frames += self._new_frames(may_reach, below, limit - len(frames) if frames else limit)
-        if frames and not self.cache.repaired and not self._flow.round_trip.is_sampling:
+        if frames and not self.cache.repaired and self._flow.round_trip.sample is None:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
         if not readers.active and not self.unsent:
             self._release_acknowledged()
