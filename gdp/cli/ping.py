@@ -51,7 +51,8 @@ def ping(
 ) -> None:
     """Measure the round-trip time to the members that publish or serve a name, by the path of data.
 
-    Each line is one reply. Ctrl-C ends it and prints loss, minimum, median, 99th percentile and maximum.
+    Each line is one reply, and says how far the clock there is ahead of ours. Ctrl-C ends it and prints loss, minimum,
+    median, 99th percentile and maximum.
     The exit code is 1 if nothing came back.
 
     \b
@@ -131,10 +132,11 @@ class _Run:
         if self._as_json:
             line = {"number": number, "node": target, "rtt_ms": rtt_ms if came else None}
             if came:
-                line |= {key: result[key] for key in ("label", "role", "domain", "domain_label", "result")}
+                clock = {key: result.get(key) for key in ("clock_offset_ms", "clock_bound_ms")}
+                line |= {key: result[key] for key in ("label", "role", "domain", "domain_label", "result")} | clock
             echo(json.dumps(line))
         elif came:
-            echo(f"reply {number} from {self._labels[target]}: {rtt_ms:.2f} ms")
+            echo(f"reply {number} from {self._labels[target]}: {rtt_ms:.2f} ms{clock_words(result)}")
         else:
             echo(f"no reply {number} from {self._shown(target)} within {self._timeout_s:g} s")
 
@@ -153,6 +155,12 @@ class _Run:
 
     def _shown(self, target: str) -> str:
         return self._labels.get(target, Name.from_text(target).short)
+
+
+def clock_words(result: Mapping[str, object]) -> str:
+    """Return how far the clock of who replied is ahead, and the bound of the error; empty: not known."""
+    offset_ms, bound_ms = result.get("clock_offset_ms"), result.get("clock_bound_ms")
+    return "" if offset_ms is None else f", clock {offset_ms:+.2f} ± {bound_ms:.2f} ms"
 
 
 def _domain(result: Mapping[str, object]) -> str:

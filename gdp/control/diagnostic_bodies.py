@@ -95,6 +95,7 @@ class DiagnosticReply(Body):
         is_cut: lists in the result lack their last items.
         hops_left: that the request had when it came.
         membership: DER; empty: the asker has it.
+        clock: ``ClockStamps`` of the replying member; empty: of an earlier version.
     """
 
     TYPE = StatementType.DIAGNOSTIC_REPLY
@@ -107,6 +108,7 @@ class DiagnosticReply(Body):
     is_cut: Annotated[bool, Keyed("m", FLAG)] = False
     hops_left: Annotated[int, Keyed("h", uint(HOPS_MASK))] = 0
     membership: Annotated[bytes, Keyed("c", CERT, absent=b"", is_omitted=True)] = b""
+    clock: Annotated[bytes, Keyed("ts", OCTETS, absent=b"", is_omitted=True)] = b""
 
 
 def cut_to_fit(reply: DiagnosticReply, max_bytes: int) -> DiagnosticReply | None:

@@ -22,6 +22,7 @@ from gdp.errors import DropReason, FrameError, LocalError, StatementError
 from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
 from gdp.frame.kinds import Kind
 from gdp.limits import DIAGNOSTIC_FRAMES_RATE, DIAGNOSTIC_WAIT_S, DIAGNOSTICS_RATE, HOPS_MAX
+from gdp.message.clock_offset import ClockEstimate, ClockOffset, ClockStamps
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame, Timestamps
@@ -70,6 +71,7 @@ class Reply:
         is_withheld: it answers members of our domain with less than its own.
         is_cut: the rest would have made the reply longer than its request.
         switches: that the request passed before it came to the member, as that one counted.
+        clock: what its wall clock is ahead of ours; None: not known.
     """
 
     member: Membership
@@ -78,6 +80,7 @@ class Reply:
     is_withheld: bool = False
     is_cut: bool = False
     switches: int = 0
+    clock: ClockEstimate | None = None
 
 
 Answerer = Callable[[Question, Timestamps], "Mapping[str, object] | None"]
@@ -113,7 +116,7 @@ class _Asked:
     knows_us: bool
     until_s: float
     on_reply: OnReply | None = None  # our own question
-    begun_s: float = 0.0
+    begun_s: float = 0.0  # when it came
     hops_left: int = 0
 
 
@@ -149,6 +152,10 @@ class Diagnostics:
         self._pending: OrderedDict[int, _Pending] = OrderedDict()
         self._waiting: list[_Asked] = []
         self._peers = Lru[_Peer](_PEERS_MAX)
+        self._clocks = Lru[ClockOffset](_PEERS_MAX)
+        self._clock_from_s: float | None = (
+            None  # when the clock of our stamps showed 0: it says nothing of this machine
+        )
         self._knows_us: OrderedDict[Name, None] = OrderedDict()  # members that have our certificate
         self._frames = TokenBuckets(*DIAGNOSTIC_FRAMES_RATE)
         self._requests = TokenBuckets(*DIAGNOSTICS_RATE)
@@ -172,6 +179,11 @@ class Diagnostics:
                 that the policy names.
         """
         self._answerers[ask] = _Registered(answer, for_foreign)
+
+    def clock_of(self, member: Name, now: Timestamps) -> ClockEstimate | None:
+        """Return what a member's wall clock is ahead of ours, by its replies; None: there were none."""
+        clock = self._clocks.get(member)
+        return None if clock is None else clock.estimate(*now)
 
     # -- ask
 
@@ -301,6 +313,7 @@ class Diagnostics:
             len(statement.wire),
             request.knows_target,
             until_s,
+            begun_s=now.mono_s - arrival.waited_s,
             hops_left=header.hops_left & HOPS_MASK,
         )
         self._answer(asked, now)
@@ -330,6 +343,7 @@ class Diagnostics:
             is_withheld=not is_open,
             hops_left=asked.hops_left,
             membership=b"" if asked.knows_us else self._identity.member.wire,
+            clock=self._stamps(asked.begun_s, now).to_wire(),
         )
         fitting = cut_to_fit(made, asked.reply_max_bytes)
         if fitting is None:
@@ -354,7 +368,12 @@ class Diagnostics:
         self._knows_us.move_to_end(member.name)
         if len(self._knows_us) > _PEERS_MAX:
             self._knows_us.popitem(last=False)
-        rtt_s = max(now.mono_s - arrival.waited_s - pending.sent_s, 0.0)
+        came_s = now.mono_s - arrival.waited_s
+        rtt_s = max(came_s - pending.sent_s, 0.0)
+        if reply.clock:
+            clock = self._clocks.get(member.name) or ClockOffset()
+            clock.add(pending.sent_s, ClockStamps.from_wire(reply.clock), came_s, now.mono_s)
+            self._clocks.put(member.name, clock)
         made = Reply(
             member=member,
             result=reply.result,
@@ -362,8 +381,15 @@ class Diagnostics:
             is_withheld=reply.is_withheld,
             is_cut=reply.is_cut,
             switches=max(pending.hops - reply.hops_left, 0),
+            clock=self.clock_of(member.name, now),
         )
         pending.on_reply(made, rtt_s)
+
+    def _stamps(self, came_s: float, now: Timestamps) -> ClockStamps:
+        if self._clock_from_s is None:
+            self._clock_from_s = came_s
+        from_s, ahead_s = self._clock_from_s, now.unix_s - now.mono_s + self._clock_from_s
+        return ClockStamps(*(round(1e6 * each_s) for each_s in (came_s - from_s, now.mono_s - from_s, ahead_s)))
 
     def _verified(self, statement: Statement, now: Timestamps) -> _Peer:
         """Return the signer of a statement, whose signature is proved.

@@ -14,6 +14,7 @@ from gdp.control.diagnostics import Reply
 from gdp.errors import LocalError
 from gdp.intervals import MINUTE_S, PROMPT_S
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES, HOPS_MAX
+from gdp.message.clock_offset import ClockEstimate
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.state.control_protocol import Respond, Response
@@ -94,10 +95,17 @@ class DiagnosticCommands:
             "domain_label": "" if root is None else root.label,
             "result": {key: as_json(value) for key, value in reply.result.items()},
             "switches": reply.switches,
+            **clock_fields(reply.clock),
             "error": reply.error,
             "withheld": reply.is_withheld,
             "cut": reply.is_cut,
         }
+
+
+def clock_fields(clock: ClockEstimate | None) -> dict[str, float | None]:
+    """Return by how much another wall clock is ahead of ours, and the bound of the error, as JSON fields."""
+    offset_ms, bound_ms = (None, None) if clock is None else (round(1e3 * each, 3) for each in clock)
+    return {"clock_offset_ms": offset_ms, "clock_bound_ms": bound_ms}
 
 
 def as_json(value: object) -> object:

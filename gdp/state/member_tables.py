@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gdp.names import Name
 from gdp.sansio import Timestamps
-from gdp.state.diagnostic_control import Row, TableSource
+from gdp.state.diagnostic_control import Row, TableSource, clock_fields
 from gdp.state.node_state import MemberState, RibState
 from gdp.state.tables import common_tables, seconds_left
 from gdp.trust.right import Right
@@ -32,16 +32,17 @@ def participant_tables(state: MemberState) -> dict[str, TableSource]:
                 rows.append({"local": label, "right": each.right.value, "state": word, "name": each.subject.name})
         return sorted(rows, key=lambda row: (str(row["local"]), str(row["right"])))
 
-    def peer(topic: Name, far: Name, kind: str, word: str) -> Row:
-        return {"local": state.local_name(topic), "peer": far, "is": kind, "state": word, "name": topic}
+    def peer(topic: Name, far: Name, kind: str, word: str, now: Timestamps) -> Row:
+        clock = clock_fields(member.diagnostics.clock_of(far, now))
+        return {"local": state.local_name(topic), "peer": far, "is": kind, "state": word, **clock, "name": topic}
 
-    def peers(_now: Timestamps) -> list[Row]:
+    def peers(now: Timestamps) -> list[Row]:
         writers = [
-            peer(each.topic, each.publisher, "writer", each.state.name.lower())
+            peer(each.topic, each.publisher, "writer", each.state.name.lower(), now)
             for each in member.subscriptions.writer_proxies()
         ]
         readers = [
-            peer(each.topic, reader, "reader", "silent" if each.matched.is_suspended(reader) else "live")
+            peer(each.topic, reader, "reader", "silent" if each.matched.is_suspended(reader) else "live", now)
             for each in list(member.publications)
             for reader in map(Name, each.matched.names())
         ]

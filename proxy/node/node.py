@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import FrameType
 
+from gdp.client.clock_exchange import ClockExchange
 from gdp.client.participant import Participant, Topic
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
@@ -136,6 +137,7 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         runtime = node.runtime
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         runtime.every(TICK_S, EpochTimer(node.reload_on_signal).handle_timer)
+        runtime.every(TICK_S, ClockExchange(node.member).work)
         sources = common_sources(node.node_log, proxy_sources(node.state))
         handlers = replace(
             proxy_handlers(node.state, sources),

@@ -88,6 +88,8 @@ def answered(arguments: Mapping[str, object]) -> dict[str, object]:
         "withheld": is_trace and hops == 2,
         "cut": False,
         "error": "",
+        "clock_offset_ms": 2_500.12,
+        "clock_bound_ms": 0.7,
     }
 
 
@@ -118,8 +120,8 @@ def gdp(*words: str) -> int:
 def test_a_ping_prints_a_line_for_each_reply_and_a_summary(capsys: pytest.CaptureFixture[str]) -> None:
     assert gdp("ping", "/scan", "-c", "2", "-i", "0.05") == 0
     assert capsys.readouterr().out.splitlines() == [
-        "reply 1 from robot (proxy, school): 1.50 ms",
-        "reply 2 from robot (proxy, school): 1.50 ms",
+        "reply 1 from robot (proxy, school): 1.50 ms, clock +2500.12 ± 0.70 ms",
+        "reply 2 from robot (proxy, school): 1.50 ms, clock +2500.12 ± 0.70 ms",
         "--- /scan ---",
         "robot (proxy, school): 2 sent, 2 received, 0 % lost, min/median/p99/max 1.50/1.50/1.50/1.50 ms",
     ]
