@@ -402,8 +402,9 @@ class Publisher:
             heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
-        if queue.is_empty:
-            self.governing_paths.paces.slowing.blocks.clear()  # all that is published leaves in time
-        elif self.has_more and len(self.matched.active) > 1:
+        slowing = self.governing_paths.paces.slowing
+        if self.has_more and len(self.matched.active) > 1 and not queue.is_empty:
             self.governing_paths.record_waiting(sum(map(len, frames)), now_s)
+        elif slowing.blocks and queue.is_empty:
+            slowing.blocks.clear()  # all that is published leaves in time
         return frames
