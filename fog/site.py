@@ -224,11 +224,6 @@ class Site:
     border: Path | None = None
 
     @property
-    def software_folder(self) -> Path:
-        """Return the folder of the software server's keys, and of the packed workspace."""
-        return self.state / "software"
-
-    @property
     def software_listens(self) -> tuple[str, int]:
         """Return host and port on which the supervisor serves software; an empty host: every address."""
         if self.config.software.listen is not None:

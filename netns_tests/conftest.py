@@ -44,6 +44,8 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 
 def _why_not() -> str:
     """Return why tests with real namespaces cannot run here; empty if they can."""
+    if None in map(shutil.which, ("nsenter", "setpriv")):
+        return "nsenter or setpriv is not installed (util-linux)"
     try:
         with Space(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0):
             return ""

@@ -26,6 +26,7 @@ needs_wireguard = pytest.mark.skipif(
         ["messages.py", "--quick", "--mtu", "9000", "--load", "none"],
         pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "gdp"],
+        ["own_pace.py", "--quick", "--no-save"],
         pytest.param(["reduce.py", "--quick"], marks=needs_pillow),
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["ros.py", "--calls", "--quick", "--no-save"], marks=needs_ros2),

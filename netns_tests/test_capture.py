@@ -1,4 +1,4 @@
-"""Capture command in a child process, read back by Scapy."""
+"""Capture of the ring in a child process, read back by Scapy."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scapy.utils import PcapNgReader, RawPcapReader
 
 from gdp.frame.codec import Header, encode, ethernet
 from gdp.frame.kinds import Kind
+from gdp.frame.layers import GDP
 from lab.machine import LabMachine
 from lab.namespaces import Space
 from lab.process import LabProcess
@@ -38,7 +39,7 @@ def links(space: Space) -> Iterator[list[socket.socket]]:
 
 
 def start(machine: LabMachine, *arguments: str) -> LabProcess:
-    return machine.launch([sys.executable, "-m", "gdp.ports.capture", *arguments])
+    return machine.launch([sys.executable, "-m", "ring.capture", *arguments])
 
 
 def frame(number: int) -> bytes:
@@ -51,7 +52,7 @@ def test_every_frame_of_both_links_is_in_the_file_when_it_is_ended(
     number: signal.Signals, links: list[socket.socket], machine: LabMachine
 ) -> None:
     file = machine.folder / "seen.pcap"
-    capture = start(machine, "--iface", "b0", "--iface", "a1", str(file))
+    capture = start(machine, str(file), "b0", "a1")
     assert capture.read(PATIENCE_S) == {"event": "ready", "file": str(file)}
     for at in range(300):
         links[0].send(frame(at))  # comes in at b0
@@ -67,11 +68,11 @@ def test_every_frame_of_both_links_is_in_the_file_when_it_is_ended(
     assert [data for data, _ in seen if data[13] == 0xB5] == [*map(frame, range(300)), frame(1_000)]
     assert len(seen) == 302
     assert all(meta.sec > 1_600_000_000 and meta.wirelen == len(data) for data, meta in seen)
-    assert Ether(seen[0][0]).payload.name == "GDP"
+    assert isinstance(Ether(seen[0][0]).payload, GDP)
 
 
 def test_a_device_that_is_not_there_ends_it_with_a_word(space: Space, machine: LabMachine) -> None:
-    capture = start(machine, "--iface", "nothing", str(machine.folder / "seen.pcap"))
+    capture = start(machine, str(machine.folder / "seen.pcap"), "nothing")
     capture.reap(PATIENCE_S)
-    assert capture.code == 2
-    assert "device nothing: No such device" in capture.logged
+    assert capture.code == 1
+    assert "No such device" in capture.logged

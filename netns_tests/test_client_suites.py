@@ -41,8 +41,6 @@ from tests.pages import ROOT
 from tests.proxy.bridge import known
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph, Publication
 
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 pytest.importorskip("websockets")
 pytest.importorskip("roslibpy")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ from gdp.trust.right import Right
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
 from tests.pages import ROOT
 
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 pytest.importorskip("websockets")
 
 pytestmark = pytest.mark.netns

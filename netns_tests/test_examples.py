@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -11,9 +10,6 @@ import pytest
 
 from gdp.trust.right import Right
 from netns_tests.session_lab import EXAMPLES, SessionLab, lines_of, session_lab
-
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 
 pytestmark = pytest.mark.netns
 

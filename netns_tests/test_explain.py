@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import time
 from collections.abc import Iterator, Mapping
@@ -23,9 +22,6 @@ from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
 needs("std_msgs", "std_srvs")
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
-
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("a diagnosis takes seconds")]
 
 STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"

@@ -65,6 +65,7 @@ def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
     yield made
     made.run("down", "--all")
     made.host.close()
+    assert not left_of(made)
 
 
 def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(fog: Fog) -> None:
@@ -121,7 +122,7 @@ def test_the_listing_of_the_paper_plans_grasps_on_two_machines_and_the_robot_fin
 ) -> None:
     for module in ("cv2", "scipy"):
         pytest.importorskip(module, reason="needs the extra experiments")
-    patient = 'cloud_nodes=[planner],\n        timeout_s=60.0,'  # a busy machine plans longer than a call waits
+    patient = "cloud_nodes=[planner],\n        timeout_s=60.0,"  # a busy machine plans longer than a call waits
     written = (ROOT / "examples" / "listing1.launch.py").read_text().replace("cloud_nodes=[planner],", patient)
     listing = str(tmp_path / "listing1.launch.py")
     Path(listing).write_text(written)

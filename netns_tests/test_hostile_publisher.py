@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from collections.abc import Iterator
 from typing import Final
@@ -13,9 +12,6 @@ import yaml
 
 from gdp.trust.right import Right
 from netns_tests.session_lab import SessionLab, lines_of, session_lab
-
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("about one input, no lease matters")]
 

@@ -107,23 +107,33 @@ def observe(
     return receiver.wait(token, timeout_s)
 
 
+class Internet:
+    """A laboratory with two hosts of public addresses."""
+
+    def __init__(self, laboratory: Laboratory) -> None:
+        self.laboratory = laboratory
+        site = laboratory.add_site("dc", Access.PUBLIC)
+        self.borders = laboratory.add_host("border1", site), laboratory.add_host("border2", site)
+
+    def attach(self, access: Access, label: str = "robot", **options: float) -> Host:
+        """Attach a host by a site of its own."""
+        return self.laboratory.add_host(label, self.laboratory.add_site(f"of-{label}", access, **options))
+
+
 @pytest.fixture
-def borders(laboratory: Laboratory) -> tuple[Host, Host]:
-    """Two hosts with public addresses."""
-    site = laboratory.add_site("dc", Access.PUBLIC)
-    return laboratory.add_host("border1", site), laboratory.add_host("border2", site)
-
-
-def attach(laboratory: Laboratory, access: Access, label: str = "robot", **options: float) -> Host:
-    return laboratory.add_host(label, laboratory.add_site(f"of-{label}", access, **options))
+def net(laboratory: Laboratory) -> Internet:
+    return Internet(laboratory)
 
 
 @pytest.mark.parametrize("access", NATS, ids=lambda each: each.value)
-def test_a_nat_maps_a_socket_to_one_endpoint_unless_it_is_symmetric(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
-) -> None:
-    robot = attach(laboratory, access)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as a, UdpProbe(borders[0]) as b, UdpProbe(borders[1]) as c:
+def test_a_nat_maps_a_socket_to_one_endpoint_unless_it_is_symmetric(net: Internet, access: Access) -> None:
+    robot = net.attach(access)
+    with (
+        UdpProbe(robot) as probe,
+        UdpProbe(net.borders[0]) as a,
+        UdpProbe(net.borders[0]) as b,
+        UdpProbe(net.borders[1]) as c,
+    ):
         seen = [observe(probe, each) for each in (a, b, c)]
     assert {each.address for each in seen if each} == {robot.site().address}
     assert (len(set(seen)) == 1) is TRAITS[access].is_mapping_stable
@@ -139,15 +149,13 @@ def test_a_nat_maps_a_socket_to_one_endpoint_unless_it_is_symmetric(
     ],
     ids=lambda each: each.value,
 )
-def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
-) -> None:
-    robot = attach(laboratory, access)
+def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(net: Internet, access: Access) -> None:
+    robot = net.attach(access)
     with (
         UdpProbe(robot) as probe,
-        UdpProbe(borders[0]) as known,
-        UdpProbe(borders[0]) as port,
-        UdpProbe(borders[1]) as stranger,
+        UdpProbe(net.borders[0]) as known,
+        UdpProbe(net.borders[0]) as port,
+        UdpProbe(net.borders[1]) as stranger,
     ):
         public = observe(probe, known)
         assert public is not None
@@ -156,20 +164,18 @@ def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
 
 
 @pytest.mark.nightly
-def test_a_full_cone_has_no_mapping_for_a_socket_that_never_sent(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.FULL_CONE)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as stranger:
+def test_a_full_cone_has_no_mapping_for_a_socket_that_never_sent(net: Internet) -> None:
+    robot = net.attach(Access.FULL_CONE)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as stranger:
         assert observe(stranger, probe, Endpoint(robot.site().address, probe.local.port)) is None
 
 
-def test_where_udp_is_blocked_only_tcp_to_port_443_passes(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
-    robot = attach(laboratory, Access.UDP_BLOCKED)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0], port=443) as border:
+def test_where_udp_is_blocked_only_tcp_to_port_443_passes(net: Internet) -> None:
+    robot = net.attach(Access.UDP_BLOCKED)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0], port=443) as border:
         assert observe(probe, border, timeout_s=SILENCE_S) is None
-    assert connects(robot, borders[0], 443)
-    assert not connects(robot, borders[0], 80, 0.5)
+    assert connects(robot, net.borders[0], 443)
+    assert not connects(robot, net.borders[0], 80, 0.5)
 
 
 def connects(client: Host, server: Host, port: int, timeout_s: float = 5.0) -> bool:
@@ -185,19 +191,17 @@ def connects(client: Host, server: Host, port: int, timeout_s: float = 5.0) -> b
         return True
 
 
-def test_an_ipv6_only_host_shows_its_own_address_and_lets_no_stranger_in(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.IPV6_ONLY)
+def test_an_ipv6_only_host_shows_its_own_address_and_lets_no_stranger_in(net: Internet) -> None:
+    robot = net.attach(Access.IPV6_ONLY)
     assert not robot.lease().has(4)
-    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border, UdpProbe(borders[1], 6) as stranger:
+    with UdpProbe(robot, 6) as probe, UdpProbe(net.borders[0], 6) as border, UdpProbe(net.borders[1], 6) as stranger:
         assert observe(stranger, probe, timeout_s=SILENCE_S) is None
         assert observe(probe, border) == probe.local
         assert observe(border, probe) == border.local
 
 
-def test_a_public_host_is_reached_by_a_stranger_over_both_ip_versions(laboratory: Laboratory) -> None:
-    one, other = (attach(laboratory, Access.PUBLIC, label) for label in ("one", "other"))
+def test_a_public_host_is_reached_by_a_stranger_over_both_ip_versions(net: Internet) -> None:
+    one, other = (net.attach(Access.PUBLIC, label) for label in ("one", "other"))
     for version in (4, 6):
         with UdpProbe(one, version) as a, UdpProbe(other, version) as b:
             assert observe(a, b) == a.local
@@ -206,10 +210,10 @@ def test_a_public_host_is_reached_by_a_stranger_over_both_ip_versions(laboratory
 @pytest.mark.nightly
 @pytest.mark.parametrize("access", [Access.FULL_CONE, Access.DOUBLE_NAT], ids=lambda each: each.value)
 def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagram_from_inside(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+    net: Internet, access: Access
 ) -> None:
-    robot = attach(laboratory, access)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+    robot = net.attach(access)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         before = observe(probe, border)
         robot.site().flush_mappings()
         assert observe(border, probe, before, timeout_s=SILENCE_S) is None
@@ -218,11 +222,9 @@ def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagra
 
 
 @pytest.mark.nightly
-def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.SYMMETRIC)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(net: Internet) -> None:
+    robot = net.attach(Access.SYMMETRIC)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         before = observe(probe, border)
         assert observe(probe, border) == before
         robot.site().flush_mappings()
@@ -231,11 +233,9 @@ def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("access", [*NATS, Access.PUBLIC], ids=lambda each: each.value)
-def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
-) -> None:
-    robot = attach(laboratory, access)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(net: Internet, access: Access) -> None:
+    robot = net.attach(access)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         before = observe(probe, border)
         robot.site().renumber()
         after = observe(probe, border)
@@ -247,55 +247,47 @@ def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
 
 
 @pytest.mark.nightly
-def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.IPV6_ONLY)
-    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border:
+def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(net: Internet) -> None:
+    robot = net.attach(Access.IPV6_ONLY)
+    with UdpProbe(robot, 6) as probe, UdpProbe(net.borders[0], 6) as border:
         before = observe(probe, border)
         robot.site().renumber()
         assert observe(probe, border) not in (before, None)
 
 
 @pytest.mark.nightly
-def test_a_new_lease_gives_a_host_another_address_behind_the_same_nat(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
+def test_a_new_lease_gives_a_host_another_address_behind_the_same_nat(net: Internet) -> None:
+    robot = net.attach(Access.PORT_RESTRICTED)
     before = robot.lease().address
     robot.renumber()
     assert robot.lease().address != before
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         seen = observe(probe, border)
         assert seen is not None
         assert seen.address == robot.site().address
 
 
 @pytest.mark.nightly
-def test_a_socket_outlives_the_move_of_its_host_to_another_site(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
-    mobile = laboratory.add_site("mobile", Access.SYMMETRIC)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+def test_a_socket_outlives_the_move_of_its_host_to_another_site(net: Internet) -> None:
+    robot = net.attach(Access.PORT_RESTRICTED)
+    mobile = net.laboratory.add_site("mobile", Access.SYMMETRIC)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         assert observe(probe, border) is not None
         robot.attach(mobile)
         after = observe(probe, border)
     assert after is not None
     assert after.address == mobile.address
-    robot.attach(laboratory.add_site("v6", Access.IPV6_ONLY))
-    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border:
+    robot.attach(net.laboratory.add_site("v6", Access.IPV6_ONLY))
+    with UdpProbe(robot, 6) as probe, UdpProbe(net.borders[0], 6) as border:
         assert observe(probe, border) == probe.local
 
 
 @pytest.mark.nightly
-def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    home, mobile = (laboratory.add_site(label, Access.PORT_RESTRICTED) for label in ("home", "mobile"))
-    robot = laboratory.add_host("robot", home, "wlan0")
+def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(net: Internet) -> None:
+    home, mobile = (net.laboratory.add_site(label, Access.PORT_RESTRICTED) for label in ("home", "mobile"))
+    robot = net.laboratory.add_host("robot", home, "wlan0")
     robot.attach(mobile, "wwan0")
-    with UdpProbe(borders[0]) as border:
+    with UdpProbe(net.borders[0]) as border:
         for device, address in (("", home.address), ("wlan0", home.address), ("wwan0", mobile.address)):
             with UdpProbe(robot, device=device) as probe:
                 seen = observe(probe, border)
@@ -304,11 +296,9 @@ def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(
 
 
 @pytest.mark.nightly
-def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(net: Internet) -> None:
+    robot = net.attach(Access.PORT_RESTRICTED)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         public = observe(probe, border)
         robot.site().cut()
         assert observe(probe, border, timeout_s=SILENCE_S) is None
@@ -319,8 +309,8 @@ def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
 
 
 @pytest.mark.nightly
-def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED)
+def test_an_unplugged_host_sees_its_carrier_go_and_come(net: Internet) -> None:
+    robot = net.attach(Access.PORT_RESTRICTED)
     seen = []
     for action in (robot.unplug, robot.plug):
         action()
@@ -331,12 +321,10 @@ def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("access", [Access.SYMMETRIC, Access.DOUBLE_NAT, Access.IPV6_ONLY], ids=lambda each: each.value)
-def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
-    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
-) -> None:
-    robot = attach(laboratory, access)
+def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(net: Internet, access: Access) -> None:
+    robot = net.attach(access)
     version = min(TRAITS[access].versions)
-    with UdpProbe(robot, version) as probe, UdpProbe(borders[0], version) as border:
+    with UdpProbe(robot, version) as probe, UdpProbe(net.borders[0], version) as border:
         public = observe(probe, border)
         robot.site().power_off()
         assert observe(probe, border, timeout_s=SILENCE_S) is None
@@ -346,11 +334,9 @@ def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
 
 
 @pytest.mark.nightly
-def test_a_delay_line_delays_both_directions_and_loses_nothing(
-    laboratory: Laboratory, borders: tuple[Host, Host]
-) -> None:
-    robot = attach(laboratory, Access.PORT_RESTRICTED, delay_ms=30.0, jitter_ms=5.0)
-    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+def test_a_delay_line_delays_both_directions_and_loses_nothing(net: Internet) -> None:
+    robot = net.attach(Access.PORT_RESTRICTED, delay_ms=30.0, jitter_ms=5.0)
+    with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         public = observe(probe, border)
         started_s = time.monotonic()
         probe.send(border.local, b"there")

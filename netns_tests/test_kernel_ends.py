@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
+import struct
 import sys
 import time
+from collections.abc import Iterator
 
 import pytest
 from pyroute2 import IPRoute
@@ -15,14 +18,13 @@ from gdp.ports.kernel.assembler import Assembler
 from gdp.ports.kernel.loaded_program import PROGRAM
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.kernel.syscall import (
-    Command,
+    BpfError,
     attached,
+    bpf,
     create_link,
-    link_program,
+    info_of,
     load_program,
-    objects,
-    program_id,
-    program_name,
+    name_of,
 )
 from gdp.switch.table import Table
 from lab.machine import LabMachine
@@ -34,6 +36,7 @@ from tests.fixtures_forwarding import MTUS, ONE, PEER_MACS, WIDE, filled, frame,
 pytestmark = pytest.mark.netns
 
 TCX_INGRESS = 46
+PROG_GET_NEXT_ID, LINK_GET_FD_BY_ID, LINK_GET_NEXT_ID = 11, 30, 31  # enum bpf_cmd
 PATIENCE_S = 20.0
 
 
@@ -62,14 +65,44 @@ def running(machine: LabMachine, mode: str, ports: list[str]) -> tuple[LabProces
     return child, [int(each) for each in child.read_line(PATIENCE_S).split()]
 
 
+def program_id(program: int) -> int:
+    """Return the id of an open program, constant while it is loaded."""
+    return int(struct.unpack_from("=II", info_of(program))[1])
+
+
+def ids(next_id: int) -> Iterator[int]:
+    """Yield the ids of all programs (or links) of the system."""
+    at = 0
+    while True:
+        attributes = bytearray(struct.pack("=II8x", at, 0))
+        try:
+            bpf(next_id, attributes, "list what is loaded")
+        except BpfError as error:
+            if error.number == errno.ENOENT:
+                return
+            raise
+        at = struct.unpack_from("=II", attributes)[1]
+        yield at
+
+
 def loaded() -> dict[int, str]:
     """Return the names of all programs in the kernel; others on this machine may have loaded theirs."""
-    found = objects(Command.PROG_GET_NEXT_ID, Command.PROG_GET_FD_BY_ID)
-    return {program_id(opened): program_name(opened) for opened in found}
+    return {each: name for each in ids(PROG_GET_NEXT_ID) if (name := name_of(each)) is not None}
 
 
 def links_of(program: int) -> int:
-    return [link_program(each) for each in objects(Command.LINK_GET_NEXT_ID, Command.LINK_GET_FD_BY_ID)].count(program)
+    """Return how many links a program has."""
+    count = 0
+    for each in ids(LINK_GET_NEXT_ID):
+        try:
+            opened = bpf(LINK_GET_FD_BY_ID, bytearray(struct.pack("=I12x", each)), "open a link")
+        except BpfError as error:
+            if error.number == errno.ENOENT:  # removed in the meantime
+                continue
+            raise
+        count += struct.unpack_from("=III", info_of(opened))[2] == program
+        os.close(opened)
+    return count
 
 
 def gone(program: int) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import sys
 
@@ -10,9 +9,6 @@ import pytest
 
 from netns_tests.session_lab import lines_of, session_lab
 from tests.pages import ROOT, blocks
-
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 
 pytestmark = pytest.mark.netns
 

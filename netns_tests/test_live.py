@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import time
 from collections.abc import Iterator, Mapping
@@ -17,9 +16,6 @@ from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
 needs("std_msgs", "nav_msgs", "sensor_msgs", "geometry_msgs", "std_srvs", "test_msgs")
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
-
 pytestmark = pytest.mark.netns
 
 STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
@@ -12,9 +11,6 @@ from netns_tests.live_pair import Crossing, Pair, Proxy, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
 needs("std_msgs", "sensor_msgs", "geometry_msgs", "std_srvs", "diagnostic_msgs")
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
-
 pytestmark = pytest.mark.netns
 
 STRING, SET_BOOL, IMAGE = "std_msgs/msg/String", "std_srvs/srv/SetBool", "sensor_msgs/msg/Image"

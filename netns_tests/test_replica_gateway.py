@@ -44,9 +44,11 @@ from netns_tests.local_site import (
     spec,
     ticking,
 )
-from netns_tests.test_fog import Fog, left_of
+from netns_tests.test_fog import Fog, fog
 from netns_tests.test_uplink import BYTES, OVERHEAD_BYTES, PARTS, REQUESTS, tell
 from tests.pages import ROOT
+
+__all__ = ["fog"]  # a fixture
 
 pytestmark = pytest.mark.netns
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
@@ -146,16 +148,6 @@ def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gatew
             assert once < received_bytes(gateway, provider) - sent < 1.5 * once  # two copies are 2.0 or more
     finally:
         domain.close()
-
-
-@pytest.fixture
-def fog(tmp_path: Path, space: Space) -> Iterator[Fog]:
-    space.ip("link", "set", "lo", "up")
-    made = Fog(tmp_path)
-    yield made
-    made.run("down", "--all")
-    made.host.close()
-    assert not left_of(made)
 
 
 @pytest.mark.nightly

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import pytest
@@ -15,6 +16,7 @@ import pytest
 import gdp
 from gdp.trust.right import Right
 from internet.access import Access
+from internet.flow import open_sessions
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
@@ -89,25 +91,13 @@ class Field:
 def roamer(laboratory: Laboratory, request: pytest.FixtureRequest) -> Iterator[Field]:
     """Yield the robot and the server, between which messages flow; a parameter is the lease of their names."""
     lease_s = getattr(request, "param", None)
-    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
-    server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    overlay = Overlay(laboratory)
-    overlay.add_switch(border, is_border=True)
-    for host in (robot, server):
-        overlay.add_switch(host, borders=[border])
-    overlay.start(border)
-    overlay.start_rib(border)
-    overlay.start(robot, server)
     rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
-    nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
-    with (
-        overlay.open_session(robot, nodes[0], lease_s) as caller,
-        overlay.open_session(server, nodes[1], lease_s) as callee,
-    ):
+    with ExitStack() as stack:
+        overlay, _, (caller, callee) = open_sessions(robot, stack, rights, lease_s=lease_s)
         subscription = callee.subscribe(TOPIC, queue=UNREAD)
         publisher = caller.publisher(TOPIC)
-        made = Field(laboratory, overlay, border, robot, caller, publisher, subscription)
+        made = Field(laboratory, overlay, laboratory.hosts["border"], robot, caller, publisher, subscription)
         callee.serve(SERVICE, made.serve)
         made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
         publishing = threading.Thread(target=made.publish)

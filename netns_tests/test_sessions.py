@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
@@ -10,9 +9,6 @@ import pytest
 from gdp.trust.right import Right
 from lab.process import calling
 from netns_tests.session_lab import SessionLab, execute, session_lab
-
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
 
 pytestmark = pytest.mark.netns
 

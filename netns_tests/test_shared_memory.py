@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -44,20 +45,26 @@ def lab() -> Iterator[Lab]:
         yield made
 
 
-def peer(lab: Lab, node: str, name: str) -> Peer:
-    """Start a node on a machine, whose Fast DDS has shared memory and UDP."""
-    made = Peer(name, lab.command(node, [], ros_environment(lab.directory, DOMAIN, shared_memory=True)), {})
-    made.tell("!from std_msgs.msg import String")
-    return made
+@contextmanager
+def peers(lab: Lab, topic: str, talks: str, listens: str) -> Iterator[tuple[Peer, Peer]]:
+    """Start a talker and a listener on two machines, which have met; their Fast DDS has shared memory and UDP."""
+    with ExitStack() as stack:
+        talker, listener = (
+            Peer(name, lab.command(node, [], ros_environment(lab.directory, DOMAIN, shared_memory=True)), {})
+            for name, node in (("talker", talks), ("listener", listens))
+        )
+        for peer in (talker, listener):
+            stack.callback(peer.end)
+            peer.tell("!from std_msgs.msg import String")
+        listener.tell(f"!listen(String, {topic!r})")
+        talker.tell(f"!out = talk(String, {topic!r})")
+        talker.waits_for("out.get_subscription_count()", 1)
+        yield talker, listener
 
 
 @pytest.mark.nightly
 def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> None:
-    talker, listener = peer(lab, "s1", "talker"), peer(lab, "s2", "listener")
-    try:
-        listener.tell("!listen(String, '/news')")
-        talker.tell("!out = talk(String, '/news')")
-        talker.waits_for("out.get_subscription_count()", 1)
+    with peers(lab, "/news", "s1", "s2") as (talker, listener):
         talker.tell("out.publish(String(data='before'))")
         listener.waits_for("len(heard['/news'])", 1)
         lab.namespaces.cut("s1", "s2")
@@ -66,25 +73,15 @@ def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> 
         assert listener.tell("len(heard['/news'])") == 1
         lab.namespaces.restore_link("s1", "s2")
         listener.waits_for("len(heard['/news'])", 2)
-    finally:
-        talker.end()
-        listener.end()
 
 
 def test_nodes_of_one_machine_exchange_large_messages_through_shared_memory(lab: Lab) -> None:
-    talker, listener = peer(lab, "s1", "talker"), peer(lab, "s1", "listener")
-    try:
-        listener.tell("!listen(String, '/images')")
-        talker.tell("!out = talk(String, '/images')")
-        talker.waits_for("out.get_subscription_count()", 1)
+    with peers(lab, "/images", "s1", "s1") as (talker, listener):
         before = int(str(talker.tell(OCTETS)))
         for number in range(1, IMAGES + 1):
             talker.tell(f"out.publish(String(data='x' * {IMAGE_BYTES}))")
             listener.waits_for("len(heard['/images'])", number)
         assert int(str(talker.tell(OCTETS))) - before < IMAGE_BYTES  # discovery and acknowledgements
-    finally:
-        talker.end()
-        listener.end()
 
 
 @pytest.mark.nightly

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import select
-import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -21,9 +20,6 @@ from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_la
 from tests.proxy.endpoints.ros2_net import needs
 
 needs("std_msgs", "std_srvs")
-if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
-    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
-
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("about tools, no lease matters")]
 
 STRING, SET_BOOL, TRIGGER = "std_msgs/msg/String", "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"

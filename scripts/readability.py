@@ -6,7 +6,6 @@
     scripts/readability.py --save            write the better of limit and figure as limits: they never get looser
     scripts/readability.py --words           list each listed word as file:line:column: word
     scripts/readability.py --names           list method names that many packages define
-    scripts/readability.py --json            print the figures as JSON
 
 ``scripts/readability.json`` holds the limits, the goals, the listed words and the exceptions, each with its reason.
 Exit status: 0 all limits hold, 1 a figure is worse, 2 wrong usage.
@@ -384,7 +383,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--save", action="store_true", help="lower the limits to the present figures")
     parser.add_argument("--words", action="store_true", help="list each place of a listed word")
     parser.add_argument("--names", action="store_true", help="list method names that several packages define")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     options = parser.parse_args(argv)
     console = Console(highlight=False, soft_wrap=True)
     try:
@@ -392,9 +390,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         parser.error(str(error))
     report = measure(ROOT, settings)
-    if options.json:
-        print(json.dumps(report.figures, indent=2))
-    elif not options.words and not options.names:
+    if not options.words and not options.names:
         console.print(_table(report, settings))
         for circle in report.circles:
             console.print("import circle:", ", ".join(circle), markup=False)

@@ -79,7 +79,7 @@ def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
 def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:
     """Release all machines of a cluster, wait until they are gone, and print their number."""
     out = console(stderr=as_json)
-    last = max((each.id for each in journal.events(last=1)), default=0)
+    last = journal.last_event()
     journal.unwant(name, why, time.time())
     is_known = any(each.plan.name == name for each in journal.clusters())
     count = len(journal.machines(name, gone=False))

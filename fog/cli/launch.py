@@ -16,19 +16,18 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
 
 from fog.cli.down import clear, end_cluster
 from fog.cli.market import choices, in_regions, market, reached, refusal
 from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, Started, resolved, run
-from fog.cli.views import event_line, print_json
+from fog.cli.views import print_event
 from fog.cluster import ClusterPlan
 from fog.launch.load import Loaded
 from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.infrastructure import command_of, is_up, open_provider, set_up
-from fog.supervisor.journal import Entry, Journal
+from fog.supervisor.journal import Journal
 from gdp.cli.console import Columns, console
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
@@ -132,7 +131,7 @@ def launch(
         loaded = priced(here).loaded
         plan = loaded.plan
         robot = check_programs(here, loaded)
-        last = max((each.id for each in journal.events(last=1)), default=0)
+        last = journal.last_event()
         for each in (signal.SIGINT, signal.SIGTERM):  # a shell lets programs in its background ignore the first
             signal.signal(each, signal.default_int_handler)
         try:
@@ -186,7 +185,7 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
     def news() -> tuple[int, str]:
         last, reported = after, trouble
         for entry in journal.events(plan.name, after=after):
-            _tell(entry, out, as_json=as_json)
+            print_event(entry, out, as_json=as_json)
             last = entry.id
             reported = entry.detail if entry.what in ("trouble", "refused", "failed") else reported
         return last, reported
@@ -209,10 +208,3 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
             time.sleep(LOOK_S)
     if not as_json:
         out.print(f"{wanted} {serve}", style="green" if is_watched else "yellow")
-
-
-def _tell(entry: Entry, out: Console, *, as_json: bool) -> None:
-    if as_json:
-        print_json(entry)
-    else:
-        out.print(event_line(entry))

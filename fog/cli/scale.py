@@ -9,7 +9,7 @@ import os
 import time
 from contextlib import closing
 from dataclasses import replace
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -24,16 +24,12 @@ from gdp.cli.node import Logs, running
 from gdp.errors import LocalError
 from gdp.terminal import echo
 
-_LINES: Final = 50
-
 scale = typer.Typer(no_args_is_help=True, help="Add or take away replicas while all runs.")
 
 Count = Annotated[int, typer.Argument(metavar="[N]", min=1, help="how many")]
 Detach = Annotated[bool, typer.Option("--detach", help="do not wait")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="show what it would cost, change nothing")]
 Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="such as m3; see fog status")]
-Program = Annotated[str, typer.Argument(metavar="[PROGRAM]", help="node, proxy or switch; empty: the machine itself")]
-Lines = Annotated[int, typer.Option("--lines", "-n", min=1, help="only the last so many")]
 Lock = Annotated[int | None, typer.Option("--lock", hidden=True)]
 Stay = Annotated[bool, typer.Option("--stay", help="go on also while nothing is wanted; for systemd")]
 
@@ -67,7 +63,7 @@ def up(
         if dry_run:
             _say({"cluster": plan.name, "adds": count, "usd_per_hour": round(usd, 6)}, as_json=as_json)
             return
-        last = max((each.id for each in journal.events(last=1)), default=0)
+        last = journal.last_event()
         wider = replace(plan, machines=(*plan.machines, *more))
         set_up(here)
         journal.put_cluster(wider, time.time(), why=f"{len(plan.machines)} -> {len(wider.machines)} machines")

@@ -25,6 +25,7 @@ from fog.cli.views import (
     events_table,
     machine_fields,
     machines_table,
+    print_event,
     print_json,
     show,
 )
@@ -100,9 +101,7 @@ def status(
                 _as_json(lambda: _status(here, journal, journal.cluster(name), gone=all_), follow=follow)
             elif follow and not console().is_terminal:
                 show(_page(here, journal, found, gone=all_))
-                _follow(
-                    journal, name, max((each.id for each in journal.events(name, last=1)), default=0), as_json=False
-                )
+                _follow(journal, name, journal.last_event(), as_json=False)
             elif follow:
                 with Live(console=console(), auto_refresh=False) as live:
                     while True:
@@ -191,10 +190,7 @@ def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoRetu
     while True:
         for entry in journal.events(name, after=after):
             after = entry.id
-            if as_json:
-                print_json(entry)
-            else:
-                out.print(event_line(entry))
+            print_event(entry, out, as_json=as_json)
         sys.stdout.flush()
         time.sleep(WATCH_S)
 

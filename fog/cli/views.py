@@ -11,7 +11,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Final
 
-from rich.console import RenderableType
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -35,6 +35,7 @@ __all__ = [
     "machine_fields",
     "machines_table",
     "ms_text",
+    "print_event",
     "print_json",
     "show",
     "stage",
@@ -214,6 +215,14 @@ def show(*parts: RenderableType) -> None:
         for part in parts:
             shown.print(part)
     echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+def print_event(entry: Entry, out: Console, *, as_json: bool) -> None:
+    """Print one event as it happens: as JSON, or as a line of text on ``out``."""
+    if as_json:
+        print_json(entry)
+    else:
+        out.print(event_line(entry))
 
 
 def print_json(value: object) -> None:

@@ -199,6 +199,10 @@ class Journal(TransactionFile):
             rows = file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
         return [Entry(**dict(zip(_ENTRY_COLUMNS, row, strict=True))) for row in reversed(rows)]
 
+    def last_event(self) -> int:
+        """Return the id of the newest event; 0: there was none."""
+        return max((each.id for each in self.events(last=1)), default=0)
+
     def _plan(self, name: str, plan: str) -> ClusterPlan:
         try:
             return ClusterPlan.from_json(plan)

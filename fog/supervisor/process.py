@@ -88,7 +88,7 @@ def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[st
     with ExitStack() as stack:
         stack.callback(listening.close)
         url = f"https://{site.config.software_address}"
-        server = SoftwareServer(listening, site.software_folder, site.config.software, url, time.time)
+        server = SoftwareServer(listening, site.state / "software", site.config.software, url, time.time)
         stack.callback(server.close)
         yield partial(server.bundle_file, lifetime_s)
 

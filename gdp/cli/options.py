@@ -5,6 +5,7 @@ I/O.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -31,6 +32,12 @@ Protect = Annotated[bool, typer.Option("--protect", help="put private keys under
 KeyUri = Annotated[
     str | None, typer.Option("--key", metavar="URI", help="the signing key is in a token: pkcs11:... (RFC 7512)")
 ]
+
+
+def known_name(example: str, complete: Callable[..., list[str]]) -> object:
+    """Return the argument of a command for a name that exists already; ``complete``: returns those that begin so."""
+    text = f"ROS name such as {example}, the 256-bit name in hex, or its short form such as 75e…0fc."
+    return typer.Argument(metavar="NAME", autocompletion=complete, help=text)
 
 
 class NameOptions(NamedTuple):

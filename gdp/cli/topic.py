@@ -14,7 +14,7 @@ import typer
 
 from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
-from gdp.cli.options import Host
+from gdp.cli.options import Host, known_name
 from gdp.cli.output import show
 from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, known_names, rated_rows
@@ -60,14 +60,7 @@ def complete_known(incomplete: str) -> list[str]:
     return sorted({row.topic for row in rows if row.topic.startswith(incomplete)})
 
 
-KnownName = Annotated[
-    str,
-    typer.Argument(
-        metavar="NAME",
-        autocompletion=complete_known,
-        help="ROS name such as /scan, the 256-bit name in hex, or its short form such as 75e…0fc.",
-    ),
-]
+KnownName = Annotated[str, known_name("/scan", complete_known)]
 
 
 @app.command("list")

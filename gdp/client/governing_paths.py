@@ -102,18 +102,22 @@ class GoverningPaths:
         if self._count > 1 and self.is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._governing()
-        may_slow = self._may_pace and self._queue.options.own_pace and not self._queue.is_acknowledged
-        if paths and not paths[1:] and not self.blocking.blocks and not (may_slow and self.paces.stated):
+        if paths and not paths[1:] and not self.blocking.blocks:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
         if self._fastest_governs:
             return max(allowances, default=_ALL)
         if self.blocking.blocks or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
-        allowance = min(allowances, default=_ALL)
-        if may_slow and (self.paces.slowing.blocks or (allowance <= 0 and len(self._readers.active) > 1)):
-            self.paces.record(self.names(), now_s)
-        return allowance
+        return min(allowances, default=_ALL)
+
+    def record_waiting(self, size: int, now_s: float) -> None:
+        """Note which readers hold back the others, for more waits than the ``size`` bytes that leave now.
+
+        A path may permit a little at each turn, if turns are rare: what counts is what it permits beyond that.
+        """
+        if self._may_pace and self._queue.options.own_pace and not self._queue.is_acknowledged:
+            self.paces.record(self.names(), size, now_s)
 
     def allowance_of_all(self, now_s: float) -> int:
         """Return how many bytes of frames may leave on each of the paths; 0: none."""

@@ -394,7 +394,8 @@ class Publisher:
             heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
-        slowing = self.governing_paths.paces.slowing
-        if slowing.blocks and queue.is_empty:
-            slowing.blocks.clear()  # all that is published leaves in time
+        if queue.is_empty:
+            self.governing_paths.paces.slowing.blocks.clear()  # all that is published leaves in time
+        elif self.has_more and len(self.matched.active) > 1:
+            self.governing_paths.record_waiting(sum(map(len, frames)), now_s)
         return frames

@@ -87,11 +87,14 @@ class ReaderPaces:
                 given.pace, given.since_s = pace_of(model.bytes_s), now_s
         return given.pace != pace
 
-    def record(self, names: Iterable[bytes], now_s: float) -> None:
-        """Note which of the readers that govern hold back others, those with paces of their own included."""
+    def record(self, names: Iterable[bytes], size: int, now_s: float) -> None:
+        """Note which of the readers that govern hold back others, those with paces of their own included.
+
+        ``size``: bytes that leave now. A path that permits no further frame then holds back what waits.
+        """
         paths = {name: path for name in names if (path := self._paths.path(name, now_s)).governs_others}
         slowest = min((path.controller.model.bytes_s for path in paths.values()), default=0.0)
-        states = [PathState(name, path.allowance(now_s), 0) for name, path in paths.items()]
+        states = [PathState(name, (path.allowance(now_s) - size) // path.mtu, 0) for name, path in paths.items()]
         faster = (path for path in self.paced() if path.controller.model.bytes_s >= _FASTER * slowest)
         states += [PathState(b"", 1, 0) for path in faster if path not in paths.values()]
         self.slowing.record(states, now_s)

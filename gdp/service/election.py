@@ -48,10 +48,6 @@ class Election:
         """Return whether the time for silent replicas is over."""
         return now_s >= self._collect_until_s
 
-    def must_yield(self, log: LogId, own: LogId, replicas: Replicas) -> bool:
-        """Return whether another log wins: unless the own one has begun and is greater."""
-        return not (replicas.following() and log < own)
-
     def elect(self, replicas: Replicas, instance: int) -> Elected | None:
         """Return the log that begins now, or None while it may not.
 

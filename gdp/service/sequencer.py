@@ -254,7 +254,7 @@ class Sequencer(Generic[A]):
 
     def _handle_leader(self, leader: Name, log: LogId, now_s: float) -> None:
         """Record that a replica follows another sequencer, and yield to it if its log wins."""
-        if not self._election.must_yield(log, self.log, self._replicas):
+        if self._replicas.following() and log < self.log:  # the own one has begun and is greater
             return
         self._election.leader = leader
         self._calls.fail_all(Failure.REFUSED, f"kept in order by {leader.short}")

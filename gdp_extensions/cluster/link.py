@@ -68,7 +68,6 @@ class ClusterLink:
         self._pinged_s = 0.0
         self._alone_until_s: dict[Address, float] = {}
         self.failures = 0
-        self.unreplicated = 0
         try:
             self._refresh()
         except StoreError as error:
@@ -101,7 +100,7 @@ class ClusterLink:
 
         Args:
             writes: wait until a replica of each primary has the writes, so that they outlive the primary. If no replica
-                confirms in time, the primary alone has them; ``unreplicated`` counts that.
+                confirms in time, the primary alone has them.
 
         Returns the replies in order; a ``StoreError`` takes the place of a missing one.
         """
@@ -187,12 +186,10 @@ class ClusterLink:
 
     def _batch_of_writes(self, at: Address, commands: list[Command]) -> list[object]:
         if time.monotonic() < self._alone_until_s.get(at, 0.0):
-            self.unreplicated += len(commands)
             return self._batch(at, commands)
         *replies, replicas = self._batch(at, [*commands, (b"WAIT", 1, _REPLICA_MS)])
         if replicas == 0:
             self._alone_until_s[at] = time.monotonic() + UPKEEP_S  # do not wait for a missing replica
-            self.unreplicated += len(commands)
         return replies
 
     def _client(self, at: Address) -> Redis:

@@ -161,7 +161,6 @@ class Bridge:
         self._begun_s: float | None = None  # time of the first refresh
         self._tick_at_s = 0.0
         self._now_s = 0.0
-        self.unknown_names = 0
         live = [
             dispatcher for dispatcher in self._dispatchers if dispatcher.endpoint.is_live and status_topic is not None
         ]
@@ -365,10 +364,8 @@ class Bridge:
 
     def _receive(self, message: Message, now_s: float) -> None:
         flow = self._inbound.get(message.topic)
-        if flow is None or isinstance(flow, ExposedTopic):
-            self.unknown_names += 1  # its flow ended a moment ago
-            return
-        flow.receive(message, now_s)
+        if flow is not None and not isinstance(flow, ExposedTopic):  # else its flow ended a moment ago
+            flow.receive(message, now_s)
 
     def _refresh(self, now_s: float) -> None:
         """Begin desired flows, end flows that are no longer desired, and pass the graph to the others."""

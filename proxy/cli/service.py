@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gdp.cli.options import known_name
 from gdp.cli.program import Program
 from gdp.intervals import TICK_S
 from gdp.names import Name
@@ -22,14 +23,7 @@ if TYPE_CHECKING:
 app = Program("gdp service", no_args_is_help=True)
 
 
-ServiceName = Annotated[
-    str,
-    typer.Argument(
-        metavar="NAME",
-        autocompletion=complete_callable,
-        help="ROS name such as /plan, the 256-bit name in hex, or its short form such as 75e…0fc.",
-    ),
-]
+ServiceName = Annotated[str, known_name("/plan", complete_callable)]
 ServiceType = Annotated[str, typer.Argument(metavar="TYPE", help="Its type, such as std_srvs/srv/SetBool.")]
 Values = Annotated[
     str, typer.Argument(metavar="REQUEST", help="The request in YAML; fields that it leaves out are zero or empty.")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from gdp import terminal
+from gdp.cli.options import known_name
 from gdp.cli.program import Program
 from gdp.errors import RemoteError
 from gdp.intervals import REPORT_S
@@ -30,14 +31,7 @@ app = Program("gdp topic", no_args_is_help=True)
 
 _REPORT_S: Final = 1.0
 
-Name = Annotated[
-    str,
-    typer.Argument(
-        metavar="NAME",
-        autocompletion=complete_readable,
-        help="ROS name such as /scan, the 256-bit name in hex, or its short form such as 75e…0fc.",
-    ),
-]
+Name = Annotated[str, known_name("/scan", complete_readable)]
 Duration = Annotated[
     float | None, typer.Option("--duration", min=0.1, metavar="SECONDS", help="End after this time. Default: Ctrl-C.")
 ]

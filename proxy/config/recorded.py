@@ -40,11 +40,6 @@ class RecordedRules:
             tuple(rule.of_recording(_UNLIMITED) for rule in imports if rule.kind == "topic"),
         )
 
-    @property
-    def recorded_topics(self) -> tuple[tuple[str, str], ...]:
-        """Return local name and type of each topic that is recorded."""
-        return tuple((rule.local, rule.type_name) for rule in self.imports)
-
     def endpoint_of(self, rule: Rule) -> int:
         """Return 0: the recording is the only endpoint."""
         del rule

@@ -35,7 +35,7 @@ def record(settings: ProxyConfig, *, json: bool) -> bool:
         writer = _writer(settings.record)
         if writer is not None:
             stack.callback(writer.close)  # what was written stays whatever happens
-        endpoint = RecordingEndpoint(writer, rules.recorded_topics)
+        endpoint = RecordingEndpoint(writer, [(rule.local, rule.type_name) for rule in rules.imports])
         with open_recording_bridge(node, settings, rules, endpoint) as bridge:
             _work(node, bridge, writer, json=json)
             stats = bridge.stats

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import (
@@ -29,15 +29,6 @@ if TYPE_CHECKING:  # what records loads nothing that reads, and the reverse
     from proxy.recordings.reader import BagReader
     from proxy.recordings.split import SplitWriter
     from proxy.recordings.writer import BagWriter
-
-
-class RecordedMessage(NamedTuple):
-    """One message of a subscribed topic."""
-
-    handle: int  # of the subscription
-    channel: int  # number within the topic, in the recording's order
-    stamp_ns: int  # when it was recorded, Unix time
-    raw: bytes
 
 
 class _TopicsEndpoint(InProcessEndpoint):
@@ -133,16 +124,20 @@ class ReplayEndpoint(_TopicsEndpoint):
         self._put(TypeResolved(self._numbers, first, tuple(others)))
         return self._numbers
 
-    def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages of subscribed topics in time order; ``waiting``: as for ``BagReader.messages``."""
+    def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[MessageReceived]:
+        """Yield the messages of subscribed topics in time order, with their recorded stamps.
+
+        ``waiting``: as for ``BagReader.messages``.
+        """
         for message in self._reader.messages(waiting):
             subscribed = self._subscribed.get(message.channel)
             if subscribed is not None:
-                yield RecordedMessage(*subscribed, message.stamp_ns, message.raw)
+                handle, number = subscribed
+                yield MessageReceived(handle, message.stamp_ns, message.raw, number)
 
-    def deliver(self, message: RecordedMessage) -> None:
+    def deliver(self, message: MessageReceived) -> None:
         """Publish a message now; its stamp is the present time."""
-        self._put(MessageReceived(message.handle, time.time_ns(), message.raw, message.channel))
+        self._put(message._replace(stamp_ns=time.time_ns()))
 
     def advertise(self, channel: Channel) -> int:
         """Refuse to publish; raises ``LocalError``."""

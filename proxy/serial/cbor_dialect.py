@@ -6,18 +6,15 @@ Source: RFC 8949; RFC 8746 (typed arrays, tags 64 to 86, little-endian).
 
 from __future__ import annotations
 
-import struct
 from typing import Final
 
 from cbor2 import CBORTag
 
-from proxy.serial.dialect import MisfitError, Wide
+from proxy.serial.dialect import FLOATS, PATTERNS, MisfitError, Wide, flag
 from proxy.serial.schema import Number
 
 # RFC 8746, section 2.1
 _TAGS: Final = {"B": 64, "H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
-_FLOATS: Final = {"f": struct.Struct("<f"), "d": struct.Struct("<d")}
-_PATTERNS: Final = {"f": struct.Struct("<I"), "d": struct.Struct("<Q")}
 _QUIET: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}  # the one NaN that a CBOR float represents here
 
 
@@ -35,26 +32,24 @@ class CborDialect:
 
     def number(self, code: str, value: float, bits: int) -> object:
         """Return a number, or a tagged byte string for a NaN with other bits than the usual ones."""
-        if code not in _FLOATS or value == value or bits == _QUIET[code]:  # noqa: PLR0124
+        if code not in FLOATS or value == value or bits == _QUIET[code]:  # noqa: PLR0124
             return value
-        return CBORTag(_TAGS[code], _PATTERNS[code].pack(bits))
+        return CBORTag(_TAGS[code], PATTERNS[code].pack(bits))
 
     def bits(self, code: str, value: object) -> int | bool:
         """Return the value to pack for a number of either form."""
         if code == "?":
-            if not isinstance(value, bool):
-                raise MisfitError("a bool is true or false")
-            return value
-        if code in _FLOATS:
+            return flag(value)
+        if code in FLOATS:
             if isinstance(value, CBORTag):
                 raw = _tagged(_TAGS[code], value)
             elif isinstance(value, int | float) and not isinstance(value, bool):
                 if value != value:  # noqa: PLR0124
                     return _QUIET[code]
-                raw = _FLOATS[code].pack(value)
+                raw = FLOATS[code].pack(value)
             else:
                 raise MisfitError("not a number")
-            (pattern,) = _PATTERNS[code].unpack(raw)
+            (pattern,) = PATTERNS[code].unpack(raw)
             return int(pattern)
         if isinstance(value, bool) or not isinstance(value, int):
             raise MisfitError("not a whole number")
@@ -97,7 +92,7 @@ class CborDialect:
         if item.code == "?":
             if not isinstance(value, list):
                 raise MisfitError("an array of bools is a list")
-            return bytes(self.bits("?", flag) for flag in value)
+            return bytes(flag(each) for each in value)
         raw = _tagged(_TAGS[item.code], value)
         if len(raw) % item.size:
             raise MisfitError("a typed array of a broken number")

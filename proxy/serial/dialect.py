@@ -5,6 +5,7 @@ Sans-I/O. ``json_dialect``, ``cbor_dialect`` and ``native_dialect`` implement it
 
 from __future__ import annotations
 
+import struct
 from enum import Enum
 from typing import Final, Protocol
 
@@ -12,10 +13,19 @@ from proxy.serial.schema import Number
 
 # The unsigned code of the same width, for the exact bits of a float; other codes map to themselves.
 BITS: Final = {"f": "I", "d": "Q"}
+FLOATS: Final = {code: struct.Struct(f"<{code}") for code in BITS}
+PATTERNS: Final = {code: struct.Struct(f"<{bits}") for code, bits in BITS.items()}
 
 
 class MisfitError(ValueError):
     """A value or a run of bytes that the type does not allow. This package's public functions translate it."""
+
+
+def flag(value: object) -> bool:
+    """Return a bool as both dialects of numbers hold it. Raises ``MisfitError``: it is none."""
+    if not isinstance(value, bool):
+        raise MisfitError("a bool is true or false")
+    return value
 
 
 class Wide(Enum):

@@ -17,15 +17,13 @@ import orjson
 import pybase64
 from numpy.typing import NDArray
 
-from proxy.serial.dialect import BITS, MisfitError, Wide
+from proxy.serial.dialect import BITS, FLOATS, PATTERNS, MisfitError, Wide, flag
 from proxy.serial.schema import Number
 
 _Numbers: TypeAlias = "NDArray[np.generic]"
 
 _SAFE: Final = (1 << 53) - 1  # RFC 7493, section 2.2
 _DTYPES: Final = {code: np.dtype(f"<{code}") for code in "bBhHiIqQfd"}
-_FLOATS: Final = {"f": struct.Struct("<f"), "d": struct.Struct("<d")}
-_PATTERNS: Final = {"f": struct.Struct("<I"), "d": struct.Struct("<Q")}
 _TOKENS: Final = {
     "f": {0x7F800000: "Infinity", 0xFF800000: "-Infinity", 0x7FC00000: "NaN"},
     "d": {0x7FF0000000000000: "Infinity", 0xFFF0000000000000: "-Infinity", 0x7FF8000000000000: "NaN"},
@@ -57,12 +55,10 @@ class JsonDialect:
     def bits(self, code: str, value: object) -> int | bool:
         """Return the value to pack for a number, a token or a text of digits."""
         if code == "?":
-            if not isinstance(value, bool):
-                raise MisfitError("a bool is true or false")
-            return value
+            return flag(value)
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise MisfitError("not a number")
-        if code in _FLOATS:
+        if code in FLOATS:
             return _untoken(code, value) if isinstance(value, str) else _pattern(code, value)
         if isinstance(value, str):
             return _integer(value)
@@ -113,7 +109,7 @@ class JsonDialect:
         if item.code == "?":
             return list(map(bool, raw))
         values = np.frombuffer(raw, dtype=_DTYPES[item.code])
-        if item.code in _FLOATS:
+        if item.code in FLOATS:
             return _plain(item.code, values) if np.isfinite(values).all() else _with_tokens(item.code, values)
         if item.size == 8 and values.size and (values.max() > _SAFE or values.min() < -_SAFE):
             return [number if -_SAFE <= number <= _SAFE else str(number) for number in values.tolist()]
@@ -126,7 +122,7 @@ class JsonDialect:
         if not isinstance(value, list):
             raise MisfitError("an array is a list")
         if item.code == "?":
-            return bytes(self.bits("?", flag) for flag in value)
+            return bytes(flag(each) for each in value)
         try:
             return memoryview(array.array(item.code, value)).cast("B")
         except TypeError:  # not all are plain numbers
@@ -157,7 +153,7 @@ def _untoken(code: str, token: str) -> int:
 
 
 def _pattern(code: str, value: float) -> int:
-    (bits,) = _PATTERNS[code].unpack(_FLOATS[code].pack(value))
+    (bits,) = PATTERNS[code].unpack(FLOATS[code].pack(value))
     return int(bits)
 
 

@@ -33,7 +33,7 @@ from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab
 from lab.namespaces import mac_addresses
-from lab.process import FailedError, LabProcess, new_run
+from lab.process import FailedError, LabProcess, UndoneOnExit, new_run
 from lab.topology import chain
 
 KERNEL, BRIDGE = "kernel", "bridge"
@@ -61,7 +61,7 @@ def data_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> byt
     return macs + ETHERTYPE.to_bytes(2, "big") + encode(header) + bytes(payload)
 
 
-class Row(Lab):
+class Row(Lab, UndoneOnExit):
     """The five machines, with source and sink running; a context manager that ends these. Raises as ``Lab``."""
 
     def __init__(self, run: Run) -> None:
@@ -76,12 +76,6 @@ class Row(Lab):
             self._source.read(_READY_S)
             self._sink.read(_READY_S)
             self._undo = undo.pop_all()
-
-    def __enter__(self) -> Row:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._undo.close()
 
     @contextmanager
     def kernel(self) -> Iterator[Mapping[str, str]]:

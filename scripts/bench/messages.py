@@ -19,7 +19,6 @@ of --json.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -28,7 +27,7 @@ from typing import Final
 
 from background_load import LOADS, SHARE, load_of
 from peers.chain import Chain
-from peers.exchange import ANSWER, SIZE_MIN
+from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
 from plot import Panel, panel_of
 from report import Rounds, Target, percentile
@@ -117,23 +116,11 @@ def positive(text: str) -> int:
     return number
 
 
-def size_of(text: str) -> int:
-    """Return the bytes of a message.
-
-    Raises:
-        argparse.ArgumentTypeError: too few, or not a multiple of four, to which Cyclone DDS pads.
-    """
-    size = int(text)
-    if size < SIZE_MIN or size % 4:
-        raise argparse.ArgumentTypeError(f"a message has at least {SIZE_MIN} bytes, and a multiple of four")
-    return size
-
-
 def measure(options: Options) -> Outcome:
     """Measure every baseline in every case, round by round."""
-    names, sizes = options.only or list(BASELINES), options.size or SIZES
+    names = options.only or list(BASELINES)
     recorder = Recorder()
-    cases: list[Case] = list(product(sizes, options.mtu or MTUS, LOADS[options.load]))
+    cases: list[Case] = list(product(SIZES, options.mtu or MTUS, LOADS[options.load]))
     with ExitStack() as stack:
         chains = {mtu: Chain(mtu, stack.enter_context(new_run())) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)}
         trials = [
@@ -149,7 +136,7 @@ def measure(options: Options) -> Outcome:
     over = recorder.rounds
     settings = {
         "rounds": options.rounds,
-        "messages a round": [count_of(size, options) for size in sizes],
+        "messages a round": [count_of(size, options) for size in SIZES],
         "answer, B": ANSWER.size,
         "ends of gdp spin, us": SPIN_US,
         "shared memory": "off everywhere",
@@ -171,7 +158,7 @@ def measure(options: Options) -> Outcome:
 
 def is_whole(options: Options) -> bool:
     """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
-    return not (options.quick or options.only or options.mtu or options.size) and options.load == "both"
+    return not (options.quick or options.only or options.mtu) and options.load == "both"
 
 
 def main() -> None:
@@ -182,7 +169,6 @@ def main() -> None:
     parser.add_argument("--count", type=positive, default=80, help=text)
     parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
-    parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
     parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
     options = parse(parser)

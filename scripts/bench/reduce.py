@@ -221,7 +221,7 @@ def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]
 def measure(options: Options) -> Outcome:
     """Measure every reduction on every case, round by round."""
     over = Rounds()
-    every = cases(options.bags)
+    every = cases(DATA / "bags")
     for _ in range(options.rounds):
         for case in every:
             for name, settings in {PLAIN: {}, **case.reductions}.items():
@@ -243,8 +243,5 @@ def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
-    parser.add_argument("--bags", type=Path, default=DATA / "bags", help="folder of recordings (default: %(default)s)")
-    parser.add_argument(
-        "--passes", type=int, default=2, help="messages of a figure, in 60; 0: each once (default: %(default)s)"
-    )
+    parser.set_defaults(passes=2)  # messages of a figure, in 60; 0: each once
     run_bench(parser, measure)

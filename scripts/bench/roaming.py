@@ -20,6 +20,7 @@ from typing import Final
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
+from gdp.trust.right import Right
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.host import Host
@@ -67,7 +68,7 @@ def measure(options: Options) -> Outcome:
 
 
 def _start(robot: Host, stack: ExitStack) -> NumberedFlow:
-    overlay, server, (sender, reader) = open_sessions(robot, stack, [TOPIC], has_direct=True)
+    overlay, server, (sender, reader) = open_sessions(robot, stack, [{TOPIC: [Right.PUBLISH]}, {TOPIC: [Right.READ]}])
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)

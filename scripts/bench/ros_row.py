@@ -34,7 +34,7 @@ from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import BUFFER_BYTES, ros_environment
 from lab.machines import BenchNodes, Lab
-from lab.process import LabProcess
+from lab.process import LabProcess, UndoneOnExit
 from lab.topology import LEFT, MIDDLE, RIGHT, ROW, DomainPlan, Link, Topology, flat_topology
 
 READY_S: Final = 30.0
@@ -45,7 +45,7 @@ DIRECT_DOMAIN: Final = 143
 _BRIDGE: Final = "bridge"
 
 
-class Row:
+class Row(UndoneOnExit):
     """The row with switches, RIBs and proxies running; a context manager that ends them.
 
     Args:
@@ -83,7 +83,7 @@ class Row:
         cables = tuple(Link(a, b, mtu=mtu) for a, b in pairwise(direct))
         domains = (*overlay.domains, *([DomainPlan("direct", bridges)] if bridges else []))
         topology = Topology((*overlay.links, *cables), domains, overlay.attachments)
-        ends = tuple(self._machines.values())
+        self._has_shared_memory, ends = shared_memory, tuple(self._machines.values())
         self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else (), cores=cores)
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.namespaces[node].bridge(_BRIDGE, (before, after))
@@ -95,18 +95,12 @@ class Row:
             proxies = []
             for side, node in self._machines.items():
                 argv = [*program, "--config", self._admit(side, carried)]
-                environment = self._environment(node, _DOMAINS[side])
+                environment = self._environment(_DOMAINS[side])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
                 proxy.read_line(READY_S)
             self.proxies = [each.pid for each in proxies]
             self._undo = undo.pop_all()
-
-    def __enter__(self) -> Row:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._undo.close()
 
     def node(self, side: str, module: str, role: str, *, direct: bool, **settings: object) -> LabProcess:
         """Start a ROS node at A or B: ``python -m module role settings``."""
@@ -115,15 +109,15 @@ class Row:
     def process(self, side: str, what: str, arguments: Sequence[str], *, direct: bool) -> LabProcess:
         """Start a Python process with a ROS node at A or B."""
         node = self._machines[side]
-        environment = self._environment(node, DIRECT_DOMAIN if direct else _DOMAINS[side])
+        environment = self._environment(DIRECT_DOMAIN if direct else _DOMAINS[side])
         return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(side)}"])
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used."""
         return sum(processor_s(pid) for pid in self.proxies)
 
-    def _environment(self, node: str, domain: int) -> list[str]:
-        return ros_environment(self._nodes.files, domain, shared_memory=self._lab.has_shared_memory(node))
+    def _environment(self, domain: int) -> list[str]:
+        return ros_environment(self._nodes.files, domain, shared_memory=self._has_shared_memory)
 
     def _admit(self, side: str, carried: Mapping[str, Sequence[Carried]]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""

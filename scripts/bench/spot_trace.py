@@ -85,18 +85,13 @@ def outages(trace: Trace, recovery_s: float) -> Steps:
     return down
 
 
-def pool_down(traces: Sequence[Trace], replicas: int, recovery_s: float, on_demand: int = 0) -> Steps:
+def pool_down(traces: Sequence[Trace], replicas: int, recovery_s: float) -> Steps:
     """Return the steps in which a pool that may change zones has no replica up.
 
     The pool wants ``replicas`` spot machines. A preempted machine is replaced at once and serves ``recovery_s`` later.
     The replacement is in the zone with the fewest machines of the pool among the zones with capacity. It waits while no
     zone has capacity.
-
-    Args:
-        on_demand: number of additional machines that are never preempted.
     """
-    if on_demand:
-        return np.zeros_like(traces[0].taken)
     late = _steps(traces[0], recovery_s)
     taken = np.stack([trace.taken for trace in traces])
     places = [-1] * replicas

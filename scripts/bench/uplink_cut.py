@@ -22,6 +22,7 @@ from typing import Final, Literal
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
+from gdp.trust.right import Right
 from internet.access import Access
 from internet.flow import NumberedFlow, open_sessions
 from internet.laboratory import Laboratory
@@ -49,7 +50,7 @@ def measure(options: Options) -> Outcome:
         quiet_s = time.monotonic()
         time.sleep(QUIET_S)
         limits = {
-            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), options.limit_ms)
+            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), LIMIT_MIN_MS)
             for paths, flow in flows.items()
         }
         silences: dict[int, list[float]] = {paths: [] for paths in flows}
@@ -97,7 +98,8 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
     homes = [laboratory.add_site(each, Access.PORT_RESTRICTED) for each in UPLINKS]
     robot = laboratory.add_host("robot", homes[0], UPLINKS[0])
     robot.attach(homes[1], UPLINKS[1])
-    overlay, server, (sender, reader) = open_sessions(robot, stack, TOPICS, has_direct=False, uplinks=UPLINKS)
+    rights = [{topic: [right] for topic in TOPICS} for right in (Right.PUBLISH, Right.READ)]
+    overlay, server, (sender, reader) = open_sessions(robot, stack, rights, has_direct=False, uplinks=UPLINKS)
     flows: dict[int, NumberedFlow] = {}
     for topic, paths in TOPICS.items():
         subscription = reader.subscribe(topic, paths=paths)
@@ -110,8 +112,4 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True)
-    parser.add_argument(
-        "--limit-ms", type=float, default=LIMIT_MIN_MS, help="least delay of a late message (default: %(default)s)"
-    )
-    run_bench(parser, measure)
+    run_bench(command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True), measure)

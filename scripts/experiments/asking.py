@@ -13,6 +13,7 @@ import bench_path  # noqa: F401 - finds ``peers``
 from report import progress
 from samples import Sample, Series
 
+from gdp.closing import ClosedOnExit
 from lab.process import LabProcess
 
 _ROBOT: Final = "robot"
@@ -27,7 +28,7 @@ class Place(Protocol):
         """Start a role of ``robot.py`` at a machine."""
 
 
-class Asking:
+class Asking(ClosedOnExit):
     """Series in progress, read a sample at a time; a context manager that ends its client.
 
     ``twice``: surplus answers that reached a call; None until the end, or where they were not counted. ``heard``:
@@ -41,10 +42,8 @@ class Asking:
         self.heard: int | None = None
         self.warm_up: dict[str, int] = {}
 
-    def __enter__(self) -> Asking:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the client."""
         self._client.close()
 
     def __iter__(self) -> Iterator[Sample]:

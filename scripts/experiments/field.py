@@ -28,7 +28,7 @@ from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import ros_environment
 from lab.machines import BenchNodes, Lab
-from lab.process import LabProcess
+from lab.process import LabProcess, UndoneOnExit
 from lab.topology import Topology, flat_topology
 
 ROBOT: Final = "robot"
@@ -37,8 +37,6 @@ _NEAR, _GATE = "s1", "gate"
 _MTU: Final = 1_500
 _HERE: Final = ROOT / "scripts" / "experiments"
 REPLICA: Final = _HERE / "replica.py"
-# The relay of the provider ``local`` waits on its standard input for permission to begin.
-_RELAY: Final = "import io, sys; from fog.providers.local.delay import main; sys.stdin = io.StringIO('\\n'); main()"
 _DOMAIN: Final = 150  # ROS domain of the robot; those of the machines follow
 
 
@@ -126,7 +124,7 @@ class Server:
                 os.killpg(each.pid, number)
 
 
-class Field:
+class Field(UndoneOnExit):
     """Field with switches, RIB, proxies and servers running; a context manager that ends them.
 
     Args:
@@ -153,8 +151,9 @@ class Field:
         self._lab = Lab(run, self._topology())
         with ExitStack() as undo:
             for machine, seconds in (delays or {}).items():
-                relay = ["-c", _RELAY, _GATE, machine, str(1e3 * seconds)]
-                undo.enter_context(self._lab.start(self._relays[machine], "relay", relay)).read_line(READY_S)
+                relay = ["-m", "internet.line", _GATE, machine, str(1e3 * seconds), "0"]
+                line = undo.enter_context(self._lab.start(self._relays[machine], "relay", relay, has_orders=True))
+                line.read_line(READY_S)
             self._nodes = undo.enter_context(BenchNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S))
             self.data_plane = ", ".join(sorted(self._nodes.planes))
             argv = ["-m", "proxy.cli.proxy", "--config", self._admit(ROBOT, served)]
@@ -167,12 +166,6 @@ class Field:
                 server.wait()
             robot.read_line(READY_S)
             self._undo = undo.pop_all()
-
-    def __enter__(self) -> Field:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._undo.close()
 
     def client(self, place: str, role: str, **settings: object) -> LabProcess:
         """Start a client at the robot, or at a server: a role of ``robot.py`` and its settings."""

@@ -28,7 +28,7 @@ from gdp.host.run_registry import Run, RunRegistry, outer_uid
 from lab.dds import ros_environment
 from lab.machine import LabMachine
 from lab.namespaces import Namespaces
-from lab.process import Event, FailedError, LabProcess, until
+from lab.process import Event, FailedError, LabProcess, UndoneOnExit, until
 from lab.topology import single
 
 ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
@@ -43,7 +43,6 @@ _LAUNCH_S: Final = 200.0
 _DOWN_S: Final = 60.0
 
 T = TypeVar("T")
-C = TypeVar("C", bound="Cluster")
 
 
 def standing_runs(what: str) -> RunRegistry:
@@ -83,7 +82,7 @@ def _note(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-class Cluster:
+class Cluster(UndoneOnExit):
     """Replicas that serve, and a robot; a context manager that removes everything.
 
     Args:
@@ -136,12 +135,6 @@ class Cluster:
             self._runs = local_provider(self._site).runs
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
-
-    def __enter__(self: C) -> C:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._undo.close()
 
     def call(self, rate_hz: float) -> None:
         """Let the robot's node call ``/echo``; return when it is answered."""

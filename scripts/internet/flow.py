@@ -8,17 +8,17 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
 from typing import Final
 
 import gdp
-from gdp.trust.right import Right
 from internet.access import Access
 from internet.host import Host
 from internet.overlay import Overlay
+from lab.credentials import NameRights
 from lab.process import FailedError
 
 HZ: Final = 100.0
@@ -29,12 +29,18 @@ _NUMBER: Final = struct.Struct("!q")
 
 
 def open_sessions(
-    robot: Host, stack: ExitStack, topics: Iterable[str], *, has_direct: bool, uplinks: Sequence[str] = ()
+    robot: Host,
+    stack: ExitStack,
+    rights: Sequence[NameRights],
+    *,
+    has_direct: bool = True,
+    uplinks: Sequence[str] = (),
+    lease_s: float | None = None,
 ) -> tuple[Overlay, Host, list[gdp.Session]]:
     """Start an overlay of a border, a robot and a server behind a NAT; return it, the server, and two sessions.
 
-    ``topics``: the session at the robot publishes them, that at the server reads them. ``has_direct``: robot and server
-    open a tunnel to each other. ``uplinks``: of the robot; none: the usual one.
+    ``rights``: of the session at the robot, and of that at the server. ``has_direct``: robot and server open a tunnel
+    to each other. ``uplinks``: of the robot; none: the usual one. ``lease_s``: of the sessions' names.
     """
     laboratory = robot.laboratory
     overlay = Overlay(laboratory)
@@ -46,9 +52,8 @@ def open_sessions(
     overlay.start(border)
     overlay.start_rib(border)
     overlay.start(robot, server)
-    sides = ((robot, Right.PUBLISH), (server, Right.READ))
-    nodes = [(host, overlay.add_node(host, {topic: [right] for topic in topics})) for host, right in sides]
-    return overlay, server, [stack.enter_context(overlay.open_session(host, node)) for host, node in nodes]
+    nodes = [(host, overlay.add_node(host, given)) for host, given in zip((robot, server), rights, strict=True)]
+    return overlay, server, [stack.enter_context(overlay.open_session(*each, lease_s)) for each in nodes]
 
 
 class NumberedFlow:

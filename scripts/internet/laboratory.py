@@ -11,6 +11,7 @@ from ipaddress import IPv4Network, IPv6Network
 from itertools import chain, count
 from typing import Final
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from internet.access import Access, core_rules
@@ -27,7 +28,7 @@ TOOLS: Final = ("ip", "nft", "conntrack")  # what it needs
 _FIRST_INDEX: Final = 1_000  # ends of a pair differ in index; see ``lab.namespaces``
 
 
-class Laboratory:
+class Laboratory(ClosedOnExit):
     """The core and what is attached to it; a context manager that ends the processes of hosts and of delay lines.
 
     Raises ``LocalError``: the kernel refuses; the run's record names what was made before.
@@ -45,10 +46,8 @@ class Laboratory:
         self._indices, self._devices = count(_FIRST_INDEX), count()
         self.core.configure(f"route add blackhole {network}" for network in (*_PUBLIC, _PUBLIC6))
 
-    def __enter__(self) -> Laboratory:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the processes."""
         end_processes([process for host in self.hosts.values() for process in host.running], _END_S)
         for each in self.sites.values():
             each.close()

@@ -124,9 +124,7 @@ class CloudSite(FogSite):
 
     def tunnels(self) -> list[str]:
         """Return the labels of the peers of the border's switch."""
-        status = ask_node(find_control_socket(self.border / "switch"), Command.STATUS, _STATUS_S)
-        links = status.result.get("links")
-        return [str(each["label"]) for each in links] if isinstance(links, list) else []
+        return [str(each["label"]) for each in self.host.status("border/switch").get("links", [])]
 
     def serving(self, cluster: str) -> list[Record]:
         """Return the machines that serve, by the overlay."""

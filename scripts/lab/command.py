@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Final, NoReturn, TypeVar
+from typing import Final, NoReturn
 
 import typer
 from rich.console import Console, RenderableType
@@ -18,6 +18,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.text import Text
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import GdpError
 from gdp.host.interruption import let_nothing_interrupt
 from lab.process import FailedError
@@ -26,8 +27,6 @@ PASSED: Final = 0
 FAILED: Final = 1
 _WRONG_INPUT: Final = 2
 _WIDE: Final = 160  # columns without a terminal
-
-_DisplayT = TypeVar("_DisplayT", bound="StepDisplay")
 
 
 def new_app() -> typer.Typer:
@@ -66,7 +65,7 @@ def exit_with(work: Callable[[], int]) -> None:
     raise typer.Exit(code)
 
 
-class StepDisplay:
+class StepDisplay(ClosedOnExit):
     """Display of steps and of the present state; a context manager.
 
     ``is_kept``: whether the last state stays in the terminal. ``plain_every_s``: time between two plain lines where
@@ -79,10 +78,8 @@ class StepDisplay:
         self._plain_every_s = plain_every_s
         self._live = Live(console=console, auto_refresh=False, transient=not is_kept) if console.is_terminal else None
 
-    def __enter__(self: _DisplayT) -> _DisplayT:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the display."""
         if self._live is not None:
             self._live.stop()
 

@@ -11,10 +11,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 import yaml
 
+from gdp.closing import ClosedOnExit
 from gdp.host.run_registry import Run
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
@@ -22,7 +23,6 @@ from gdp.stores.keyring import ROOT_CERTIFICATE
 from lab.process import FailedError, LabProcess, end_processes, python_environment
 
 NodeProgram = Literal["switch", "rib", "relay", "proxy"]
-_MachineT = TypeVar("_MachineT", bound="LabMachine")
 
 GDP: Final = (sys.executable, "-m", "gdp.cli.gdp")
 PROGRAMS: Final = {
@@ -38,7 +38,7 @@ _ANSWER_S: Final = 60.0
 _END_S: Final = 10.0
 
 
-class LabMachine:
+class LabMachine(ClosedOnExit):
     """A folder of configurations, and the processes that run from them; a context manager that ends these.
 
     Args:
@@ -61,12 +61,6 @@ class LabMachine:
         self._enter, self._run = list(enter), run
         self.environment = dict(environment or {})
         self._numbers = count()
-
-    def __enter__(self: _MachineT) -> _MachineT:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End all processes."""

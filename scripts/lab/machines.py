@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
+from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Role
 from gdp.host.mounts import mount_tmpfs
 from gdp.host.run_registry import Run
@@ -30,7 +31,6 @@ _BENCH: Final = ROOT / "scripts" / "bench"
 _END_S: Final = 3.0
 
 T = TypeVar("T")
-_NodesT = TypeVar("_NodesT", bound="OverlayNodes")
 
 
 class SharedMemory:
@@ -76,10 +76,6 @@ class Lab:
             for node in topology.nodes
         }
 
-    def has_shared_memory(self, node: str) -> bool:
-        """Return whether a machine has a ``/dev/shm`` of its own."""
-        return node in self._memories
-
     def inside(self, node: str, work: Callable[[], T]) -> T:
         """Call ``work`` in a machine's namespace."""
         return self.namespaces[node].inside(work)
@@ -109,7 +105,7 @@ class Lab:
         return started
 
 
-class OverlayNodes:
+class OverlayNodes(ClosedOnExit):
     """Switches and RIBs of a lab, with keys of their own; a context manager that ends them.
 
     ``credentials``: of the overlay; the files of the nodes are there before a node starts.
@@ -119,12 +115,6 @@ class OverlayNodes:
         self.lab = lab
         self.credentials = credentials
         self.running: dict[tuple[str, str], LabProcess] = {}  # by role and node
-
-    def __enter__(self: _NodesT) -> _NodesT:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End all processes."""

@@ -40,6 +40,7 @@ class SimLink:
         burst_frames: mean length of a run of lost frames in one direction (Gilbert's model); 1: they are independent.
         bytes_s: rate of each direction; frames beyond it wait in a FIFO.
         fifo_s: longest wait in that FIFO; a frame that would wait longer is lost.
+        spared: node towards which no frame is lost at random.
     """
 
     delay_s: float = 0.0005
@@ -51,6 +52,7 @@ class SimLink:
     burst_frames: float = 1.0
     fifo_s: float = _UNLIMITED
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
+    spared: str = ""
     in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
 
     def loses(self, to: bytes, chance: float) -> bool:
@@ -283,7 +285,7 @@ class SimNetwork:
         if not sim_link.is_up or len(frame) - ETHER_BYTES > sim_link.mtu:
             self.drops[DropReason.PORT_DOWN if not sim_link.is_up else DropReason.TOO_BIG] += 1
         elif (sim_link.free_s and sim_link.is_full(far.mac, self._now_s)) or (
-            sim_link.loss and sim_link.loses(far.mac, self._random.random())
+            sim_link.loss and far.node != sim_link.spared and sim_link.loses(far.mac, self._random.random())
         ):
             self.lost += 1
         else:

@@ -15,10 +15,11 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from gdp.closing import ClosedOnExit
 from gdp.errors import GdpError
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run, RunRegistry
@@ -67,7 +68,17 @@ class FailedError(GdpError):
     """A process ended too early, was silent for too long, or reported a failure."""
 
 
-class LabProcess:
+class UndoneOnExit(ClosedOnExit):
+    """Context manager that undoes what its constructor has begun and put on ``_undo``."""
+
+    _undo: ExitStack
+
+    def close(self) -> None:
+        """Undo it, the last first."""
+        self._undo.close()
+
+
+class LabProcess(ClosedOnExit):
     """Running process; a context manager that ends it, and its group with it.
 
     Args:
@@ -121,12 +132,6 @@ class LabProcess:
     def code(self) -> int | None:
         """Return its exit code; None while it runs."""
         return self._process.poll()
-
-    def __enter__(self: _ProcessT) -> _ProcessT:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the process and its group; harmless where it has ended."""

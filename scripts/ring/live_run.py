@@ -83,7 +83,7 @@ class LiveSession:
                 node.send(signal.SIGINT)
             self._await_reports(far, ENDING_S)
         finally:
-            self._reporter.end_traffic()
+            self._reporter.close()
         said = self._done
         return Heard(tuple(said[each] for each in talkers), said[nodes.lamp], said[nodes.listener], said[nodes.caller])
 
@@ -166,7 +166,8 @@ class LiveRing:
         """Run the traffic between robot and server, and compare."""
         overlay, supervisor = self.overlay, self.overlay.supervisor
         overlay.stand_up()
-        supervisor.ready(*(self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1))
+        argv = ["-m", "ring.nodes.master", str(MASTER_PORT)]
+        supervisor.ready(*(self._start(at, graph, "master", argv) for at, graph, _ in self._ends if graph.ros == 1))
         self._proxies = [self._start_proxy(*end) for end in self._ends]
         supervisor.ready(*self._proxies)
         session = LiveSession(supervisor, self._live_nodes(), self._reporter)
@@ -230,9 +231,6 @@ class LiveRing:
         self.overlay.supervisor.release(proxy)
         proxy.send(signal.SIGINT)
         return self.overlay.supervisor.wait_for(proxy, "done", ENDING_S)
-
-    def _start_master(self, at: Attachment, graph: Graph) -> LabProcess:
-        return self._start(at, graph, "master", ["-m", "ring.nodes.master", str(MASTER_PORT)])
 
     def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> LabProcess:
         carried = {side: carried_in(self._options.encoding)}

@@ -66,8 +66,7 @@ class Overlay:
     def stand_up(self) -> None:
         """Start switches and RIBs; return when all are ready."""
         if self.options.pcap is not None:
-            ifaces = [f"--iface={each}" for each in self.topology.neighbours(_MIDDLE)]
-            argv = ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)]
+            argv = ["-m", "ring.capture", str(self.options.pcap), *self.topology.neighbours(_MIDDLE)]
             self.supervisor.ready(self.start(_MIDDLE, "capture", argv))
         self.reporter.step("starting a switch in each")
         for node in self.topology.nodes:

@@ -71,8 +71,3 @@ class ProgressReporter(StepDisplay):
             self._rated, self._rated_s = now, time.monotonic()
             self._bar.update(self._task, completed=now.received, words=words)
             self._show(self._bar.get_renderable(), Text(f"{now.received}/{now.total}  {words}"))
-
-    def end_traffic(self) -> None:
-        """Remove the bar."""
-        if self._live is not None:
-            self._live.stop()

@@ -6,7 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -31,29 +31,11 @@ STALL_S: Final = 30.0
 _ALL: Final = "recording"  # its topics are counted together
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """Final reports of both sides.
-
-    Args:
-        topics: the receiver's measurements, one event a topic.
-        unread: why some of the recording could not be read; None if all could.
-        complaints: deviations from the expected run.
-        traffic_s: from the first message until all was confirmed or given up.
-        silent_s: the longest time in which messages were due and none came, to half a second.
-    """
-
-    topics: tuple[Event, ...]
-    unread: str | None
-    complaints: tuple[str, ...]
-    traffic_s: float
-    silent_s: float
-
-
 class Replay:
     """One replay in progress.
 
-    ``supervisor``: watches all the while; the receiver is released when it is requested to finish.
+    ``supervisor``: watches all the while; the receiver is released when it is requested to finish. ``topics``: what the
+    receiver measured, one event a topic, once it has reported.
     """
 
     def __init__(
@@ -68,9 +50,10 @@ class Replay:
         self._unconfirmed = ""  # names of topics
         self._has_moved = False
         self._done: dict[LabProcess, Event] = {}
+        self.topics: tuple[Event, ...] = ()
 
-    def report(self, injection: Injection) -> Report:
-        """Follow the traffic to its end, while faults are injected."""
+    def report(self, injection: Injection) -> Result:
+        """Follow the traffic to its end, while faults are injected; return what both sides report, without topics."""
         self._reporter.begin_traffic(self._traffic.total)
         begun_s = time.monotonic()
         try:
@@ -84,14 +67,15 @@ class Replay:
             receiver_code = self._finish()
         finally:
             complaints = injection.stop()
-            self._reporter.end_traffic()
+            self._reporter.close()
         sent, received = self._done[self._sender], self._done[self._receiver]
         complaints += [_not_confirmed(topic) for topic in sent["unconfirmed"]]
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
         unread = sent.get("unread") or None
-        topics = tuple(received["topics"])
-        return Report(topics, unread, tuple(complaints), traffic_s, self._silence.longest_s)
+        self.topics = tuple(received["topics"])
+        longest_s = self._silence.longest_s
+        return Result((), {}, unread=unread, complaints=tuple(complaints), traffic_s=traffic_s, silent_s=longest_s)
 
     def _follow_unless_stalled(self) -> None:
         """Follow both ends until traffic moves, or the sender ends. Raises ``FailedError``: neither, for a while."""
@@ -190,14 +174,7 @@ class Ring:
         report = replay.report(Injection(supervisor, self.options.faults, overlay.inject))
         self._reporter.step("comparing what was sent with what was recorded")
         comparisons = compare(self.bag, self.recording, exact=self.options.encoding == "cdr")
-        return Result(
-            put_together(comparisons, report.topics),
-            overlay.settings,
-            unread=report.unread,
-            complaints=report.complaints,
-            traffic_s=report.traffic_s,
-            silent_s=report.silent_s,
-        )
+        return replace(report, topics=put_together(comparisons, replay.topics), settings=overlay.settings)
 
     def start_again(self) -> Path:
         """Start a receiver that outlives this process, in place of the ended one; return the path of its recording."""

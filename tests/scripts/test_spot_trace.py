@@ -44,7 +44,6 @@ def test_a_pool_that_moves_is_down_while_no_zone_has_capacity_and_until_it_has_r
     one, other = trace("0011110000"), trace("0000110000", "b")
     assert drawn(pool_down([one, other], 1, 10)) == "0010111000"
     assert drawn(pool_down([one, other], 2, 10)) == "0000111000"
-    assert not pool_down([one, other], 1, 10, on_demand=1).any()
 
 
 def test_none_is_up_when_all_are_down() -> None:

@@ -154,7 +154,7 @@ class _View:
 
     def is_stopgap(self, record: Record) -> bool:
         """Return whether a machine on demand has served long enough in place of a spot machine."""
-        if record.is_on_plan or record.served_unix_s is None:
+        if record.spec.offer.is_spot == record.wanted.is_spot or record.served_unix_s is None:
             return False
         return self.now_s - record.served_unix_s >= self.patience.spot_retry_s
 

@@ -86,11 +86,6 @@ class Record:
         return not self.is_gone and self.served_unix_s is not None and self.unreachable_unix_s is None
 
     @property
-    def is_on_plan(self) -> bool:
-        """Return whether it is of the requested kind: not one on demand in place of a spot machine."""
-        return self.spec.offer.is_spot == self.wanted.is_spot
-
-    @property
     def is_outgoing(self) -> bool:
         """Return whether it has a notice, or was drained or released."""
         return self.noticed_unix_s is not None or self.drained_unix_s is not None or self.is_released

@@ -13,7 +13,6 @@ import os
 import platform
 import struct
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -52,7 +51,6 @@ class Command(IntEnum):
     MAP_DELETE_ELEM = 3
     PROG_LOAD = 5
     PROG_TEST_RUN = 10
-    PROG_GET_NEXT_ID = 11
     PROG_GET_FD_BY_ID = 13
     OBJ_GET_INFO_BY_FD = 15
     PROG_QUERY = 16
@@ -60,8 +58,6 @@ class Command(IntEnum):
     MAP_UPDATE_BATCH = 26
     MAP_DELETE_BATCH = 27
     LINK_CREATE = 28
-    LINK_GET_FD_BY_ID = 30
-    LINK_GET_NEXT_ID = 31
 
 
 class BpfError(LocalError):
@@ -128,7 +124,7 @@ def address(buffer: bytes | bytearray) -> int:
     return ctypes.cast(ctypes.c_char_p(buffer), ctypes.c_void_p).value or 0
 
 
-def bpf(command: Command, attributes: bytearray, tried: str) -> int:
+def bpf(command: int, attributes: bytearray, tried: str) -> int:
     """Make the call. The kernel may write into ``attributes``.
 
     Args:
@@ -201,7 +197,7 @@ def name_of(program: int) -> str | None:
             return None
         raise
     try:
-        return program_name(opened)
+        return info_of(opened)[64:80].partition(b"\0")[0].decode(errors="replace")
     finally:
         os.close(opened)
 
@@ -258,46 +254,8 @@ class PreparedRead:
             raise BpfError(ctypes.get_errno(), "read an array")
 
 
-def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:
-    """Open every program (or link) of the system in turn; each is closed before the next one opens."""
-    at = 0
-    while True:
-        attributes = bytearray(struct.pack("=II8x", at, 0))
-        try:
-            bpf(next_id, attributes, "list what is loaded")
-        except BpfError as error:
-            if error.number == errno.ENOENT:
-                return
-            raise
-        at = struct.unpack_from("=II", attributes)[1]
-        try:
-            opened = bpf(open_by_id, bytearray(struct.pack("=I12x", at)), "open what is loaded")
-        except BpfError as error:
-            if error.number == errno.ENOENT:  # removed in the meantime
-                continue
-            raise
-        try:
-            yield opened
-        finally:
-            os.close(opened)
-
-
-def program_name(program: int) -> str:
-    """Return the name that a program was loaded under."""
-    return _info(program)[64:80].partition(b"\0")[0].decode(errors="replace")
-
-
-def program_id(program: int) -> int:
-    """Return the id of a program, constant while it is loaded."""
-    return int(struct.unpack_from("=II", _info(program))[1])
-
-
-def link_program(link: int) -> int:
-    """Return the id of a link's program."""
-    return int(struct.unpack_from("=III", _info(link))[2])
-
-
-def _info(opened: int) -> bytes:
+def info_of(opened: int) -> bytes:
+    """Return ``struct bpf_prog_info`` of an open program, or ``bpf_link_info`` of a link."""
     info = bytearray(_INFO_BYTES)
     bpf(Command.OBJ_GET_INFO_BY_FD, bytearray(struct.pack("=IIQ", opened, len(info), address(info))), "ask for details")
     return bytes(info)

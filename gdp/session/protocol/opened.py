@@ -106,6 +106,7 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
         weight: int = 1,
         max_bits_s: float | None = None,
         repairs: bool = True,
+        own_pace: bool = False,
     ) -> _P:
         """Publish a name from now on.
 
@@ -123,6 +124,7 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
             weight: share of a full path, next to other names of the same priority, 1 to 100.
             max_bits_s: most bits of frames a second, 1e3 to 1e12. None: what the path carries.
             repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.
+            own_pace: without ``reliable``: each reader gets what its path carries; otherwise the slowest one governs.
 
         Raises:
             DelegationError: the node may not publish it.
@@ -131,7 +133,12 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
         topic = self.core.resolve(name, Right.PUBLISH)
         urgent = is_urgent(priority)
         options = SendOptions(
-            deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
+            deadline_s=deadline_s,
+            weight=weight,
+            max_bits_s=max_bits_s,
+            repairs=repairs,
+            own_pace=own_pace,
+            priority=priority,
         )
         made = self.driver.run(
             lambda: self.core.member.advertise(

@@ -41,7 +41,6 @@ class ClientQueue:
 
     Attributes:
         dropped: messages dropped so far.
-        dropped_bytes: their bytes.
         is_overrun: the control messages exceed their bound, or the queues of all clients do and this one has most.
         held_bytes: the bytes of the messages of subscriptions.
     """
@@ -56,7 +55,6 @@ class ClientQueue:
         self._count = 0
         self.held_bytes = 0
         self.dropped = 0
-        self.dropped_bytes = 0
         self.is_overrun = False
 
     @property
@@ -109,9 +107,8 @@ class ClientQueue:
         return max(sizes, key=sizes.__getitem__)
 
     def _drop_oldest(self, key: int) -> None:
-        message = self._take(key)
+        self._take(key)
         self.dropped += 1
-        self.dropped_bytes += len(message.raw)
 
     def _take(self, key: int) -> Pending:
         lane = self._lanes[key]

@@ -28,6 +28,7 @@ from typing import Final
 
 from pyroute2 import IPRoute
 
+from gdp.closing import ClosedOnExit
 from gdp.frame.kinds import ETHERTYPE
 from gdp.host import netns_files
 from gdp.ports.kernel.assembler import Assembler, Reg
@@ -60,19 +61,13 @@ class FrameFaults:
     delay_s: float = 0.02
 
 
-class LinkFaults:
+class LinkFaults(ClosedOnExit):
     """The faults of many devices; a context manager that ends them all."""
 
     def __init__(self) -> None:
         self._ends: dict[tuple[Path, str], _End] = {}
         self._line: _DelayLine | None = None
         self._made = 0
-
-    def __enter__(self) -> LinkFaults:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def set(self, namespace: Path, ifname: str, faults: FrameFaults) -> None:
         """Apply faults to frames that a device receives, from now on.

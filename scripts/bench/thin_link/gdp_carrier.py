@@ -22,18 +22,22 @@ _QUEUE: Final = 4_096
 
 
 class GdpCarrier:
-    """Session of a member."""
+    """Session of a member; ``readers``: how many each of its streams has."""
 
     def __init__(self, settings: dict[str, Any], arrived: Arrival) -> None:
         self._session = gdp.open(Path(settings["config"]), busy_poll_us=SPIN_US, timeout_s=_PATIENCE_S)
         self._arrived = arrived
+        self._readers = int(settings.get("readers", 1))
         self._publishers: list[gdp.Publisher] = []
         tune_memory()
 
     def publish(self, stream: Stream) -> Callable[[bytes], None]:
         """Publish a stream, as ``Carrier``."""
         publisher = self._session.publisher(
-            stream.name, reliable=stream.reliable, priority="urgent" if stream.urgent else "normal"
+            stream.name,
+            reliable=stream.reliable,
+            priority="urgent" if stream.urgent else "normal",
+            own_pace=stream.own_pace,
         )
         self._publishers.append(publisher)
         return publisher.put
@@ -45,7 +49,7 @@ class GdpCarrier:
 
     def is_matched(self) -> bool:
         """Return whether every published stream is read."""
-        return all(publisher.readers for publisher in self._publishers)
+        return all(publisher.readers >= self._readers for publisher in self._publishers)
 
     def _read(self, stream: Stream, subscription: gdp.Subscription) -> None:
         for message in subscription:

@@ -139,16 +139,18 @@ def _set_tcp_control(lab: Lab, node: str, name: str) -> None:
 
 
 @contextmanager
-def open_line(lab: Lab, conditions: Conditions) -> Iterator[Line]:
-    """Run the relay of a link until the context ends."""
-    path = lab.directory / "line.json"
+def open_line(
+    lab: Lab, conditions: Conditions, line: str = LINE, ends: tuple[str, str] = (ROBOT, CLOUD)
+) -> Iterator[Line]:
+    """Run the relay of a link at ``line``, between the machines at its ends, until the context ends."""
+    path = lab.directory / f"{line}.json"
     settings = {
-        "devices": (ROBOT, CLOUD),
+        "devices": ends,
         "up": conditions.up.to_fields(),
         "down": conditions.down.to_fields(),
         "seed": conditions.seed,
     }
     path.write_text(json.dumps(settings), encoding="ascii")
-    with lab.start(LINE, "relay", ["-m", "thin_link.relay", str(path)], has_orders=True) as process:
+    with lab.start(line, "relay", ["-m", "thin_link.relay", str(path)], has_orders=True) as process:
         process.read(_READY_S)
         yield Line(process)

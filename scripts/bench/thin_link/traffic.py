@@ -18,6 +18,7 @@ Direction = Literal["up", "down"]
 CAMERA_BYTES: Final = {"raw": 921_600, "jpeg": 40_000}  # 640x480 rgb8; the same as JPEG
 SERVICE_ANSWER: Final = "service answer"
 RELIABLE: Final = "reliable"  # in place of a camera: raw images alone, none of which may be dropped
+TOGETHER, OWN_PACE = "together", "own-pace"  # in place of a camera: JPEG images alone, to several readers
 _HEAD: Final = struct.Struct("!IQ")
 _TAIL: Final = struct.Struct("!I")
 _FRAME_PAYLOAD: Final = 1_400  # of 1,500 bytes; what is left is for addresses, security and order of every system
@@ -29,7 +30,8 @@ class Stream:
     """One topic.
 
     ``period_s``: of its messages; 0: published when a message of ``answers`` arrives. ``urgent``: has the highest
-    priority that a system offers. ``bulk``: fills what the others leave of the link.
+    priority that a system offers. ``bulk``: fills what the others leave of the link. ``own_pace``: no reader waits for
+    another.
     """
 
     name: str
@@ -39,11 +41,15 @@ class Stream:
     reliable: bool
     urgent: bool = False
     bulk: bool = False
+    own_pace: bool = False
     answers: str = ""
 
 
 def streams(camera: str) -> tuple[Stream, ...]:
-    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``, with QoS as in ROS, or ``RELIABLE``."""
+    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``, with QoS as in ROS, or its replacement."""
+    if camera in (TOGETHER, OWN_PACE):
+        size, own_pace = CAMERA_BYTES["jpeg"], camera == OWN_PACE
+        return (Stream("camera", size, 1 / 30, "up", reliable=False, bulk=True, own_pace=own_pace),)
     if camera == RELIABLE:
         return (Stream("images", CAMERA_BYTES["raw"], 1 / 30, "up", reliable=True, bulk=True),)
     return (

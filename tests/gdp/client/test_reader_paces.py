@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gdp.client.reader_paces import ReaderPaces
 from gdp.client.reader_path import ReaderPaths
+from gdp.client.send_options import SendOptions
 from gdp.limits import PACE_MAX
+from tests.gdp.client.pipe import Pipe, publisher_of
 
 FAST, MEDIUM, THIN = (bytes([each]) * 32 for each in (1, 2, 3))
 ALL = [FAST, MEDIUM, THIN]
@@ -40,7 +44,7 @@ def hold_back(paths: ReaderPaths, paces: ReaderPaces, *names: bytes) -> None:
     for name in names:
         paths.path(name, 0.0).sent(10_000_000, 1, 0.0)
     for at_s in (0.0, 0.3, 0.6):
-        paces.record(ALL, at_s)
+        paces.record(ALL, 0, at_s)
     paces.slow_down(0.6)
     for name in names:
         paths.path(name, 0.0).controller.rate.forget_all()
@@ -57,10 +61,31 @@ def test_readers_that_hold_back_others_get_the_paces_of_their_rates() -> None:
 def test_no_reader_is_slowed_down_once_all_that_is_published_leaves_in_time() -> None:
     paths, paces = measured()
     paths.path(THIN, 0.0).sent(10_000_000, 1, 0.0)
-    paces.record(ALL, 0.0)
+    paces.record(ALL, 0, 0.0)
     paces.slowing.blocks.clear()
-    paces.record(ALL, 0.4)
+    paces.record(ALL, 0, 0.4)
     assert not paces.slow_down(0.6)
+
+
+def test_a_reader_whose_path_permits_a_little_at_each_turn_holds_back_the_others_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    publisher = publisher_of(reliable=False, options=SendOptions(own_pace=True))
+    pipe = Pipe(publisher)
+    fast, thin = (pipe.join(name).reader.name for name in (FAST, THIN))
+    assert pipe.run(1.0, lambda: len(publisher.matched.active) == 2)
+    for name, allowance in ((fast, 15_000), (thin, 3_000)):
+        path = publisher.governing_paths._paths.path(name, pipe.now_s)
+        path.controller.model.add_rate(allowance * 100.0, 0, pipe.now_s, is_full=True)
+        monkeypatch.setattr(path, "allowance", lambda *_, allowance=allowance, **__: allowance)
+    for _ in range(3):
+        publisher.publish(bytes(IMAGE_BYTES))
+        for _ in range(3):
+            now_s = pipe.now_s = pipe.now_s + 0.08
+            allowance = publisher.governing_paths.allowance(now_s)
+            assert 0 < allowance <= sum(map(len, publisher.poll_frames(now_s, allowance))) + 1_500
+            publisher.handle_timer(now_s)
+    assert [name for name, _ in publisher.governing_paths.paces.to_state()] == [thin]
 
 
 def test_a_message_is_for_all_whose_paths_are_free_for_it() -> None:

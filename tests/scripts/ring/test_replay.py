@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from gdp.host.run_registry import Run, RunRegistry
-from lab.process import FailedError, LabProcess
+from lab.process import Event, FailedError, LabProcess
 from lab.supervisor import Supervisor
 from ring import run as replay_module
 from ring.faults import cut_from_text, text_of
 from ring.overlay import Injection
 from ring.progress import ProgressReporter
-from ring.run import Replay, Report
+from ring.result import Result
+from ring.run import Replay
 
 HEAD = """
 import json, signal, sys
@@ -40,7 +41,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     started.end()
 
 
-def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = None) -> Report:
+def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = None) -> tuple[Sequence[Event], Result]:
     reporter = ProgressReporter(Console(file=reported or io.StringIO(), width=120))
 
     supervisor = Supervisor()
@@ -49,28 +50,30 @@ def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = No
         with LabProcess(run, "sender", [sys.executable, "-c", sender]) as near:
             supervisor.wait_for(near, "ready", 10)
             replay = Replay(supervisor, near, far, 2, reporter)
-            return replay.report(Injection(supervisor, (), lambda *_: None))
+            report = replay.report(Injection(supervisor, (), lambda *_: None))
+            return replay.topics, report
 
 
 def test_when_the_sender_has_finished_the_receiver_is_asked_for_its_report(run: Run) -> None:
-    report = play(run, SENDER, RECEIVER)
-    assert [topic["topic"] for topic in report.topics] == ["/a"]
+    topics, report = play(run, SENDER, RECEIVER)
+    assert [topic["topic"] for topic in topics] == ["/a"]
     assert report.complaints == ()
     assert report.unread is None
 
 
 def test_what_could_not_be_read_is_passed_on(run: Run) -> None:
-    assert play(run, SENDER.replace("unread=None", "unread='cut off'"), RECEIVER).unread == "cut off"
+    _, report = play(run, SENDER.replace("unread=None", "unread='cut off'"), RECEIVER)
+    assert report.unread == "cut off"
 
 
 def test_what_was_never_confirmed_is_a_complaint_that_names_the_topic(run: Run) -> None:
     lacking = "unconfirmed=[{'topic': '/imu', 'messages': 9, 'confirmed': 7}]"
-    report = play(run, SENDER.replace("unconfirmed=[]", lacking), RECEIVER)
+    _, report = play(run, SENDER.replace("unconfirmed=[]", lacking), RECEIVER)
     assert report.complaints == ("/imu: 2 of 9 were never confirmed",)
 
 
 def test_an_end_that_ends_badly_is_a_complaint(run: Run) -> None:
-    report = play(run, SENDER + "; sys.exit(1)", RECEIVER.replace("sys.exit(0)", "sys.exit(3)"))
+    _, report = play(run, SENDER + "; sys.exit(1)", RECEIVER.replace("sys.exit(0)", "sys.exit(3)"))
     assert report.complaints == ("the sender ended with code 1", "the receiver ended with code 3")
 
 
@@ -99,7 +102,8 @@ def test_traffic_that_stands_still_ends_the_run(run: Run, monkeypatch: pytest.Mo
 
 def test_a_line_of_a_megabyte_is_read(run: Run) -> None:
     long = RECEIVER.replace("'/a'", "'/' + 'a' * 1_000_000")
-    assert len(play(run, SENDER, long).topics[0]["topic"]) == 1_000_001
+    topics, _ = play(run, SENDER, long)
+    assert len(topics[0]["topic"]) == 1_000_001
 
 
 def test_a_process_that_does_not_answer_in_time_is_reported(run: Run) -> None:
