@@ -61,17 +61,17 @@ class RibHost:
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames."""
         self._now_s = now.mono_s
-        fragments = 0  # whose statement is not complete
+        others = 0  # keepalives, and fragments whose statement is not complete
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
-                fragments += not self._receive_frame(arrival, statements, now)
+                others += not self._receive_frame(arrival, statements, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not end the RIB
                 self.rib.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
-        if fragments < len(arrivals):
+        if others < len(arrivals):
             self.rib.receive_all(statements, now)
             self._record_connection(now)
             self._post()
@@ -84,17 +84,22 @@ class RibHost:
         """Process the timers that are due."""
         self._now_s = now.mono_s
         self.attachment.handle_timer(now)
-        self.diagnostics.handle_timer(now)
         self._record_connection(now)
-        self._reassembler.drop_expired(now.mono_s)
-        self.rib.handle_timer(now)
-        self._channels.handle_timer(now.mono_s)
+        due_s = self._next_of_rest()
+        if due_s is not None and now.mono_s >= due_s:  # most due timers are keepalives
+            self.diagnostics.handle_timer(now)
+            self._reassembler.drop_expired(now.mono_s)
+            self.rib.handle_timer(now)
+            self._channels.handle_timer(now.mono_s)
         self._post()
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        of_channels = earliest(self._channels.get_timer(), self.diagnostics.get_timer())
-        return earliest(self.attachment.get_timer(), self.rib.get_timer(), of_channels)
+        return earliest(self.attachment.get_timer(), self._next_of_rest())
+
+    def _next_of_rest(self) -> float | None:
+        """Return the monotonic second of the next timer outside the attachment, or None."""
+        return earliest(self.rib.get_timer(), self._channels.get_timer(), self.diagnostics.get_timer())
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port."""
@@ -113,8 +118,11 @@ class RibHost:
         """Do nothing: no path is measured here."""
 
     def _receive_frame(self, arrival: ReceivedFrame, statements: list[tuple[bytes, Name]], now: Timestamps) -> bool:
-        """Add the statement for the RIB that a frame completes, with its sender; return False if it completes none."""
+        """Add the statement for the RIB that a frame completes, with its sender; return whether one does."""
         header = decode(arrival.frame)
+        if header.kind == Kind.KEEPALIVE:
+            self.attachment.hello_protocol.receive_keepalive(arrival, header, now)
+            return False
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:

@@ -49,10 +49,11 @@ _PURPOSE: Final = b"gdp-keepalive-1"
 _SAME_MIN: Final = 2
 SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
 TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
+EARLY: Final = 0.25  # of an interval, by which one may leave early; RFC 5880, section 6.8.7
 _POLLS_PER_INTERVAL: Final = 4
 QUEUED_S: Final = 3.0  # longest time in which a neighbour whose other frames come may be silent
 _FORGET_S: Final = 10.0
-JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 requires up to 0.25
+JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; up to ``EARLY``
 
 
 _POLL, _FINAL, _HEARD = (int(each) for each in (KeepaliveFlag.POLL, KeepaliveFlag.FINAL, KeepaliveFlag.HEARD))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 from gdp.control.hello import Timing
 from gdp.control.hello_port import HelloPort
-from gdp.control.keepalive import SUSPECT_AFTER, TOGETHER, KeepaliveSession, keepalive_header
+from gdp.control.keepalive import EARLY, SUSPECT_AFTER, KeepaliveSession, keepalive_header
 from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_table import NeighbourTable
@@ -99,8 +99,12 @@ class SessionOffload:
         has_heard, self.has_heard = self.has_heard, False
         if not has_heard:
             return False
-        self.has_changed = True
-        return any(each.send_at_s <= now_s + each.out_interval_s * TOGETHER for each in self._own_sessions())
+        is_due = False
+        for each in self._own_sessions():
+            if each.send_at_s <= now_s + each.out_interval_s * EARLY:
+                each.send_at_s, is_due = min(each.send_at_s, now_s), True
+        self.has_changed = self.has_changed or not is_due
+        return is_due
 
     def latest_s(self, due_s: float) -> float:
         """Return until when a timer that is due then may wait for frames: one is that of a keepalive of ours."""

@@ -35,6 +35,7 @@ class LivenessMonitor:
     Attributes:
         is_probing: some neighbour may be lost before its detection time.
         longest_s: interval between keepalives to a neighbour, the longest one.
+        lost_at_s: no neighbour is lost before; as of ``find_next``.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class LivenessMonitor:
         self._slowness = Slowness()
         self._frames_from: Callable[[int], int] = lambda _: 0
         self.is_probing = False
-        self.longest_s = 0.0
+        self.longest_s = self.lost_at_s = 0.0
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         """Learn how to count the frames that have come from a port; frames without keepalives show a full queue."""
@@ -150,9 +151,11 @@ class LivenessMonitor:
     def find_next(self) -> float:
         """Return the monotonic second of the next keepalive or loss of a neighbour; infinity: never."""
         due_s, self.is_probing, self.longest_s = NEVER_S, False, 0.0
+        self.lost_at_s = NEVER_S
         for port in self._ports.values():
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self.gone_at_s(neighbour)
+                self.lost_at_s = min(self.lost_at_s, at_s)
                 self.is_probing = self.is_probing or (session is not None and session.probe is not None)
                 if session is not None and port.is_up and not session.is_offloaded:
                     self.longest_s = max(self.longest_s, session.out_interval_s)

@@ -411,10 +411,11 @@ class HelloProtocol:
     def drop_silent(self, now_s: float) -> list[Change]:
         """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
         self.liveness.note_call(self._due_s, now_s)
+        is_settled = self._next_s is not None and not self.offload.has_changed and now_s < self.liveness.lost_at_s
         self._due_s, self._next_s = NEVER_S, None
         self.reception.drop_expired(now_s)
         changes: list[Change] = []
-        for port in self.ports.values():
+        for port in () if is_settled else self.ports.values():
             silent = self.liveness.silent(port, now_s)
             if silent:
                 self.liveness.note_failed(port, silent, now_s)

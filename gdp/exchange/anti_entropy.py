@@ -193,6 +193,8 @@ class AntiEntropy(Generic[P]):
 
     def handle_timer(self, now_s: float) -> None:
         """Send totals and replies that are due; give up fetches without progress."""
+        if (due_s := self.get_timer()) is None or now_s < due_s:
+            return
         self._is_moved = True
         for peer, state in self._peers.items():
             fetch = state.fetch

@@ -34,7 +34,7 @@ class _TimedPeriodic(Periodic):
         """Call the function if it is due; return the second of the next call."""
         if now_s >= self.due_s:
             self.handle(now())
-        return NEVER_S if self.next_s is None else self.next_s
+        return self.due_s if self.has_work() else NEVER_S
 
 
 class RelayLoop:

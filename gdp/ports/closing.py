@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 
 class Closing:
@@ -16,10 +17,13 @@ class Closing:
         self._threads: list[tuple[str, threading.Thread]] = []  # each with its device
 
     def close(self, ifname: str, closes: Sequence[Callable[[], object]]) -> None:
-        """Call these, which belong to one device, one after the other in a thread; none of none."""
+        """Call these, which belong to one device, one after the other in a thread, whatever one raises."""
         if not closes:
             return
-        thread = threading.Thread(target=lambda: [close() for close in closes], name="closing", daemon=True)
+        stack = ExitStack()
+        for close in reversed(closes):
+            stack.callback(close)
+        thread = threading.Thread(target=stack.close, name="closing", daemon=True)
         self._threads.append((ifname, thread))
         thread.start()
 

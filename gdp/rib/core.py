@@ -38,6 +38,8 @@ class RibCore:
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self.state = RibCoreState(identity, policy, store, settings)
+        self._is_moved = True  # something may be due at another time than ``_due_s``
+        self._due_s: float | None = None
         self.boundary = ErrorBoundary()
         self._counting_refusals = _CountingRefusals(self.state.refusals)
 
@@ -55,7 +57,9 @@ class RibCore:
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> None:
         """Handle a statement from ``sender`` (from the frame header; unproven). Each invalid statement is counted."""
-        self.state.now_s = now.mono_s
+        self.state.now_s, self._is_moved = now.mono_s, True
+        self.state.outbox.watches.expire(now.mono_s)
+        self.state.outbox.holders.expire(now.mono_s)
         try:
             with self._counting_refusals:
                 statement = parse(wire)
@@ -70,14 +74,14 @@ class RibCore:
 
     def revoke(self, wire: bytes, origin: Name, now: Timestamps) -> None:
         """Handle a revocation that came over a neighbour, ``origin``; an invalid one is counted."""
-        self.state.now_s = now.mono_s
+        self.state.now_s, self._is_moved = now.mono_s, True
         with self._counting_refusals:
             receive_revocation(self.state, parse(wire), origin, now)
 
     def changed(self, names: Iterable[tuple[Name, list[Route]]], now: Timestamps) -> None:
         """Send watchers what another RIB changed in a shared store, given the routes that were known before."""
         state, now_s = self.state, now.mono_s
-        state.now_s = now_s
+        state.now_s, self._is_moved = now_s, True
         queries = state.upstream_queries
         concerned = [
             (name, before)
@@ -96,7 +100,7 @@ class RibCore:
 
     def load(self, entries: Iterable[Entry], now: Timestamps) -> int:
         """Load entries of a snapshot, each verified; return how many are live. Each invalid entry is counted."""
-        before = self.names
+        before, self._is_moved = self.names, True
         for entry in entries:
             with self._counting_refusals:
                 receive_entry(self.state, entry, now)
@@ -105,7 +109,7 @@ class RibCore:
     def connected(self, now: Timestamps) -> None:
         """Begin to replicate: there is a switch, and messages reach the peers from now on."""
         state = self.state
-        state.now_s = now.mono_s
+        state.now_s, self._is_moved = now.mono_s, True
         if state.started_s is None:
             state.started_s = now.mono_s
         state.exchange.announce(now.mono_s)
@@ -113,13 +117,11 @@ class RibCore:
     def handle_timer(self, now: Timestamps) -> None:
         """Expire routes and notify their watchers; repeat open queries upstream."""
         state, now_s = self.state, now.mono_s
-        state.now_s = now_s
+        state.now_s, self._is_moved = now_s, True
         for route in state.store.expire(now_s, now.unix_s):
             if not keep_of_silent_rib(state, route, now):
                 state.former.note_gone(route, is_lapsed=True)
                 state.outbox.notify_gone(route, now_s)
-        state.outbox.watches.expire(now_s)
-        state.outbox.holders.expire(now_s)
         state.exchange.handle_timer(now_s)
         state.endpoints.handle_timer(now)
         handle_query_timer(state, now)
@@ -127,11 +129,12 @@ class RibCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        state = self.state
-        of_tier_above = earliest(state.upstream_queries.next_due(), state.upstream.next_due())
-        return earliest(
-            state.store.next_expiry(), of_tier_above, state.exchange.get_timer(), state.endpoints.get_timer()
-        )
+        if self._is_moved:
+            state, self._is_moved = self.state, False
+            of_tier_above = earliest(state.upstream_queries.next_due(), state.upstream.next_due())
+            of_entries = earliest(state.store.next_expiry(), state.endpoints.get_timer())
+            self._due_s = earliest(of_entries, of_tier_above, state.exchange.get_timer())
+        return self._due_s
 
     def statements_to_send(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""

@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not
 _STREAK_MAX = 8
+_SLACK = 0.25  # of a period
 
 
 def now() -> Timestamps:
@@ -35,22 +36,20 @@ def now() -> Timestamps:
 
 @dataclass(slots=True)
 class Periodic:
-    """Function that a loop calls once in a period, and not while it has no work."""
+    """Function that a loop calls once in a period, and not while it has no work.
+
+    For up to a quarter of its period it waits until something else wakes the loop. Source: timerslack, prctl(2).
+    """
 
     period_s: float
     call: Callable[[Timestamps], None]
     has_work: Callable[[], object]
     due_s: float = float("-inf")
 
-    @property
-    def next_s(self) -> float | None:
-        """Return when it is due; None: it waits for work, which a step of the loop brings."""
-        return self.due_s if self.has_work() else None
-
     def handle(self, moment: Timestamps) -> None:
-        """Call the function if it is due."""
+        """Call the function if it is due; one that waited is due the sooner again."""
         if moment.mono_s >= self.due_s and self.has_work():
-            self.due_s = moment.mono_s + self.period_s
+            self.due_s = max(self.due_s, moment.mono_s - self.period_s * _SLACK) + self.period_s
             self.call(moment)
 
 
@@ -189,7 +188,7 @@ class Runtime:
         self._is_woken = False
         is_sending = self.send()
         arrivals: Sequence[ReceivedFrame] = ()
-        if is_sending or self._streak:
+        if is_sending or (self._streak and self._deadline_s is not None):
             arrivals = self._plane.poll(0.0)
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.get_timer()
@@ -224,11 +223,12 @@ class Runtime:
                 each.handle(moment)
 
     def _periodic_s(self) -> float | None:
-        """Return when the next periodic function is due; None: all wait for work."""
+        """Return until when the next periodic function waits; None: all wait for work."""
         first_s: float | None = None
         for each in self._periodic:
-            if first_s is None or each.due_s < first_s:
-                first_s = earliest(first_s, each.next_s)
+            latest_s = each.due_s + each.period_s * _SLACK
+            if (first_s is None or latest_s < first_s) and each.has_work():
+                first_s = latest_s
         return first_s
 
     def _take_runs(self, runs: list[KeepaliveRun], late_s: float, moment: Timestamps) -> None:

@@ -9,7 +9,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
 
     sudo .venv/bin/python scripts/bench/messages.py                     # the whole; writes docs/benchmarks/messages.*
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
-    sudo .venv/bin/python scripts/bench/messages.py --only gdp-kernel --only zenoh-mtls --mtu 1500 --size 921600
+    sudo .venv/bin/python scripts/bench/messages.py --only gdp-kernel --only zenoh-mtls --mtu 1500
     sudo .venv/bin/python scripts/bench/messages.py --load half         # other processes take half of each core
 
 Messages are CDR, and go one at a time, as in a control loop; no device has offloads. A figure of a round is the median

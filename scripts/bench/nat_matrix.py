@@ -21,13 +21,18 @@ from internet.laboratory import Laboratory
 from internet.matrix import Outcome, Pair, batches, measure
 from lab.process import new_run
 
+KINDS = [each.value for each in Access]
+
 
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description="Which pairs of internet accesses connect through real switches.")
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=KINDS, metavar="KIND", help="of: " + ", ".join(KINDS)
+    )
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
     options = parser.parse_args()
-    kinds = list(Access)
+    kinds = [Access(each) for each in options.kinds]
     RunRegistry().sweep()  # remains of a killed run
     found: dict[Pair, Outcome] = {}
     for batch in batches(kinds):

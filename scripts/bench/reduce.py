@@ -1,6 +1,6 @@
 """Bytes that each reduction of a rule saves, and the CPU time of a message that it costs at both ends.
 
-Frames and one recording are in scripts/data. Cases of recordings that --bags has not are left out, which is reported.
+Frames and one recording are in scripts/data. Cases of recordings that are not there are left out, which is reported.
 
 .venv/bin/python scripts/bench/reduce.py
 .venv/bin/python scripts/bench/reduce.py --quick --no-save

@@ -197,6 +197,8 @@ def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
 
 def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
+    if options.quick:
+        options.dead_s, options.settle_s = 3.0, 0.0
     over, targets, notes = Rounds(), list[Target](), list[str]()
     case = f"a flow of {HZ:g} messages/s"
     for name in options.only or ROWS:
@@ -215,9 +217,9 @@ def measure(options: Options) -> Outcome:
 
 
 if __name__ == "__main__":
-    quick = {"rounds": 1, "dead_s": 3.0, "settle_s": 0.0}
-    parser = command_line(__doc__, rounds=ROUNDS, quick=quick, has_record=True)
-    parser.set_defaults(dead_s=DEAD_S, settle_s=SETTLE_S)
+    parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
     parser.add_argument("--journals", type=Path, help="keep journals, and save those of a row that loses or fails here")
+    parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
+    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
     run_bench(parser, measure)

@@ -50,7 +50,7 @@ def measure(options: Options) -> Outcome:
         quiet_s = time.monotonic()
         time.sleep(QUIET_S)
         limits = {
-            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), LIMIT_MIN_MS)
+            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), options.limit_ms)
             for paths, flow in flows.items()
         }
         silences: dict[int, list[float]] = {paths: [] for paths in flows}
@@ -112,4 +112,8 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
 
 
 if __name__ == "__main__":
-    run_bench(command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True), measure)
+    parser = command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True)
+    parser.add_argument(
+        "--limit-ms", type=float, default=LIMIT_MIN_MS, help="least delay of a late message (default: %(default)s)"
+    )
+    run_bench(parser, measure)

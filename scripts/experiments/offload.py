@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from experiment import Computed, command_line, run_experiment
+from experiment import OUTPUT, Computed, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, page_of, panels_of
 from plot import save_bars
@@ -75,10 +75,13 @@ def measure(options: Options) -> Computed:
     from offload_tasks import TASKS
 
     quick: bool = options.quick
-    names = [_QUICK] if quick else list(COMPUTED)
+    names = [_QUICK] if quick else options.task or list(COMPUTED)
     for name in names:
         TASKS[name]()  # so that missing data are reported first
+    held = (options.out or OUTPUT) / "offload.json"
     tasks: dict[str, dict[str, object]] = {}
+    if held.exists() and not quick:
+        tasks = json.loads(held.read_text(encoding="utf-8"))["tasks"]
     for name in names:
         machine = {"machine": asdict(machine_state())}
         tasks[name] = {
@@ -191,6 +194,7 @@ def _short(value: object) -> object:
 
 if __name__ == "__main__":
     parser = command_line(__doc__)
+    parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
     parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)

@@ -68,7 +68,6 @@ class StateAt(IntEnum):
 
 
 SESSION_BYTES: Final = SessionAt.IFINDEX + 8
-STATE_BYTES_OF_SESSION: Final = StateAt.REPORT + 24
 END_BYTES: Final = NAME_BYTES + 4
 
 _SKB, _SESSION, _STATE, _NOW = Reg.R6, Reg.R7, Reg.R8, Reg.R9

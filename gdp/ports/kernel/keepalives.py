@@ -18,7 +18,7 @@ from functools import partial
 from heapq import heappop, heappush
 from typing import Any, Final
 
-from gdp.control.keepalive import JITTER, REPORT
+from gdp.control.keepalive import EARLY, JITTER, REPORT
 from gdp.errors import LocalError
 from gdp.frame.codec import ethernet
 from gdp.intervals import NEVER_S, SCHEDULED_S, UPKEEP_S
@@ -26,16 +26,16 @@ from gdp.ports.kernel.keepalive_program import (
     END_BYTES,
     FRAME_BYTES,
     SESSION_BYTES,
-    STATE_BYTES_OF_SESSION,
     KeepaliveMaps,
     SessionAt,
+    StateAt,
     receiver,
     sender,
 )
 from gdp.ports.kernel.maps import KernelMap, MapKind
 from gdp.ports.kernel.program import LICENCE
 from gdp.ports.kernel.sha256 import BLOCK_BYTES
-from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRead, PreparedRun, create_link, load_program
+from gdp.ports.kernel.syscall import TCX_INGRESS, PreparedRun, create_link, load_program
 from gdp.ports.plane import Port
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 
@@ -45,6 +45,8 @@ _SESSIONS_MAX: Final = 64
 _AGAIN: Final = 0.25  # of an interval, after which keepalives that were not sent are sent
 _STATE: Final = struct.Struct(f"=7Q{REPORT.size}sB2x")
 _NUMBER: Final = struct.Struct("=I")
+_WORDS: Final = _STATE.size // 8
+_COUNT_AT, _HEARD_AT, _UP_AT = (each // 8 for each in (StateAt.COUNT, StateAt.HEARD, StateAt.UP))
 _INNER, _OUTER = bytes(each ^ 0x36 for each in range(256)), bytes(each ^ 0x5C for each in range(256))
 
 
@@ -52,11 +54,6 @@ def _keys(key: bytes) -> bytes:
     """Return the two blocks of HMAC (RFC 2104) for a key."""
     block = key.ljust(BLOCK_BYTES, b"\0")
     return block.translate(_INNER) + block.translate(_OUTER)
-
-
-def _kept(offer: KeepaliveOffer) -> tuple[bytes, bytes]:
-    """Return what stays while a session runs."""
-    return offer.in_key, offer.mac
 
 
 def _changing(offer: KeepaliveOffer) -> dict[str, Any]:
@@ -70,7 +67,6 @@ class _Session:
     slot: int
     end: bytes
     send_at_s: float
-    heard_s: float
     sent: int
     taken: int = 0
     replays: int = 0
@@ -94,17 +90,18 @@ class KeepaliveSessions:
         self._ifnames: dict[int, str] = {}  # of ports that have no link yet
         self._links: dict[int, tuple[int, int]] = {}  # link and ifindex, by port
         self._sessions: dict[tuple[int, bytes], _Session] = {}
-        self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first, and so few are read
-        self._reader: PreparedRead | None = None  # of the states of slots in use
+        self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first
         self._listed: list[int] = []  # slots that were sent for last
         self._report_at_s = NEVER_S
         self._late_s = 0.0
-        self._send_at_s, self._together_s = NEVER_S, 0.0
+        self._send_at_s, self._interval_s = NEVER_S, 0.0
         self.due_s = NEVER_S
         self.has_news = False
         try:
             self._configured = self._make(MapKind.ARRAY, 4, SESSION_BYTES, "gdp_sessions")
-            self._states = self._make(MapKind.ARRAY, 4, STATE_BYTES_OF_SESSION, "gdp_states")
+            self._states = KernelMap(MapKind.ARRAY, 4, _STATE.size, _SESSIONS_MAX, "gdp_states", is_mapped=True)
+            self._maps.append(self._states)
+            self._words = self._states.words
             self._ends = self._make(MapKind.HASH, END_BYTES, 4, "gdp_ends")
             self._slots = self._make(MapKind.ARRAY, 4, 4, "gdp_slots")
             maps = KeepaliveMaps(
@@ -160,10 +157,11 @@ class KeepaliveSessions:
         wanted = {(each.port, each.name): each for each in offers}
         for key, session in list(self._sessions.items()):
             offer = wanted.get(key)
-            if offer is None or offer.port not in self._links or _kept(offer) != _kept(session.offer):
+            ran = session.offer
+            if offer is None or offer.port not in self._links or (offer.in_key, offer.mac) != (ran.in_key, ran.mac):
                 runs.append(self._end(key))
-            elif _changing(offer) != _changing(session.offer):
-                session.offer = session.offer._replace(**_changing(offer))
+            elif _changing(offer) != _changing(ran):
+                session.offer = ran._replace(**_changing(offer))
                 self._configure(session, ports[offer.port].mac)
         for key, offer in wanted.items():
             if key not in self._sessions and self._free and self._receives(offer.port):
@@ -173,14 +171,14 @@ class KeepaliveSessions:
     def _begin(self, key: tuple[int, bytes], offer: KeepaliveOffer, mac: bytes) -> KeepaliveRun:
         slot, ifindex = heappop(self._free), self._links[offer.port][1]
         end = offer.name + _NUMBER.pack(ifindex)
-        session = _Session(offer, slot, end, offer.send_at_s, offer.heard_s, offer.sent)
+        session = _Session(offer, slot, end, offer.send_at_s, offer.sent)
         report = REPORT.pack(offer.echo, 0, 0, 0)
         heard_ns = int(offer.heard_s * 1e9)
         state = _STATE.pack(offer.sequence, offer.sent, offer.received, heard_ns, 0, 0, 0, report, 0)
         self._states.put(_NUMBER.pack(slot), state)
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
-        self._sessions[key], self._reader = session, None
+        self._sessions[key] = session
         now_s = time.monotonic()
         self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
         self._plan(now_s)
@@ -197,50 +195,34 @@ class KeepaliveSessions:
     def _end(self, key: tuple[int, bytes]) -> KeepaliveRun:
         session = self._sessions[key]
         self._ends.remove(session.end)
-        run = self._report(session, self._read()[session.slot])._replace(is_over=True)
+        run = self._report(session)._replace(is_over=True)
         del self._sessions[key]
-        self._reader = None
         heappush(self._free, session.slot)
         self._plan(time.monotonic())
         return run
 
-    def _read(self) -> list[tuple[Any, ...]]:
-        if self._reader is None:
-            count = max(each.slot for each in self._sessions.values()) + 1
-            self._reader = PreparedRead(self._states.fd, _STATE.size, count)
-        self._reader()
-        return list(_STATE.iter_unpack(self._reader.values))
-
-    def _report(self, session: _Session, state: tuple[Any, ...]) -> KeepaliveRun:
+    def _report(self, session: _Session) -> KeepaliveRun:
+        state = _STATE.unpack_from(self._words, session.slot * _STATE.size)
         sequence, _, received, heard_ns, taken, _, replays, report, multiplier = state
         offer = session.offer
-        session.heard_s = heard_ns * 1e-9
         sent_s, session.sent_s = tuple(session.sent_s), []
         came, session.taken = taken - session.taken, taken
         refused, session.replays = replays - session.replays, replays
         return KeepaliveRun(
-            offer.port, offer.name, offer.nonce, sent_s, sequence, came, received, session.heard_s,
+            offer.port, offer.name, offer.nonce, sent_s, sequence, came, received, heard_ns * 1e-9,
             REPORT.unpack(report), multiplier, refused, session.send_at_s,
         )  # fmt: skip
 
     # the tick
 
     def tick(self, now_s: float) -> None:
-        """Send the keepalives that are due, or look who is silent; the node must be called if there is news."""
+        """Send the keepalives that are due, and look who is silent; the node must be called if there is news."""
         if self.due_s < now_s - SCHEDULED_S:
             self._late_s = max(self._late_s, now_s - self.due_s)
             self.has_news = True
-        sessions = self._sessions.values()
-        if self._send_at_s <= now_s:
-            until_s = now_s + self._together_s
-            self._send([each for each in sessions if each.send_at_s <= until_s], now_s)
-        states = self._read()
-        for session in sessions:
-            _, sent, _, heard_ns, *_ = states[session.slot]
-            session.heard_s = heard_ns * 1e-9
-            if sent != session.sent:
-                session.sent_s.append(now_s)
-                session.sent = sent
+        if self._send_at_s <= now_s + self._interval_s * EARLY:
+            until_s = now_s + self._interval_s / 2
+            self._send([each for each in self._sessions.values() if each.send_at_s <= until_s], now_s)
         self.has_news = self.has_news or now_s >= self._report_at_s
         self._plan(now_s)
 
@@ -256,20 +238,23 @@ class KeepaliveSessions:
             jitter = 1 - _AGAIN
         for session in sessions:
             session.send_at_s = now_s + session.offer.out_interval_s * (1 - jitter)
+            sent = self._words[session.slot * _WORDS + _COUNT_AT]
+            if sent != session.sent:
+                session.sent_s.append(now_s)
+                session.sent = sent
 
     def _plan(self, now_s: float) -> None:
-        """Set when the next tick is due; what is due within half an interval waits for one tick from then on."""
+        """Set when the next tick is due: silence is looked at when keepalives leave, half an interval late at most."""
         send_at_s = silent_at_s = interval_s = NEVER_S
         for session in self._sessions.values():
             offer = session.offer
-            send_at_s = min(send_at_s, session.send_at_s)
-            silent_at_s = min(silent_at_s, session.heard_s + offer.suspect_s)
+            silent_s = self._words[session.slot * _WORDS + _HEARD_AT] * 1e-9 + offer.suspect_s
+            send_at_s, silent_at_s = min(send_at_s, session.send_at_s), min(silent_at_s, silent_s)
             interval_s = min(interval_s, offer.out_interval_s)
         if silent_at_s <= now_s:
             self.has_news = True
-        self._send_at_s, self._together_s = send_at_s, interval_s / 2
-        look_at_s = max(silent_at_s, now_s + self._together_s)
-        self.due_s = send_at_s if send_at_s <= silent_at_s + self._together_s else min(send_at_s, look_at_s)
+        self._send_at_s, self._interval_s = send_at_s, interval_s
+        self.due_s = min(send_at_s, silent_at_s + interval_s / 2)
 
     def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
         """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""
@@ -277,14 +262,13 @@ class KeepaliveSessions:
         is_due, runs = now_s >= self._report_at_s, list[KeepaliveRun]()
         if is_due or not self._sessions:
             self._report_at_s = now_s + UPKEEP_S if self._sessions else NEVER_S
-        states = self._read() if self._sessions else []
         for key, session in list(self._sessions.items()):
-            state = states[session.slot]
-            has_come = state[5] or session.offer.port not in self._links
-            if has_come or state[3] * 1e-9 + session.offer.suspect_s <= now_s:
+            at = session.slot * _WORDS
+            has_come = self._words[at + _UP_AT] or session.offer.port not in self._links
+            if has_come or self._words[at + _HEARD_AT] * 1e-9 + session.offer.suspect_s <= now_s:
                 runs.append(self._end(key))
             elif is_due:
-                runs.append(self._report(session, state))
+                runs.append(self._report(session))
         return runs, late_s
 
 

@@ -8,6 +8,7 @@ be CPUs, each padded to 8 bytes.
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import resource
 import struct
@@ -18,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from gdp.ports.kernel.syscall import BATCH, NAME_MAX, BpfError, Command, PreparedRead, address, bpf
+from gdp.ports.kernel.syscall import BATCH, NAME_MAX, BpfError, Command, address, bpf
 
 # BPF_F_NO_PREALLOC: an entry costs memory only while it exists. From Linux 6.1 on, the kernel may reuse a removed or
 # replaced element at once, while a frame in progress still reads it. For some nanoseconds that frame may see the port
@@ -26,6 +27,7 @@ from gdp.ports.kernel.syscall import BATCH, NAME_MAX, BpfError, Command, Prepare
 # Preallocation does not help: the kernel has always reused preallocated elements at once, and the usual table would
 # cost 18 MB.
 _NO_PREALLOC: Final = 1
+_MAPPABLE: Final = 1 << 10  # BPF_F_MMAPABLE
 _POSSIBLE: Final = Path("/sys/devices/system/cpu/possible")
 _STOPPED: Final = (errno.E2BIG, errno.ENOENT)
 _NO_BATCH: Final = (errno.EINVAL, 524)  # ENOTSUPP: arrays, before Linux 5.13
@@ -54,20 +56,24 @@ class KernelMap:
         kind: a hash starts empty and takes memory as it grows; an array is complete at once, and all zero.
         value_bytes: size of one value; for a per-CPU map, on one CPU.
         name: shown by diagnostic tools.
+        is_mapped: of an array: it has ``words``.
 
     Attributes:
         value_bytes: bytes of one value as user space sees it: the values of all CPUs.
+        words: of 64 bits, of all values; they follow what programs write.
 
     Raises:
         BpfError: the kernel refuses it.
     """
 
-    def __init__(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> None:
+    def __init__(
+        self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str, *, is_mapped: bool = False
+    ) -> None:
         self.max_entries = max_entries
         self.name = name
         each = -(-value_bytes // 8) * 8
         self.value_bytes = each * possible_cpus() if kind is MapKind.PERCPU_ARRAY else value_bytes
-        flags = _NO_PREALLOC if kind is MapKind.HASH else 0
+        flags = _NO_PREALLOC * (kind is MapKind.HASH) | _MAPPABLE * is_mapped
         shape = struct.pack("=5I", kind, key_bytes, value_bytes, max_entries, flags)
         attributes = bytearray(shape + struct.pack("=2I16s", 0, 0, name.encode()[:NAME_MAX]))
         self.fd = _create(attributes, f"make the map {name} of {max_entries} entries")
@@ -75,10 +81,13 @@ class KernelMap:
         self._one = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(self._key), address(self._value), 0))
         self._one_key = self._one[:16]  # an operation without a value must get none
         self._tried = f"map {name}"
+        mapped = mmap.mmap(self.fd, max_entries * self.value_bytes, access=mmap.ACCESS_READ) if is_mapped else b""
+        self.words = memoryview(mapped).cast("Q")
 
     def close(self) -> None:
         """Close the descriptor; a program that uses the map keeps it."""
         if self.fd >= 0:
+            self.words.release()
             os.close(self.fd)
             self.fd = -1
 
@@ -134,14 +143,16 @@ class KernelMap:
         """Return the first ``count`` values of an array, concatenated. Safe in any thread."""
         if not count:
             return b""
-        read = PreparedRead(self.fd, self.value_bytes, count)
+        end, keys, values = bytearray(4), bytearray(4 * count), bytearray(self.value_bytes * count)
+        places = address(end), address(keys), address(values)
         try:
-            read()
+            bpf(Command.MAP_LOOKUP_BATCH, bytearray(BATCH.pack(0, *places, count, self.fd, 0, 0)), self._tried)
         except BpfError as error:
             if error.number in _NO_BATCH:
                 return b"".join(self.get(index.to_bytes(4, sys.byteorder)) or b"" for index in range(count))
-            raise
-        return bytes(read.values)
+            if error.number != errno.ENOENT:  # which marks the end of the array
+                raise
+        return bytes(values)
 
     def _batch(self, command: Command, keys: bytes, values: bytes, count: int) -> int:
         """Return how many were done, from the first on; the kernel reports it only if it refused one."""

@@ -27,7 +27,7 @@ _ATTACHED_MAX: Final = 64  # BPF_MPROG_MAX: the most programs at one hook
 _SKB_BYTES: Final = 512  # more than the size of struct __sk_buff
 _PRIORITY_AT: Final = 32
 BATCH: Final = struct.Struct("=QQQQIIQQ")  # of map elements: the count is the fifth
-_COUNT_AT, _REPEAT_AT = 8, 8  # in words
+_REPEAT_AT: Final = 8  # in words
 _NUMBERS: Final = {  # of the call itself; a 32-bit Python looks up the machine that it was built for
     "x86_64": 321,
     "aarch64": 280,
@@ -230,28 +230,6 @@ class PreparedRun:
         self._words[_REPEAT_AT] = repeat
         if _libc.syscall(*self._call) < 0:
             raise BpfError(ctypes.get_errno(), "run the program")
-
-
-class PreparedRead:
-    """Read of the first values of an array, again and again; for one thread.
-
-    Attributes:
-        values: as of the last read, concatenated.
-    """
-
-    def __init__(self, array: int, value_bytes: int, count: int) -> None:
-        self.values = bytearray(value_bytes * count)
-        self._kept, self._count = bytearray(4 * count + 8), count
-        keys, values = address(self._kept), address(self.values)
-        self._attributes = bytearray(BATCH.pack(0, keys + 4 * count, keys, values, count, array, 0, 0))
-        self._words = memoryview(self._attributes).cast("I")
-        self._call = (_number(), Command.MAP_LOOKUP_BATCH, address(self._attributes), len(self._attributes))
-
-    def __call__(self) -> None:
-        """Read the values. Raises ``BpfError``."""
-        self._words[_COUNT_AT] = self._count
-        if _libc.syscall(*self._call) < 0 and ctypes.get_errno() != errno.ENOENT:  # which marks the end of the array
-            raise BpfError(ctypes.get_errno(), "read an array")
 
 
 def info_of(opened: int) -> bytes:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import threading
+
+import pytest
 
 from gdp.ports.closing import Closing
 
@@ -17,3 +20,16 @@ def test_who_opens_a_device_again_waits_for_its_end_and_for_no_other() -> None:
     released.set()
     closing.wait()
     assert closed == ["b0", "b0", "a0"]
+
+
+def test_what_one_close_raises_keeps_no_other_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    closing, closed, raised = Closing(), list[str](), list[threading.ExceptHookArgs]()
+    monkeypatch.setattr(threading, "excepthook", raised.append)
+
+    def fail() -> None:
+        raise OSError(errno.EIO, "gone")
+
+    closing.close("a0", [lambda: closed.append("first"), fail, lambda: closed.append("last")])
+    closing.wait()
+    assert closed == ["first", "last"]
+    assert [each.exc_type for each in raised] == [OSError]

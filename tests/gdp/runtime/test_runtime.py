@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import Runtime
-from gdp.sansio import NodeCore, ReceivedFrame
+from gdp.sansio import NodeCore, ReceivedFrame, Timestamps
 
 
 class Core:
@@ -85,3 +85,18 @@ def test_a_period_without_work_wakes_no_loop_and_its_function_is_called_once_the
     assert runtime.next_due_s() is not None
     runtime.step(time.monotonic())
     assert work == []
+
+
+def test_periods_wait_for_a_quarter_of_them_until_something_else_wakes_the_loop_and_are_kept_on_average() -> None:
+    runtime, _ = loop(0)
+    called: list[float] = []
+    runtime.every(0.5, lambda moment: called.append(moment.mono_s))
+    (each,) = runtime._periodic
+    each.handle(Timestamps(100.0, 0.0))
+    each.handle(Timestamps(100.3, 0.0))
+    due_s, until_s = each.due_s, runtime.next_due_s()
+    assert until_s == due_s + 0.125
+    for now_s in (due_s - 0.01, due_s + 0.06, due_s + 0.4):
+        each.handle(Timestamps(now_s, 0.0))
+    assert called == [100.0, due_s + 0.06]
+    assert each.due_s == due_s + 0.5

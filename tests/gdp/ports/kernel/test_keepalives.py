@@ -209,17 +209,28 @@ def test_what_is_due_leaves_in_one_tick_and_a_silent_neighbour_is_handed_back(se
     assert sessions.due_s == float("inf")
 
 
-def test_a_second_tick_in_an_interval_is_rare(sessions: KeepaliveSessions) -> None:
+@pytest.mark.parametrize("neighbours", [1, 20])
+def test_one_tick_in_an_interval_sends_all_and_finds_who_is_silent(
+    sessions: KeepaliveSessions, neighbours: int
+) -> None:
     begun_s = now_s = time.monotonic()
-    sessions.follow([offer(heard_s=begun_s, send_at_s=begun_s)], PORTS)
-    ticks, intervals = 0, 200
+    offers = [offer(name=bytes([at]) * 32, heard_s=begun_s, send_at_s=begun_s) for at in range(neighbours)]
+    sessions.follow(offers, PORTS)
+    words = [0] * len(sessions._words)
+    sessions._words = cast("memoryview[int]", words)
+    sessions._run = lambda _count: None  # type: ignore[assignment]
+    ticks = sends = 0
+    intervals = 200
     while now_s < begun_s + intervals * INTERVAL_S:
-        heard_s = now_s - (now_s - begun_s) % INTERVAL_S
-        sessions._read = lambda heard_s=heard_s: [(0, 0, 0, int(heard_s * 1e9))]  # type: ignore[method-assign,misc]
+        for at, session in enumerate(sessions._sessions.values()):
+            heard_s = now_s - (now_s - begun_s - INTERVAL_S * at / neighbours) % INTERVAL_S
+            words[session.slot * 10 + 3] = int(heard_s * 1e9)
+        before = sessions._send_at_s
         sessions.tick(now_s)
-        ticks += 1
-        now_s = max(now_s, sessions.due_s)
-    assert ticks < 1.5 * intervals
+        ticks, sends = ticks + 1, sends + (sessions._send_at_s > before)
+        assert sessions.due_s - now_s > 0.7 * INTERVAL_S
+        now_s = sessions.due_s
+    assert sends == ticks < intervals / 0.7
 
 
 def test_a_number_of_a_frame_is_where_the_program_expects_it() -> None:
