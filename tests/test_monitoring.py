@@ -40,6 +40,7 @@ def exported() -> dict[str, set[str]]:
         "entries": lambda: {bytes(64): (1, 2)},
         "links": lambda: [NeighbourRow(port="eth0", name=Name(bytes(32)), rtt_s=0.1, cost=10)],
         "latency": lambda: seen,
+        "clocks": lambda: {"75e…0fc": (2.5, 0.01)},
         "ports": lambda: [PortRow("eth0", is_up=True, mtu=1500, counts=DeviceCounts(1, 1, 1, 1, 1, 1, 1, 1))],
         "topics": lambda: [TopicCounts("75e…0fc", "out", 1, 1, 1, 1)],
         "health": Health,

@@ -185,6 +185,11 @@ class Diagnostics:
         clock = self._clocks.get(member)
         return None if clock is None else clock.estimate(*now)
 
+    def clocks(self, now: Timestamps) -> list[tuple[Membership, ClockEstimate]]:
+        """Return what is known of the wall clocks of all members that have replied."""
+        known = ((peer.member, self.clock_of(peer.member.name, now)) for peer in self._peers.values())
+        return [(member, clock) for member, clock in known if clock is not None]
+
     # -- ask
 
     def ask(

@@ -51,6 +51,11 @@ class ClockEstimate(NamedTuple):
     offset_s: float
     bound_s: float
 
+    @property
+    def least_s(self) -> float:
+        """Return by how much the clocks differ at least."""
+        return max(abs(self.offset_s) - self.bound_s, 0.0)
+
 
 class _Sample(NamedTuple):
     at_s: float
@@ -78,7 +83,8 @@ class ClockOffset:
         least_s, most_s = stamps.sent / 1e6 - came_s - aged_s, stamps.received / 1e6 - sent_s + aged_s
         if least_s > most_s:
             return  # no clock shows that
-        self._age(now_s)
+        self._least_s, self._most_s = self._aged(now_s)
+        self._at_s = now_s
         if self._anchor is None or least_s > self._most_s or most_s < self._least_s:  # another clock: it started again
             self._anchor, self.drift, self._least_s, self._most_s = None, 0.0, least_s, most_s
         self._least_s, self._most_s = max(least_s, self._least_s), min(most_s, self._most_s)
@@ -89,18 +95,14 @@ class ClockOffset:
         """Return what that node's wall clock is ahead of ours; None: not known."""
         if self._anchor is None:
             return None
-        self._age(now_s)
-        return ClockEstimate(
-            (self._least_s + self._most_s) / 2 + self._wall_s - (unix_s - now_s), (self._most_s - self._least_s) / 2
-        )
+        least_s, most_s = self._aged(now_s)
+        return ClockEstimate((least_s + most_s) / 2 + self._wall_s - (unix_s - now_s), (most_s - least_s) / 2)
 
-    def _age(self, now_s: float) -> None:
-        """Move the interval by the drift, and widen it, so that it contains the truth at any drift up to the most."""
+    def _aged(self, now_s: float) -> tuple[float, float]:
+        """Return the interval, moved by the drift, and so wide that it has the truth at any drift up to the most."""
         passed_s = max(now_s - self._at_s, 0.0)
         shift_s, growth_s = self.drift * passed_s, (DRIFT_MAX + abs(self.drift)) * passed_s
-        self._at_s += passed_s
-        self._least_s += shift_s - growth_s
-        self._most_s += shift_s + growth_s
+        return self._least_s + shift_s - growth_s, self._most_s + shift_s + growth_s
 
     def _measure_drift(self, sample: _Sample) -> None:
         """Measure the drift since the anchor, if that gives it well enough; the next one is measured from here."""

@@ -206,6 +206,7 @@ def common_sources(node_log: NodeLog, own: Sources) -> Sources:
         drops=state.drops,
         waiting=node_log.metrics,
         links=lambda: state.links,
+        clocks=lambda: {member.name.short: clock for member, clock in state.clocks},
         ports=state.ports,
         health=node_log.health,
     )

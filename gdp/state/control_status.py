@@ -12,7 +12,7 @@ from gdp.crypto.identity import Identity
 from gdp.state.tables import rounded_ms
 from gdp.telemetry.sources import NeighbourRow, Sources
 
-_ROWS: Final = ("entries", "latency", "links", "ports", "topics", "health")  # no counters
+_ROWS: Final = ("clocks", "entries", "latency", "links", "ports", "topics", "health")  # no counters
 
 
 def node_status(identity: Identity, sources: Sources, *, uptime_s: float, **more: object) -> dict[str, object]:

@@ -16,8 +16,10 @@ from gdp.control.diagnostics import Diagnostics
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.waiting import Wait, wait_fact
+from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
+from gdp.message.clock_offset import ClockEstimate
 from gdp.names import Name
 from gdp.ports.plane import Plane
 from gdp.sansio import Timestamps
@@ -50,6 +52,7 @@ class NodeState(ABC):
 
     Attributes:
         role: word for the kind of node in errors.
+        clocks: of members, as of the last ``refresh``; any thread may read them.
         links: neighbours that are up, as of the last ``refresh``, by port and short name; any thread may read them.
         read_devices: returns counts by device, as ``PortCounters.read``.
         local_name: returns the user's word for a name, or another form for people.
@@ -73,6 +76,7 @@ class NodeState(ABC):
         self.core = core
         self.begun_s = begun_s
         self.links: list[NeighbourRow] = []
+        self.clocks: list[tuple[Membership, ClockEstimate]] = []
         self.read_devices: Callable[[], Mapping[str, Sequence[int]]] = dict
         self.local_name: Callable[[Name], str] = lambda name: name.short
 
@@ -103,8 +107,9 @@ class NodeState(ABC):
         ]
         return sorted(rows, key=lambda row: row.port)
 
-    def refresh(self, _now: Timestamps) -> None:
-        """Read the links again; the node's own thread calls it."""
+    def refresh(self, now: Timestamps) -> None:
+        """Read links and clocks again; the node's own thread calls it."""
+        self.clocks = self.core.diagnostics.clocks(now)
         self.links = sorted(self.neighbours(is_up=True), key=lambda row: (row.port, row.name.short))
 
     def neighbours(self, *, is_up: bool = False) -> Iterator[NeighbourRow]:

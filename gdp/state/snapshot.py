@@ -7,6 +7,7 @@ Sans-I/O. A whole name would let every reader of a picture request the topic, so
      "links": [{"port": "s1", "to": "9ab…", "label": "cloud", "role": "switch", "rtt_ms": 0.4, "loss": 0.0, ...}],
      "names": [["c01…", "9ab…", "publish"], ...],                   name, node, right
      "trees": [["c01…", "9ab…", 1, "9ab…", ["77d…"]], ...],         name, publisher, path, from, to
+     "clocks": [["9ab…", "cloud", 0.2, 0.4], ...],                  node, label, offset and its bound in ms
      "drops": {"no-route": 2}, "frames": {"in": 812, ...}, "waiting": [], "left_out": 0}
 """
 
@@ -32,6 +33,7 @@ NAMES_MAX: Final = 1_000
 TREES_MAX: Final = 400
 FLOWS_MAX: Final = 400
 LINKS_MAX: Final = 256
+CLOCKS_MAX: Final = 64
 SWITCHES_MAX: Final = 512  # of a topology
 _FAN_OUT_MAX: Final = 64  # branches of one tree
 
@@ -57,6 +59,10 @@ def node_snapshot(state: NodeState, sources: Sources, now_s: float) -> dict[str,
         "uptime_s": state.uptime_s(now_s),
         "drops": {reason.label: drops[reason] for reason in sorted(drops)},
         **{key: dict(source()) for key, source in counts.items() if source is not None},
+        "clocks": [
+            [short_id(member.name), member.label, rounded_ms(clock.offset_s), rounded_ms(clock.bound_s)]
+            for member, clock in state.clocks[:CLOCKS_MAX]
+        ],
         "waiting": [reason for reason, is_waiting in waiting.items() if is_waiting],
     }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from typing import Final, TypeVar
 
@@ -87,6 +87,8 @@ class Metrics(Collector):
         yield from _gauges("gdp_waiting", "1: the node makes no progress for this reason", "reason", of.waiting)
         if of.links is not None:
             yield from _links(of.links())
+        if of.clocks is not None:
+            yield from _clocks(of.clocks())
         if of.ports is not None:
             yield from _ports(of.ports())
         if of.topics is not None:
@@ -97,7 +99,8 @@ class Metrics(Collector):
                 "gdp_identity_clashes", "Signs of another node with this identity", value=of.clashes()
             )
         if of.latency is not None:
-            yield _histogram("gdp_latency_seconds", "One-way latency of messages", of.latency())
+            text = "One-way latency of messages, corrected by the offset of the sender's clock where that is known"
+            yield _histogram("gdp_latency_seconds", text, of.latency())
 
     def text(self) -> str:
         """Return the text of a scrape."""
@@ -163,6 +166,12 @@ def _links(rows: Sequence[NeighbourRow]) -> Iterator[Metric]:
     yield _family(GaugeMetricFamily, "gdp_link_rtt_seconds", "Its smoothed round-trip time", labels, rtts)
     losses = [((*at, way), loss) for at, row in ends for way, loss in (("in", row.loss_in), ("out", row.loss_out))]
     yield _family(GaugeMetricFamily, "gdp_link_loss", "Share of keepalives lost", [*labels, "direction"], losses)
+
+
+def _clocks(rows: Mapping[str, tuple[float, float]]) -> Iterator[Metric]:
+    texts = "What the wall clock of another member is ahead of ours", "How wrong that may be"
+    for at, (name, text) in enumerate(zip(("gdp_clock_offset_seconds", "gdp_clock_bound_seconds"), texts, strict=True)):
+        yield _family(GaugeMetricFamily, name, text, ["peer"], (([peer], row[at]) for peer, row in rows.items()))
 
 
 def _ports(rows: Sequence[PortRow]) -> Iterator[Metric]:

@@ -147,12 +147,13 @@ class Sources:
         calls: events of services with several servers: late and unexpected responses, hedged requests.
         waiting: 1 for each reason for which the node makes no progress, 0 for the others.
         links: to neighbours that are up.
+        clocks: what the wall clocks of other members are ahead of ours, and the bounds of the errors, in seconds.
         ports: with the kernel's counts of their devices.
         topics: that a proxy carries now.
         health: of the loop, for probes.
         two_paths: flows that want two paths, by what they have: disjoint, shared, single.
         clashes: signs of another node with this identity.
-        latency: one-way, from the source's stamp to delivery.
+        latency: one-way, from the source's stamp to delivery, by the reader's clock where the offset is known.
     """
 
     frames: Counts | None = None
@@ -171,6 +172,7 @@ class Sources:
     calls: Counts | None = None
     waiting: Counts | None = None
     links: Callable[[], Sequence[NeighbourRow]] | None = None
+    clocks: Callable[[], Mapping[str, tuple[float, float]]] | None = None
     ports: Callable[[], Sequence[PortRow]] | None = None
     topics: Callable[[], Sequence[TopicCounts]] | None = None
     health: Callable[[], Health] | None = None

@@ -34,5 +34,9 @@ class Lru(Generic[_V]):
         if len(self._items) > self._maximum:
             self._items.popitem(last=False)
 
+    def values(self) -> list[_V]:
+        """Return all values, the least recently used first."""
+        return list(self._items.values())
+
     def __len__(self) -> int:
         return len(self._items)

@@ -24,7 +24,7 @@ class Traffic:
         hedged: second copies of requests.
         answered: by the overlay name of a service, 64 hex digits: the answered calls of local clients, and what they
             took together, in milliseconds.
-        latency: one-way, from the remote proxy's stamp until delivery to the endpoint here.
+        latency: one-way, from the remote proxy's stamp, as our clock shows it, until delivery to the endpoint here.
     """
 
     messages_out: int = 0

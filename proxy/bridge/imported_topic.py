@@ -30,7 +30,7 @@ from proxy.bridge.rate_limit import RateLimiter
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Origin
 from proxy.endpoints.core.qos import unmatched
 from proxy.serial.channel import Channel
-from proxy.serial.frames import FrameRewriter
+from proxy.serial.headers import HeaderRewriter, StampShift
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import HEAD_BYTES, RosMessage, TopicDescription
 
@@ -39,11 +39,11 @@ _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 
 
 class _Decoded(NamedTuple):
-    """Expander, decoder, rewriter and output of one remote channel."""
+    """Expander, decoder, rewriter of headers and output of one remote channel."""
 
     expander: MessageExpander
     incoming: MessageDecoder
-    frames: FrameRewriter | None  # where the rule renames frames
+    headers: HeaderRewriter | None  # where the rule renames frames, or converts stamps
     handle: int  # of the local output
 
 
@@ -192,16 +192,19 @@ class ImportedTopic:
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
-        expander, incoming, frames, handle = channels[ros_message.channel]
+        expander, incoming, headers, handle = channels[ros_message.channel]
         raw = incoming.decode(*expander.expand(ros_message))
-        if frames is not None:
-            raw = frames.rewrite(raw)
+        if headers is not None:
+            is_moved = rule.stamps == "local"
+            ahead_ns = self._context.clock_offset_ns(publisher, now_s, is_sure=False) if is_moved else 0
+            raw = headers.rewrite(raw, StampShift(-ahead_ns, ros_message.stamp_ns))
         if len(raw) > rule.max_bytes:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
             return
         self._output.publish(handle, raw, Origin(ros_message.stamp_ns, delivered.sequence))
-        latency_ms = (time.time_ns() - ros_message.stamp_ns) / 1e6
+        sent_ns = ros_message.stamp_ns - self._context.clock_offset_ns(publisher, now_s, is_sure=True)
+        latency_ms = (time.time_ns() - sent_ns) / 1e6
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.stats.add(latency_ms, delivered.parts, delivered.hops, len(raw))
         traffic.latency.observe(latency_ms / 1e3)
@@ -230,6 +233,9 @@ class ImportedTopic:
             return None
         return tuple(map(_Decoded, expanders, incoming, rewriters, handles))
 
-    def _rewriter(self, channel: Channel) -> FrameRewriter | None:
-        frames = self._flow_spec.rule.frames
-        return None if frames is None else FrameRewriter(channel, frames.rename)
+    def _rewriter(self, channel: Channel) -> HeaderRewriter | None:
+        rule = self._flow_spec.rule
+        has_stamps = rule.stamps == "local"
+        if rule.frames is None:
+            return HeaderRewriter(channel, None, has_stamps=True) if has_stamps else None
+        return HeaderRewriter(channel, rule.frames.rename, has_stamps=has_stamps)

@@ -76,6 +76,7 @@ _OF_KINDS: Final = {  # keys that only the rules of these kinds have
         "repair",
         "readers",
         "frames",
+        "stamps",
         *REDUCTIONS,
     ),
     "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
@@ -283,6 +284,9 @@ class Rule(Section):
         description="Larger messages, as ROS wrote them, are counted only.",
     )
     frames: Frames | None = Field(default=None, description="Imported topics: names of coordinate frames here.")
+    stamps: Literal["as-sent", "local"] = Field(
+        default="as-sent", description="Imported topics: stamps of headers, by the sender's clock or by that of here."
+    )
     compress: SomeCompress = Field(default=None, description="Exposed topics: compressed bodies.")
     image: PictureFormat | None = Field(
         default=None, description="Exposed sensor_msgs/msg/Image: travels so; needs the extra `images`."

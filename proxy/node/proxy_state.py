@@ -20,6 +20,7 @@ from gdp.names import Name
 from gdp.nodes.node import common_handlers
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import now
+from gdp.sansio import Timestamps
 from gdp.state.member_tables import participant_tables
 from gdp.state.node_state import MemberState
 from gdp.state.snapshot import member_snapshot
@@ -30,7 +31,7 @@ from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
-from proxy.bridge.faults import Faults
+from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.flow_rows import flow_fields, flow_rows, topic_counts
 from proxy.serial.channel import Qos
 
@@ -39,6 +40,7 @@ CALLED_MAX: Final = 256  # services in one status; each has less than 128 bytes
 DENIED_MAX: Final = 50  # names in one status; each has less than 1.5 KiB
 LIVELINESS_BYTES: Final = 96 << 10  # of a status, whose response has 256 KiB
 QOS_MAX: Final = 256  # topics in one status; each has less than 200 bytes
+TRANSFORMS_S: Final = 0.1  # for which Nav2 extrapolates transforms (transform_tolerance)
 UNDELEGATED_MAX: Final = 100  # flows in one status; each has less than 2 KiB of a response's 256
 
 
@@ -72,6 +74,18 @@ class ProxyState(MemberState):
         self.ros_domains: tuple[int, ...] = ()
         self._rule_names = rule_names
         self.local_name = self._local_name
+
+    def refresh(self, now: Timestamps) -> None:
+        """Read links and clocks again, and warn of each clock by which transforms would be extrapolated."""
+        super().refresh(now)
+        for member, clock in self.clocks:
+            is_known = Fault.CLOCK.value in self.context.faults.of(member.label)
+            if clock.least_s <= TRANSFORMS_S:
+                self.context.faults.clear(member.label, Fault.CLOCK)
+            elif not is_known:
+                ahead = f"{abs(clock.offset_s):.3f} s {'ahead of' if clock.offset_s > 0 else 'behind'}"
+                what = f"its clock is {ahead} that of {self.identity.label}, to {clock.bound_s:.3f} s"
+                self.context.faults.report(member.label, Fault.CLOCK, f"{what}: transforms between both do not fit")
 
     def _local_name(self, name: Name) -> str:
         flows = () if self.bridge is None else self.bridge.flows

@@ -10,7 +10,7 @@ Sans-I/O. Two ends describe a link, several nodes a name; each says what it know
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -30,6 +30,7 @@ class Node:
     domain: str = ""
     is_near: bool = False
     waiting: tuple[str, ...] = ()
+    clocks: tuple[Sequence[object], ...] = ()  # of others: id, label, what they are ahead and its bound, in ms
 
 
 @dataclass(slots=True, kw_only=True)
@@ -164,6 +165,7 @@ def _add_node(graph: Graph, reading: Reading) -> None:
     node.label, node.domain, node.is_near = text_of(fields, "label"), text_of(fields, "domain"), True
     waiting = fields.get("waiting")
     node.waiting = tuple(map(str, waiting)) if isinstance(waiting, list) else ()
+    node.clocks = tuple(row for row in rows_of(fields, "clocks", 4) if all(isinstance(each, float) for each in row[2:]))
     graph.domains[node.domain] = text_of(fields, "domain_label")
     graph.left_out += int(number_of(fields, "left_out"))
 

@@ -96,6 +96,7 @@ class Scene:
             "drops": drops,
             "replicas": replicas,
             "waiting": {node.id: list(node.waiting) for node in graph.nodes.values() if node.waiting},
+            "clocks": {node.id: list(node.clocks) for node in graph.nodes.values() if node.clocks},
             "totals": self._totals_of(graph),
             "events": [each for each in self._events if number_of(each, "number") > after_event],
         }

@@ -97,6 +97,8 @@ export class Panels {
     for (const reason of store.waiting[node.id] ?? []) parts.push(element("p", { class: "bad" }, `waits: ${reason}`));
     parts.push(this.table(rows, "link to", "rate", "RTT", "loss"));
     if (links.length > ROWS_MAX) parts.push(element("p", {}, `and ${links.length - ROWS_MAX} more links`));
+    const clocks = (store.clocks[node.id] ?? []).slice(0, ROWS_MAX);
+    if (clocks.length) parts.push(this.table(clocks.map(([id, label, offset, bound]) => [this.to("node", id, label), offset.toFixed(1), bound.toFixed(1)]), "clock of", "ahead, ms", "± ms"));
     if (names.length) {
       parts.push(element("h2", {}, `Its names (${names.length})`));
       parts.push(this.table(names.slice(0, ROWS_MAX).map((name) => [this.to("name", name.id, name.label), this.uses(name, at)])));

@@ -13,6 +13,7 @@ export class Store {
     this.drops = [];
     this.totals = {};
     this.waiting = {};
+    this.clocks = {};
     this.nodeAt = new Map();
     this.nameAt = new Map();
     this.selected = null; // {kind: "node" | "name" | "link", id}
@@ -49,6 +50,7 @@ export class Store {
     this.drops = message.drops;
     this.replicas = message.replicas;
     this.waiting = message.waiting;
+    this.clocks = message.clocks;
     this.totals = message.totals;
     this.events = [...message.events.slice().reverse(), ...this.events].slice(0, 400);
     return message.events.length > 0;

@@ -92,6 +92,9 @@ class FakeGraph:
         ros: dialect of its messages.
         channels: message types known to its machine, by type name.
         services: service types known to its machine.
+
+    Attributes:
+        now_ns: returns the wall clock of the machine.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class FakeGraph:
         self.servers: list[Server] = []
         self.endpoints: list[FakeEndpoint] = []
         self._keys = count()
+        self.now_ns: Callable[[], int] = lambda: 0
 
     def publish(
         self, node: str, topic: str, type_name: str, qos: Qos | None = None, *, hides_depth: bool = False
@@ -281,10 +285,11 @@ class FakeEndpoint:
         def describe() -> None:
             self.tell(TypeResolved(handle, replace(channel, latched=self._graph.is_latched(topic, type_name))))
 
+        def hear(raw: bytes) -> None:
+            self.tell(MessageReceived(handle, self._graph.now_ns(), raw))
+
         describe()
-        subscription = self._graph.subscribe(
-            self._node, topic, type_name, lambda raw: self.tell(MessageReceived(handle, 0, raw)), qos, describe
-        )
+        subscription = self._graph.subscribe(self._node, topic, type_name, hear, qos, describe)
         self._open[handle].close = subscription.close
         return handle
 
