@@ -9,7 +9,6 @@ up. A key that is due sooner gets a second entry, and the first becomes void.
 from __future__ import annotations
 
 import heapq
-from itertools import count
 from typing import Any, Final, Generic, TypeVar
 
 from gdp.intervals import NEVER_S
@@ -34,7 +33,7 @@ class DueQueue(Generic[K]):
         self._entries: dict[K, _Entry] = {}  # the valid one of each key
         self._waiting = 0  # entries that are due at some time
         self._heap: list[_Entry] = []
-        self._order = count()
+        self._rank = 0
 
     def __len__(self) -> int:
         return self._waiting
@@ -52,20 +51,22 @@ class DueQueue(Generic[K]):
         if at_s is None or at_s == NEVER_S:
             self.discard(key)
             return
-        entry = self._entries.get(key)
-        if entry is None or entry[_DUE] == NEVER_S:
+        if key not in self._entries:
             self._waiting += 1
-            if entry is not None:  # the order is that in which keys began to wait
-                self._entries[key] = self._entries.pop(key)
-        if entry is None or at_s < entry[_PLACE]:
-            if entry is not None:
-                entry[_DUE] = _VOID
-            entry = self._entries[key] = [at_s, key if self._is_sorted else next(self._order), key, at_s]
-            heapq.heappush(self._heap, entry)
-            if len(self._heap) > 4 * self._waiting + _SLACK:
-                self._rebuild()
         else:
-            entry[_DUE] = at_s
+            entry = self._entries[key]
+            if entry[_DUE] == NEVER_S:
+                self._waiting += 1
+                self._entries[key] = self._entries.pop(key)  # the order is that in which keys began to wait
+            if at_s >= entry[_PLACE]:
+                entry[_DUE] = at_s
+                return
+            entry[_DUE] = _VOID
+        self._rank += 1
+        entry = self._entries[key] = [at_s, key if self._is_sorted else self._rank, key, at_s]
+        heapq.heappush(self._heap, entry)
+        if len(self._heap) > 4 * self._waiting + _SLACK:
+            self._rebuild()
 
     def discard(self, key: K) -> None:
         """Remove a key, if it waits."""
@@ -95,7 +96,8 @@ class DueQueue(Generic[K]):
                 if due_s == NEVER_S:
                     del self._entries[key]
             else:
-                entry[_PLACE], entry[_RANK] = due_s, key if self._is_sorted else next(self._order)
+                self._rank += 1
+                entry[_PLACE], entry[_RANK] = due_s, key if self._is_sorted else self._rank
                 heapq.heapreplace(heap, entry)
         return None
 
@@ -112,9 +114,9 @@ class DueQueue(Generic[K]):
     def _rebuild(self) -> None:
         """Drop the void entries."""
         waiting = [(each, entry[_DUE]) for each, entry in self._entries.items() if entry[_DUE] != NEVER_S]
-        ranks = [each if self._is_sorted else next(self._order) for each, _ in waiting]
-        entries = zip(waiting, ranks, strict=True)
-        self._entries = {each: [due_s, rank, each, due_s] for (each, due_s), rank in entries}
+        ranked = enumerate(waiting, self._rank + 1)
+        self._entries = {each: [at_s, each if self._is_sorted else rank, each, at_s] for rank, (each, at_s) in ranked}
+        self._rank += len(waiting)
         self._heap = list(self._entries.values())
         heapq.heapify(self._heap)
 

@@ -47,7 +47,9 @@ class Backoff:
         """
         if tries > self.growing:
             return self.most_s
-        return min(max(estimate_s, self.first_s) * 2.0 ** (max(tries - 1, 0) // self.equal), self.most_s)
+        first_s = estimate_s if estimate_s > self.first_s else self.first_s
+        pause_s = first_s * 2.0 ** ((tries - 1 if tries else 0) // self.equal)
+        return pause_s if pause_s < self.most_s else self.most_s
 
     def after_s(self, pause_s: float) -> float:
         """Return the pause after one of this length."""

@@ -103,13 +103,16 @@ class AckNackHandler:
             reader.behind_s = None
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
-        reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
-        if sequence > ledger.last or acknack.sequence >= queue.sent_sequence:
+        reader.sequence = sequence if sequence > reader.sequence else reader.sequence
+        reader.lost = acknack.lost if acknack.lost > reader.lost else reader.lost
+        if sequence > ledger.last:
             return
-        sent, _ = queue.sent
-        is_stuck = now_s - reader.advanced_s >= READER.refresh_s
-        is_settled = queue.is_acknowledged or is_stuck or now_s - self._sent_frames.last_s > _SETTLED_S
-        if is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
+        if queue.is_acknowledged:
+            is_settled = acknack.next_number >= self._window.sent[0]
+        else:
+            is_stuck = now_s - reader.advanced_s >= READER.refresh_s
+            is_settled = is_stuck or now_s - self._sent_frames.last_s > _SETTLED_S
+        if is_settled and acknack.sequence < queue.sent_sequence:
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
 
     def poll_heartbeat(self, now_s: float, trip_s: float, paces: tuple[tuple[bytes, int], ...] = ()) -> bytes:
@@ -279,16 +282,16 @@ class AckNackHandler:
         reader, window, queue = self._readers.active[name], self._window, self._queue
         if acknack.missing:
             self.lose_ended(window.poll_cancelled(acknack))
-        oldest = queue.oldest
+        lacks_from = acknack.missing[0].number if acknack.missing and not is_new else acknack.next_number
+        is_gone = lacks_from not in window.cache.messages and lacks_from < queue.oldest
         if not (name in window.readers.active or name in window.readers.suspended) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before
+            oldest = queue.oldest
             if not is_new and acknack.next_number < oldest:
                 end = queue.ledger.begin_of(oldest, queue.first_waiting)
                 queue.ledger.give_up(acknack.sequence, end - 1)
             window.add_reader(name, min(max(acknack.next_number, oldest), queue.next_number), now_s)
         if name in window.readers.active or name in window.readers.suspended:
             window.handle_acknack(name, acknack, now_s, trip_s)
-        lacks_from = acknack.missing[0].number if acknack.missing and not is_new else acknack.next_number
-        is_gone = lacks_from < oldest
         if is_gone or (name in window.readers.suspended and not acknack.missing):
             self._heartbeats.is_reminder_wanted = True  # it requests what is gone, or does not know what it lacks

@@ -41,6 +41,7 @@ class AckNackSchedule:
         self.received = self.receipts = 0
         self.newest = (0, -1, due_s)
         self._unreported_bytes = 0
+        self._is_owed = False  # enough bytes came for a report
         self._total_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
         self._has_come = False  # something has, since the report before
@@ -58,6 +59,8 @@ class AckNackSchedule:
         """
         self._unreported_bytes += size
         self._total_bytes += size
+        if self._unreported_bytes >= _FIRST_BYTES:
+            self._is_owed = self._unreported_bytes >= self._owed_bytes()
         self.received += frames
         if samples:
             self.receipts += sum([seal for _, seal in samples])
@@ -67,7 +70,7 @@ class AckNackSchedule:
     def handle_run(self, now_s: float, *, is_in_order: bool) -> None:
         """Reschedule after fragments that followed each other, behind a gap or not."""
         pause_s = REPORT_PAUSE_S if is_in_order else REPORT_GAP_S
-        self.due_s = min(self.due_s, now_s if self._is_owed() else now_s + pause_s)
+        self.due_s = min(self.due_s, now_s if self._is_owed else now_s + pause_s)
 
     def handle_part(self, header: Header, highest: int, expected: int, now_s: float) -> None:
         """Reschedule after a new fragment.
@@ -78,13 +81,13 @@ class AckNackSchedule:
         """
         number, data = header.number, self._data
         if header.parts == 1 and number == highest + 1 == expected and self.due_s <= now_s + REPORT_DELAY_S:
-            if self._is_owed():
+            if self._is_owed:
                 self.due_s = now_s
             return  # a complete message in order changes nothing else
         is_next = number == highest or (number == highest + 1 and (highest < expected or data.is_finished(highest)))
         is_done = header.parts == 1 or data.is_finished(number)
         is_in_order = is_next and (is_done or header.part == data.progress(number) - 1)
-        if self._is_owed():
+        if self._is_owed:
             due_s = now_s
         elif not is_in_order:
             due_s = now_s + REPORT_GAP_S
@@ -96,7 +99,7 @@ class AckNackSchedule:
         """Count all received bytes as reported."""
         self._clean_bytes += self._unreported_bytes
         self._has_come = self._unreported_bytes > 0
-        self._unreported_bytes = 0
+        self._unreported_bytes, self._is_owed = 0, False
 
     def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
         """Schedule the report after one that is sent now: ever later while something is missing and nothing comes."""
@@ -105,14 +108,12 @@ class AckNackSchedule:
             self._clean_bytes = 0
         self.due_s = now_s + (_MISSING.pause_s(self._requests) if is_missing else self.idle_s)
 
-    def _is_owed(self) -> bool:
-        """Return whether enough bytes came for a report; the threshold grows while nothing is missing.
+    def _owed_bytes(self) -> int:
+        """Return the bytes for which a report is owed; they grow while nothing is missing.
 
         A writer's congestion window has grown by what was reported since the last loss, and must never run empty. At
         first the writer knows nothing of the path, and two frames are enough.
         """
-        if self._unreported_bytes < _FIRST_BYTES:
-            return False
         first_bytes = max(self._total_bytes // 8, _FIRST_BYTES)
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
-        return self._unreported_bytes >= min(first_bytes, every_bytes)
+        return min(first_bytes, every_bytes)

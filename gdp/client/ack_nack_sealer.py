@@ -104,11 +104,10 @@ class AckNackSealer:
         Raises:
             KeyError: there is no secret of that epoch.
         """
-        sealer = self._sealers.get(epoch)
-        if sealer is None:
+        if epoch not in self._sealers:
             key = control_key(self._shared, self._secrets[epoch], *self._context(Kind.ACKNACK))
-            sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)
-        return sealer
+            self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)
+        return self._sealers[epoch]
 
     def _introduction(self, epoch: int) -> list[bytes]:
         """Return the frames that prove the sender of these reports, sealed under the secret of an epoch."""

@@ -371,11 +371,6 @@ class Attachment:
             return self._requests.poll_due(now_s)
         return [self._own.key] if self._requests.due_s(self._own.key) <= now_s else []
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, the frames to send."""
-        out, self.outgoing = self.outgoing, []
-        return out
-
     def _choose_switch(self, now_s: float) -> None:
         """Attach to the switch over the cheapest link; a new or restarted one receives every advertisement."""
         switches = [each for each in self.hello_protocol.neighbours.all_up() if each.role.is_switch]

@@ -105,7 +105,7 @@ class BestEffortQueue:
             count = len(taken)
             limit -= count
             self._part += count
-            if self._part == len(oldest):
+            if self._part == oldest.parts:
                 self._let_oldest_go()
         return frames
 

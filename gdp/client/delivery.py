@@ -157,12 +157,14 @@ class Delivery:
     def add(self, reassembled: ReassembledMessage, now_s: float) -> None:
         """Order a complete message, and deliver the consecutive ones."""
         number = reassembled.number
-        skips = not self.is_reliable and self._lag_s() <= 0 and number < self._late.hold((), now_s)
-        if self.is_live and (skips or number == self.expected):
+        is_next = number == self.expected or (
+            not self.is_reliable and self._lag_s() <= 0 and number < self._late.hold((), now_s)
+        )
+        if self.is_live and is_next:
             if number > self.expected:
                 self._skip_to(number)
             self._unpack(reassembled)
-            self.expected = number + 1
+            self.expected, self._late.hold_s = number + 1, NEVER_S
             if self._waiting:
                 self._deliver(now_s)
             else:

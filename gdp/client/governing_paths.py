@@ -153,7 +153,7 @@ class GoverningPaths:
     def note_idle(self) -> None:
         """Note that nothing waits, though the paths may permit more."""
         for path in self._governing():
-            path.note_idle()
+            path.controller.app_limited()
 
     @property
     def bytes_s(self) -> float | None:

@@ -33,6 +33,7 @@ class HeartbeatSchedule:
         wanted: a Heartbeat has to be sent.
         is_reminder_wanted: ... once a round trip has passed since the last one.
         starts: new readers, and where they begin.
+        again_s: monotonic second at which the description is sent again; infinity: never.
     """
 
     def __init__(self, description: bytes, number: int) -> None:
@@ -41,7 +42,7 @@ class HeartbeatSchedule:
         self.starts: dict[bytes, StreamStart] = {}
         self._description = description
         self._said = len(_PAUSES_S) + 1  # times that the description was sent; beyond the last it is not new
-        self._again_s = NEVER_S  # when the description is sent again
+        self.again_s = NEVER_S
         self._at_s = self._remind_s = -NEVER_S  # when the next Heartbeat, and the next reminder, may be sent
 
     def describe(self, description: bytes) -> bool:
@@ -59,11 +60,11 @@ class HeartbeatSchedule:
 
     def handle_timer(self, now_s: float) -> None:
         """Request another Heartbeat if the description is to be repeated now."""
-        self.wanted |= self._again_s <= now_s
+        self.wanted |= self.again_s <= now_s
 
     def get_timer(self) -> float:
         """Return the monotonic second at which a Heartbeat may be sent or will be wanted; infinity: never."""
-        at_s = self._at_s if self.wanted else self._again_s
+        at_s = self._at_s if self.wanted else self.again_s
         return min(at_s, self._remind_s) if self.is_reminder_wanted else at_s
 
     def is_due(self, now_s: float) -> bool:
@@ -80,7 +81,7 @@ class HeartbeatSchedule:
         is_news = self._said <= len(_PAUSES_S)
         about = self._description if self.starts or is_news else b""
         if is_news:
-            self._again_s = now_s + _PAUSES_S[self._said] if self._said < len(_PAUSES_S) else NEVER_S
+            self.again_s = now_s + _PAUSES_S[self._said] if self._said < len(_PAUSES_S) else NEVER_S
             self._said += 1
         wire = place._replace(starts=dict(self.starts), description=about).to_wire()
         self.starts.clear()

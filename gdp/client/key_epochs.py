@@ -31,6 +31,7 @@ class KeyEpochs:
 
     Attributes:
         epoch: the newest.
+        secret: its secret.
         data: seals messages.
         status: seals Heartbeats.
 
@@ -42,14 +43,9 @@ class KeyEpochs:
         self._topic = topic
         self._writer = writer
         self._address = address
-        self._secrets = _checked(secrets)
+        self.secret = b""
         self._former = (-1, b"", _NEVER)  # the epoch before, its secret, and until when readers use it
-        self._use(max(secrets))
-
-    @property
-    def secret(self) -> bytes:
-        """Return the secret of the newest epoch."""
-        return self._secrets[self.epoch]
+        self._use(_checked(secrets))
 
     def renew(self, secrets: Secrets, now_s: float) -> bool:
         """Replace the secrets; return whether there is a new epoch, which seals from now on.
@@ -58,11 +54,11 @@ class KeyEpochs:
             LocalError: there is no secret.
         """
         former = self.epoch, self.secret, now_s + EPOCH_GRACE_S
-        self._secrets = _checked(secrets)
-        if max(secrets) == self.epoch:
+        if max(_checked(secrets)) == self.epoch:
+            self.secret = secrets[self.epoch]
             return False
         self._former = former
-        self._use(max(secrets))
+        self._use(secrets)
         return True
 
     def secret_of(self, epoch: int, now_s: float) -> bytes:
@@ -78,8 +74,9 @@ class KeyEpochs:
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
         return secret
 
-    def _use(self, epoch: int) -> None:
-        self.epoch = epoch
+    def _use(self, secrets: Secrets) -> None:
+        self.epoch = max(secrets)
+        self.secret = secrets[self.epoch]
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
         self._parity: ParitySealer | None = None
@@ -129,11 +126,10 @@ class Openers:
 
     def opener(self, kind: Kind, epoch: int) -> Opener:
         """Return the opener of messages or Heartbeats. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""
-        opener = self._openers.get((kind, epoch))
-        if opener is None:
+        if (kind, epoch) not in self._openers:
             secret = self._secret(epoch)
-            opener = self._openers[kind, epoch] = Opener(secret, kind, *self._ends, is_signed=self._is_signed)
-        return opener
+            self._openers[kind, epoch] = Opener(secret, kind, *self._ends, is_signed=self._is_signed)
+        return self._openers[kind, epoch]
 
     def parity(self, epoch: int) -> ParityOpener:
         """Return the opener of parity frames. Raises ``EnvelopeError``: UNKNOWN_EPOCH."""

@@ -298,7 +298,6 @@ class Participant:
         """Process the timers that are due."""
         if self._control.has_changed or now.mono_s >= self._control.early_s:
             self._control.handle_timer(now)
-        self._clock.advance(now.mono_s)
         self.publications.handle_timer(now.mono_s)
         self._reception.handle_timer(now.mono_s)
         self.flush(now.mono_s)
@@ -306,10 +305,10 @@ class Participant:
     def flush(self, now_s: float) -> None:
         """Pass frames and reports that are ready to the switch."""
         switch, scheduler = self.attachment.switch, self._scheduler
-        if switch is None:
-            return
         if now_s != self._clock.now_s:
             self._clock.advance(now_s)
+        if switch is None:
+            return
         if switch is not self._sent_by:
             self._sent_by = switch
             self.publications.attachment_changed(now_s)
@@ -326,9 +325,14 @@ class Participant:
         due_s = self._control.due_s
         if self.attachment.switch is None:  # nothing can be sent: hellos alone are due
             return due_s
-        timers, own_s = self._reception.timers, self.publications.next_due()
-        read_s = timers.next_due() if timers.touched else timers.due_s
-        own_s = own_s if own_s < read_s else read_s
+        publications, reading = self.publications, self._reception.timers
+        writing, own_s = publications.timers, publications.reader_paths.due_s
+        writing_s = writing.next_due() if writing.touched else writing.due_s
+        reading_s = reading.next_due() if reading.touched else reading.due_s
+        for each_s in (writing_s, reading_s, self._scheduler.due_s):
+            own_s = each_s if each_s < own_s else own_s
+        for requests in publications.holding:
+            own_s = min(own_s, requests.get_timer())
         self.offload.urgent_s = own_s
         return own_s if due_s is None or own_s < due_s else due_s
 
@@ -351,11 +355,15 @@ class Participant:
             self.publications.release_requests(now_s)
         if not attachment.outgoing and (self._scheduler.is_ready or self._reception.reporting):
             self.flush(now_s)
-        return attachment.frames_to_send() if attachment.outgoing else []
+        frames, attachment.outgoing = attachment.outgoing, []
+        return frames
 
     def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: sealing them took time."""
-        self.publications.frames_sent(now_s)
+        if self._scheduler.uncounted is not None:
+            self._scheduler.count_sent()
+        if self.publications.reader_paths.leaving:
+            self.publications.reader_paths.frames_sent(now_s)
 
     def poll_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each writer proxy."""

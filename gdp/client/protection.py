@@ -50,6 +50,7 @@ class Protection:
         copies: of urgent frames.
         parity: parity frames of large messages.
         has_more: the last ``poll_frames`` reached its limit.
+        entered: changes of the readers when frames were last entered.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Protection:
         self.parity = ParitySender(keys=keys, budget=source.parity, is_enabled=self._has_one_path and fec)
         self._striper = Striper() if settings.paths == SPREAD else None
         self._loss: float | None = None  # of frames, where parity may save time
+        self.entered = -1
         self.has_more = False
 
     @property
@@ -143,8 +145,9 @@ class Protection:
             if parity.waiting:
                 self.has_more = left <= len(parity.waiting)
                 after = parity.poll_frames(max(left, 0))
-            if not is_doubled:
+            if not is_doubled and (sent or self.entered != self._readers.changes):
                 self._sent_frames.leaving = sent, paths.confirming(sent, again), now_s, again
+                self.entered = self._readers.changes
             if paths.limit_bytes_s is not None:
                 paths.charge_limit(chain(before, sent, after), now_s)
         frames = heartbeats + before + sent + after

@@ -40,6 +40,9 @@ class Publications:
     Attributes:
         requests: to the servers of each name that is called.
         holding: those of them with copies that have not begun.
+        timers: of the publishers.
+        reader_paths: to the readers of all of them.
+        scheduler: the order in which they send.
     """
 
     def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
@@ -51,9 +54,9 @@ class Publications:
         self.holding: dict[RequestStreams, None] = {}
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
-        self._timers = TimerQueue[Publisher]()
-        self._reader_paths = ReaderPaths()
-        self.scheduler = SendScheduler(self._timers.reschedule)
+        self.timers = TimerQueue[Publisher]()
+        self.reader_paths = ReaderPaths()
+        self.scheduler = SendScheduler(self.timers)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
 
@@ -100,7 +103,7 @@ class Publications:
             description=description,
             settings=settings,
             past=self._sequence_registry.of(name),
-            reader_paths=self._reader_paths,
+            reader_paths=self.reader_paths,
         )
         publisher.published = self.scheduler.add
         self._publishers[name] = publisher
@@ -108,7 +111,7 @@ class Publications:
 
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
-        public, paths_to = self._publishers[name], self._reader_paths
+        public, paths_to = self._publishers[name], self.reader_paths
         self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to, self.holding)
         self._private[name] = UnicastStreams(
             service=name,
@@ -117,7 +120,7 @@ class Publications:
             sequence_registry=self._sequence_registry,
             published=self.scheduler.add,
             settings=replace(settings, patience=TOPICS),
-            reader_paths=self._reader_paths,
+            reader_paths=self.reader_paths,
         )
 
     def remove(self, name: Name) -> bool:
@@ -186,7 +189,7 @@ class Publications:
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
         publisher.receive_acknack(header, frame, now_s, waited_s)
-        self.scheduler.add(publisher)  # with it those that wait for the same path
+        self.scheduler.handle_report(publisher, now_s)
 
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
@@ -204,38 +207,21 @@ class Publications:
 
     def handle_timer(self, now_s: float) -> None:
         """Process the timers that are due."""
-        timers = self._timers
+        timers = self.timers
         for publisher in timers.poll_due(now_s) if timers.touched or now_s >= timers.due_s else ():
             publisher.handle_timer(now_s)
             self.scheduler.add(publisher)
         for streams in self._private.values() if self._private else ():
             streams.forget_idle(now_s)
-        if now_s >= self._reader_paths.due_s and self._reader_paths.handle_timer(now_s):
+        if now_s >= self.reader_paths.due_s and self.reader_paths.handle_timer(now_s):
             self.scheduler.resume()
         if self.holding:
             self.release_requests(now_s)
 
-    def frames_sent(self, now_s: float) -> None:
-        """Count the frames polled last, which left at ``now_s``."""
-        if self.scheduler.uncounted is not None:
-            self.scheduler.count_sent()
-        if self._reader_paths.leaving:
-            self._reader_paths.frames_sent(now_s)
-
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
-        self._reader_paths.attachment_changed(now_s)
+        self.reader_paths.attachment_changed(now_s)
         self.scheduler.resume()
-
-    def next_due(self) -> float:
-        """Return the monotonic second of the next timer; infinity: none."""
-        timers = self._timers
-        due_s = timers.next_due() if timers.touched else timers.due_s
-        for each_s in (self._reader_paths.due_s, self.scheduler.due_s):
-            due_s = each_s if each_s < due_s else due_s
-        for requests in self.holding:
-            due_s = min(due_s, requests.get_timer())
-        return due_s
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

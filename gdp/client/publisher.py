@@ -32,7 +32,7 @@ from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import SECOND_PATH, Header
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES, PACE_MAX, SPREAD, WINDOW_BYTES
-from gdp.message.acknack import AckNack, AckNackFlag
+from gdp.message.acknack import AckNackFlag
 from gdp.message.bundle import BUNDLE_BYTES
 from gdp.message.loss import LossReason
 from gdp.message.send_window import SendWindow
@@ -152,6 +152,14 @@ class Publisher:
         queue = self.queue
         is_read = self.matched.active or (queue.is_acknowledged and self._window.readers.suspended)
         return queue.mtu is not None and bool(is_read)
+
+    @property
+    def has_work(self) -> bool:
+        """Return whether ``poll_frames`` may return frames, or has to drop some."""
+        window, heartbeats, protection = self._window, self._heartbeats, self.protection
+        is_changed = protection.entered != self.matched.changes or heartbeats.wanted or heartbeats.is_reminder_wanted
+        is_held = self._fastest_governs or self.governing_paths.paces.slowing.blocks or protection.late.messages
+        return bool(is_changed or is_held or not self.queue.is_empty or (window.cache.messages and window.has_frames))
 
     @property
     def confirms(self) -> bool:
@@ -317,7 +325,11 @@ class Publisher:
         if self.sent_frames.handle_report(source, report, now_s, waited_s, hops):
             self.drops[DropReason.UNPROVEN] += 1
         self.protection.handle_report(source, report, now_s, is_new=is_new)
-        self._handle_pace(source, report, now_s)
+        paces, is_paced = self.governing_paths.paces, report.flags is AckNackFlag.PACED
+        if is_paced or paces.stated or paces.given:
+            # a Heartbeat gives it another pace than it has stated to its switch, if it is to have one
+            is_moved = paces.handle_report(source, report.share if is_paced else PACE_MAX, now_s)
+            self._heartbeats.is_reminder_wanted |= is_moved
         if self._fastest_governs:
             self._window.governing = next(iter(self.governing_paths.fastest()), None)
         path = self._node_paths.get(source) if report.missing else None  # repairs alone need its round trip
@@ -327,12 +339,6 @@ class Publisher:
             self.protection.request_late(source, report, now_s)
         self._heartbeats.is_reminder_wanted |= is_old  # it has not received the new epoch yet
         return True
-
-    def _handle_pace(self, reader: bytes, report: AckNack, now_s: float) -> None:
-        """Note the pace that a reader has stated to its switch; a Heartbeat gives it another, if it is to have one."""
-        paces, is_paced = self.governing_paths.paces, report.flags is AckNackFlag.PACED
-        if paces.handle_report(reader, report.share if is_paced else PACE_MAX, now_s):
-            self._heartbeats.is_reminder_wanted = True
 
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
@@ -350,16 +356,18 @@ class Publisher:
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer; infinity: none."""
-        protection, blocking = self.protection, self.governing_paths.blocking
-        due_s = self._awaits_until_s
+        protection, blocking, heartbeats = self.protection, self.governing_paths.blocking, self._heartbeats
+        due_s = self.matched.next_silent()
+        due_s = due_s if due_s < self._awaits_until_s else self._awaits_until_s
         if protection.late.messages or blocking.blocks:
             due_s = min(
                 due_s, protection.late.get_timer(), blocking.get_timer(), self.governing_paths.paces.slowing.get_timer()
             )
-        for each_s in (self._window.get_timer(), self.matched.next_silent()):
-            due_s = each_s if each_s < due_s else due_s
+        if self.queue.is_acknowledged and (window_s := self._window.get_timer()) < due_s:
+            due_s = window_s
         if self.matched.active and self.queue.mtu is not None:
-            for each_s in (self._heartbeats.get_timer(), protection.copies.due_s):
+            is_wanted = heartbeats.wanted or heartbeats.is_reminder_wanted
+            for each_s in (heartbeats.get_timer() if is_wanted else heartbeats.again_s, protection.copies.due_s):
                 due_s = each_s if each_s < due_s else due_s
         return due_s
 
@@ -384,7 +392,7 @@ class Publisher:
         if queue.deferred.waiting:
             queue.seal_deferred()
         if not queue.is_acknowledged:
-            queue.bytes_s = self.governing_paths.bytes_s
+            queue.bytes_s = None if queue.options.deadline_s is None else self.governing_paths.bytes_s
             self._heartbeats.is_reminder_wanted |= queue.drop_expired(now_s)
         heartbeats: list[bytes] = []
         schedule = self._heartbeats
@@ -394,8 +402,9 @@ class Publisher:
             heartbeats = self._keys.status.seal(schedule.number, queue.flags, wire, mtu)[:]
         frames = self.protection.poll_frames(now_s, limit_bytes, heartbeats)
         self.has_more = self.protection.has_more
-        if queue.is_empty:
-            self.governing_paths.paces.slowing.blocks.clear()  # all that is published leaves in time
-        elif self.has_more and len(self.matched.active) > 1:
+        slowing = self.governing_paths.paces.slowing
+        if self.has_more and len(self.matched.active) > 1 and not queue.is_empty:
             self.governing_paths.record_waiting(sum(map(len, frames)), now_s)
+        elif slowing.blocks and queue.is_empty:
+            slowing.blocks.clear()  # all that is published leaves in time
         return frames

@@ -47,6 +47,7 @@ class ReaderPaces:
 
     Attributes:
         stated: by reader, what its latest report says; readers that get everything are not in it.
+        given: by reader, what it was given.
         slowing: readers that hold back others, while messages wait all the time.
         withheld: count of messages that were not for every reader.
         is_under_way: returns whether frames of this topic are under way to a reader.
@@ -56,7 +57,7 @@ class ReaderPaces:
         self._paths = paths
         self.is_under_way: Callable[[bytes], bool] = lambda _name: True
         self.stated: dict[bytes, int] = {}
-        self._given: dict[bytes, _Given] = {}
+        self.given: dict[bytes, _Given] = {}
         self._begun: dict[bytes, int] = {}  # bytes of messages that begin now
         self.slowing = BlockingReaders(_SLOWED_REPORTS * REPORT_DELAY_S, most=_ALL, progress_bytes=float("inf"))
         self.withheld = 0
@@ -74,7 +75,7 @@ class ReaderPaces:
             self.stated[name] = pace
         elif self.stated:
             self.stated.pop(name, None)
-        given = self._given.get(name)
+        given = self.given.get(name)
         if given is None or (path := self._paths.get(name)) is None:
             return pace != PACE_MAX
         model = path.controller.model
@@ -123,19 +124,19 @@ class ReaderPaces:
 
     def to_state(self) -> tuple[tuple[bytes, int], ...]:
         """Return the readers that are to state another pace to their switches."""
-        new = [(name, each.pace) for name, each in self._given.items() if each.pace != self._pace(name)]
-        new += [(name, PACE_MAX) for name in self.stated if name not in self._given]
+        new = [(name, each.pace) for name, each in self.given.items() if each.pace != self._pace(name)]
+        new += [(name, PACE_MAX) for name in self.stated if name not in self.given]
         return tuple(new[:PACES_MAX])
 
     def take_back(self) -> None:
         """Take back what was given: all readers are to get everything."""
-        self._given.clear()
+        self.given.clear()
 
     def keep(self, names: Iterable[bytes]) -> None:
         """Forget all readers but these."""
-        gone = (self._given.keys() | self.stated.keys()) - set(names)
+        gone = (self.given.keys() | self.stated.keys()) - set(names)
         for name in gone:
-            self._given.pop(name, None)
+            self.given.pop(name, None)
             self.stated.pop(name, None)
 
     def begin_turn(self) -> None:
@@ -163,11 +164,11 @@ class ReaderPaces:
         return lowest
 
     def _give(self, name: bytes, now_s: float) -> bool:
-        path, given = self._paths.get(name), self._given.get(name)
+        path, given = self._paths.get(name), self.given.get(name)
         if path is None or not path.controller.model.bytes_s:
             return False
         if given is None:
-            given = self._given[name] = _Given(PACE_MAX, now_s)
+            given = self.given[name] = _Given(PACE_MAX, now_s)
         if given.pace < PACE_MAX or now_s < given.governs_until_s:
             return False
         given.pace, given.since_s = pace_of(path.controller.model.bytes_s), now_s

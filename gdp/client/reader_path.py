@@ -98,11 +98,6 @@ class ReaderPath:
         next_s = self.controller.next_send_s(self.mtu)
         return NEVER_S if next_s is None else next_s
 
-    def note_idle(self) -> None:
-        """Note that nothing waits, though more might leave."""
-        if self.controller.rate.inflight < self.controller.limit:
-            self.controller.app_limited()
-
     def sent(self, size: int, frames: int, now_s: float) -> Flight:
         """Count frames that leave at once; return the flight as which they are confirmed."""
         if not self.controller.rate.inflight:
@@ -261,13 +256,12 @@ class ReaderPaths:
 
     def path(self, reader: bytes, now_s: float) -> ReaderPath:
         """Return the path to a reader node; a new one begins without knowledge."""
-        path = self._paths.get(reader)
-        if path is None:
-            path = self._paths[reader] = ReaderPath(self._mtu, now_s)
+        if reader not in self._paths:
+            self._paths[reader] = ReaderPath(self._mtu, now_s)
             self.changes += 1
         if self.due_s == NEVER_S:
             self.due_s = now_s + PACE_S
-        return path
+        return self._paths[reader]
 
     def get(self, reader: bytes) -> ReaderPath | None:
         """Return the path to a reader node, or None."""
@@ -336,16 +330,16 @@ class ReaderPaths:
         """Let silent paths start again, and forget unused ones; return whether any may carry more now."""
         if now_s < self.due_s:
             return False
-        before = sum(path.is_silent for path in self._paths.values())
-        timed_out = False
+        may_more, self.due_s = False, NEVER_S
         for reader, path in list(self._paths.items()):
-            inflight = path.controller.rate.inflight
+            inflight, was_silent = path.controller.rate.inflight, path.is_silent
             path.handle_timer(now_s)
-            timed_out |= path.controller.rate.inflight < inflight or path.may_probe
-            if path.is_unused(now_s):
+            may_more |= path.controller.rate.inflight < inflight or path.may_probe or path.is_silent is not was_silent
+            if path.controller.rate.inflight:
+                self.due_s = now_s + PACE_S
+            elif path.is_unused(now_s):
+                may_more |= path.is_silent
                 del self._paths[reader]
                 self._started.pop(reader, None)
                 self.changes += 1
-        is_awaiting = any(path.controller.rate.inflight for path in self._paths.values())
-        self.due_s = now_s + PACE_S if is_awaiting else NEVER_S
-        return timed_out or before != sum(path.is_silent for path in self._paths.values())
+        return may_more

@@ -111,4 +111,4 @@ class Reception:
             if goodbye:
                 self._send(notes)
             self.reporting.pop(writer_proxy, None)
-            self.timers.reschedule(writer_proxy)
+            self.timers.touched[writer_proxy] = None

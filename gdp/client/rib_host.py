@@ -112,7 +112,8 @@ class RibHost:
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
         del now_s  # nothing here is paced
-        return self.attachment.frames_to_send()
+        frames, self.attachment.outgoing = self.attachment.outgoing, []
+        return frames
 
     def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""

@@ -27,11 +27,12 @@ from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
 from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
-from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
+from gdp.message.bundle import BUNDLE_BYTES, LENGTH_BYTES, SMALL, Gathered, pack
 from gdp.message.ledger import Ledger
 from gdp.message.loss import LossReason
 from gdp.message.renumbering import MOVES_MAX, Renumbering
 from gdp.message.send_window import SendWindow
+from gdp.sansio import new_tuple
 
 _BUNDLE: Final = int(Flag.BUNDLE)
 _PARITY: Final = int(Flag.PARITY)
@@ -60,7 +61,7 @@ class SendQueue:
         bundle_bytes: largest bundle; 0: each message has a seal of its own.
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
-        bytes_s: bytes of frames per second that this topic may send now; None: unknown.
+        bytes_s: bytes of frames per second that this topic may send now; None: unknown, or there is no deadline.
         pace_of: returns the pace of a best-effort message of so many bytes that begins to leave.
         has_parity: messages sealed from now on leave space for parity frames, and announce them.
     """
@@ -165,7 +166,7 @@ class SendQueue:
         if self.deferred.waiting:
             self.seal_deferred()
         most = most if most < self.bundle_bytes else self.bundle_bytes
-        if self.depth or not gathered.is_small(len(head) + len(message), most):
+        if self.depth or SMALL * (len(head) + len(message) + LENGTH_BYTES) > most:
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1, added_s=added_s, head=head)
             self.ledger.next(added_s)
@@ -250,7 +251,7 @@ class SendQueue:
         window, best_effort, messages = self._window, self._best_effort, self._gathered.messages
         left = limit if limit > 0 else 1
         frames = best_effort.poll_frames(left, self.pace_of) if best_effort.waiting else []
-        if not messages or window.has_frames:
+        if window.cache.messages and (not messages or window.has_frames):
             frames += window.frames_to_send(now_s, max(left - len(frames), 1) if frames else left)
         while messages:
             left = limit - len(frames) if frames else limit
@@ -309,7 +310,7 @@ class SendQueue:
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        most = min(self.bundle_bytes, self._frame_capacity)
+        most = self._frame_capacity if self._frame_capacity < self.bundle_bytes else self.bundle_bytes
         first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(most)
         count = len(together)
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
@@ -324,7 +325,7 @@ class SendQueue:
         frames = self._seal(number, body, self.mtu, is_bundle=messages > 1, prefix=prefix)
         self.next_number += 1
         if not self.is_acknowledged:
-            for dropped in self._best_effort.add(frames, Carried(number, sequence, messages, added_s)):
+            for dropped in self._best_effort.add(frames, new_tuple(Carried, (number, sequence, messages, added_s))):
                 self._lose(dropped.sequence, dropped.messages, DropReason.MEMORY_FULL, LossReason.QUEUE_OVERFLOW)
             return
         ledger.put(number, sequence, messages)

@@ -11,10 +11,10 @@ section 4 (new and old queues).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 from gdp.client.publisher import Publisher
+from gdp.client.timer_queue import TimerQueue
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES
 
@@ -28,7 +28,7 @@ class SendScheduler:
     """Publishers with frames to send; urgent ones first, the others in turn.
 
     Args:
-        asked: called with each publisher whose frames were polled.
+        timers: of the publishers; polling frames touches them.
 
     Attributes:
         is_ready: some publisher waits, and the paths hold it back no longer.
@@ -36,8 +36,8 @@ class SendScheduler:
         uncounted: the only publisher, whose frames leave before they are counted; else None.
     """
 
-    def __init__(self, asked: Callable[[Publisher], None]) -> None:
-        self._asked = asked
+    def __init__(self, timers: TimerQueue[Publisher]) -> None:
+        self._timers = timers
         self._urgent: dict[Publisher, None] = {}
         self._new: dict[Publisher, None] = {}  # had nothing to send before
         self._ordinary: dict[Publisher, int] = {}  # with the bytes left of its round; the one whose turn it is first
@@ -58,6 +58,15 @@ class SendScheduler:
             self._urgent[publisher] = None
         elif publisher not in self._ordinary:
             self._new[publisher] = None
+
+    def handle_report(self, publisher: Publisher, now_s: float) -> None:
+        """Note that a reader reported: its publisher may have frames, and others may wait for the same path."""
+        is_waiting = self._urgent or self._new or self._ordinary or self.uncounted is not None
+        if is_waiting or publisher.has_work or publisher.governing_paths.allowance(now_s) <= 0:
+            self.add(publisher)
+        else:
+            self.uncounted, self._is_idle = publisher, True
+            self._timers.touched[publisher] = None
 
     def resume(self) -> None:
         """Note that paths may permit more than before."""
@@ -98,7 +107,7 @@ class SendScheduler:
         publisher.governing_paths.share = 1.0
         allowance = publisher.governing_paths.allowance(now_s)
         frames = publisher.poll_frames(now_s, allowance if allowance < self._at_once else self._at_once)
-        self._asked(publisher)
+        self._timers.touched[publisher] = None
         self.uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
         self._new = {}
         if self._is_idle:
@@ -182,7 +191,7 @@ class SendScheduler:
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
         publisher.sent_frames.count()
-        self._asked(publisher)
+        self._timers.touched[publisher] = None
         if limit_bytes > 0 and not publisher.has_more and len(self._ordinary) + len(self._urgent) + len(self._new) == 1:
             publisher.governing_paths.note_idle()  # the path could carry more than there is
         return frames

@@ -14,9 +14,10 @@ Each frame is entered once, when it leaves. What a report shows of it is handed 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final
 
 from gdp import burst
@@ -77,7 +78,7 @@ class SentFrames:
         self.last_s = float("-inf")
         self._readers: dict[bytes, _Reader] = {}
         self._count = 0
-        self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
+        self._runs = defaultdict[int, list[_Run]](list)  # by message number; oldest first
         self._uncounted: dict[int, set[int]] = {}  # fragments sent again to several readers: they give no round trip
 
     @property
@@ -135,9 +136,9 @@ class SentFrames:
         self._count += count
         self._note_places(frames, before + 1, is_repair=is_repair)
         for name in names:
-            path, reader, place = paths.path(name, now_s), self._readers.get(name), before
-            if reader is None:
-                reader = self._readers[name] = _Reader(resolved=before)
+            if name not in self._readers:
+                self._readers[name] = _Reader(resolved=before)
+            path, reader, place = paths.path(name, now_s), self._readers[name], before
             if name in self._paces and frames[0][PACE_AT] > self._paces[name]:
                 reader.withheld.append((self._count, count))
                 continue
@@ -165,24 +166,18 @@ class SentFrames:
         if count > 1:
             last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
         if not is_repair and number == last_number and last_part - part == count - 1:  # of one message, in order
-            self._note_run(number, (part, last_part, place, False))
+            self._runs[number].append((part, last_part, place, False))
             return
         for each, frame in enumerate(frames, place):
             number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
-            self._note_run(number, (part, part, each, is_repair))
-
-    def _note_run(self, number: int, run: _Run) -> None:
-        if number in self._runs:
-            self._runs[number].append(run)
-        else:
-            self._runs[number] = [run]
+            self._runs[number].append((part, part, each, is_repair))
 
     def _find(self, number: int, part: int) -> tuple[int, bool]:
         """Return the count of frames sent up to a frame, 0 if not known any more, and whether it was sent again.
 
         A reader requests a frame when it would have come already. So of one that was sent again, the last one came.
         """
-        for first, last, place, is_repair in reversed(self._runs.get(number, ())):
+        for first, last, place, is_repair in reversed(self._runs[number]) if number in self._runs else ():
             if first <= part <= last:
                 return place + part - first, is_repair or part in self._uncounted.get(number, ())
         return 0, False
@@ -296,14 +291,15 @@ class SentFrames:
 
     def _forget_places(self) -> None:
         """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""
-        below = min([reader.resolved for reader in self._readers.values()] or [self._count])
-        gone, spare = list[int](), len(self._runs) - _MESSAGES_MAX
-        for number, runs in self._runs.items():
+        below, gone, spare = self._count, 0, len(self._runs) - _MESSAGES_MAX
+        for reader in self._readers.values():
+            below = reader.resolved if reader.resolved < below else below
+        for runs in self._runs.values():
             first, last, place, _ = runs[-1]
-            if place + last - first > below and len(gone) >= spare:
+            if place + last - first > below and gone >= spare:
                 break
-            gone.append(number)
-        for number in gone:
+            gone += 1
+        for number in [*islice(self._runs, gone)]:
             del self._runs[number]
             if self._uncounted:
                 self._uncounted.pop(number, None)

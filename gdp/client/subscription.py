@@ -130,9 +130,10 @@ class Subscription:
 
     def poll_messages(self, source: Name) -> list[Message]:
         """Return, once, the messages of one source; unicast ones only once the source has sent their description."""
-        writer_proxy, messages = self.writer_proxies.get(source), list[Message]()
-        if writer_proxy is None:
+        messages = list[Message]()
+        if source not in self.writer_proxies:
             return messages
+        writer_proxy = self.writer_proxies[source]
         topic, description = writer_proxy.topic, writer_proxy.description
         if writer_proxy.delivery.ready:
             for each in writer_proxy.delivery.poll():

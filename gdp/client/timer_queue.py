@@ -25,7 +25,7 @@ class TimerQueue(Generic[T]):
     """Timers of many objects.
 
     Attributes:
-        touched: those whose timers are read again, in order, so that a run is reproducible.
+        touched: those that may be due at another time than before, in order, so that a run is reproducible.
         due_s: as ``next_due``, while none is touched.
     """
 
@@ -33,10 +33,6 @@ class TimerQueue(Generic[T]):
         self.touched: dict[T, None] = {}
         self.due_s = NEVER_S
         self._queue = DueQueue[T]()
-
-    def reschedule(self, each: T) -> None:
-        """Note that an object may be due at another time than before."""
-        self.touched[each] = None
 
     def next_due(self) -> float:
         """Return the monotonic second at which the first is due; infinity: none is."""
@@ -53,5 +49,6 @@ class TimerQueue(Generic[T]):
         if self.next_due() > now_s:
             return []
         taken = self._queue.poll_due(now_s)
-        self.touched.update(dict.fromkeys(taken))
+        for each in taken:
+            self.touched[each] = None
         return taken

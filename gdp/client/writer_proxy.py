@@ -52,7 +52,7 @@ from gdp.message.receipts import RECEIPTS_MASK
 from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.message.striping import StripedPaths
 from gdp.names import Name
-from gdp.sansio import ReceivedFrame
+from gdp.sansio import ReceivedFrame, new_tuple
 from gdp.trust.advertisement import Advertisement
 
 ANNOUNCE_S: Final = 0.1
@@ -271,17 +271,17 @@ class WriterProxy:
         schedule.handle_reported(now_s, is_missing=bool(missing))
         schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
         expected = self.delivery.expected
-        part, sequence = self._data.progress(expected), self.delivery.sequence
+        part, sequence = self._data.progress(expected) if self._data.unfinished_bytes else 0, self.delivery.sequence
         share = 0 if self._striped is None else self._striped.poll_share()
         flags = AckNackFlag.NONE
         if self.pace < PACE_MAX:
             flags, share = AckNackFlag.PACED, self.pace
         newest, newest_part, came_s = schedule.newest
-        acknack = AckNack(
+        acknack = new_tuple(AckNack, (
             flags, expected, part, missing or late, sequence, self.losses.total, share,
             schedule.received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
             (self._data.frames - self.recovery.recovered) & FRAMES_MASK, schedule.receipts & RECEIPTS_MASK,
-        )  # fmt: skip
+        ))  # fmt: skip
         return self._over_paths(self._sealer.seal_all(acknack, now_s))
 
     def close(self) -> list[bytes]:

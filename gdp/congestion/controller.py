@@ -140,10 +140,11 @@ class PathController:
         return flight
 
     def app_limited(self) -> None:
-        """Report that nothing waits, though a frame might leave."""
+        """Report that nothing waits, though a frame might leave if the window has space."""
         rate = self.rate
-        rate.limited_until = rate.delivered + (rate.inflight or 1)  # what is under way, and what follows it
-        self.pace.is_paced = False
+        if rate.inflight < self.limit:
+            rate.limited_until = rate.delivered + (rate.inflight or 1)  # what is under way, and what follows it
+            self.pace.is_paced = False
 
     def acknowledged(
         self, flights: Iterable[Flight], now_s: float, *, held_s: float | None = 0.0, lost: int = 0
@@ -164,7 +165,7 @@ class PathController:
                 newest = flight
         if newest is None:
             return
-        self.confirmed_sent_s = max(self.confirmed_sent_s, newest.sent_s)
+        self.confirmed_sent_s = newest.sent_s if newest.sent_s > self.confirmed_sent_s else self.confirmed_sent_s
         if newest.sent_s < self._changed_s:  # it says nothing about this path
             self.rate.acknowledged(newest, size, now_s, 0.0)
             self._round_end = self.rate.delivered
@@ -264,7 +265,8 @@ class PathController:
         may_grow = not newest.is_app_limited and (self.state is State.STARTUP or 2 * newest.inflight >= self.window)
         if self.state is State.STARTUP:
             self.window += size if may_grow else 0
-            if self.model.queue_s >= min(max(self.model.base_rtt_s / 8, _ETA_S[0]), _ETA_S[1]):
+            queue_s = self.model.queue_s
+            if queue_s >= _ETA_S[0] and queue_s >= min(self.model.base_rtt_s / 8, _ETA_S[1]):
                 self._signal(Signal.PATH_FULL, now_s)
         elif self.state is State.DELAY:
             self._follow_delay(size, may_grow=may_grow)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from functools import lru_cache
-from operator import itemgetter
 from typing import Final, NoReturn, TypeAlias
 
 from gdp.errors import DropReason, LocalError, StatementError
@@ -33,7 +32,6 @@ _NAN: Final = b"\xf9\x7e\x00"
 _SHORT_HEADS: Final = tuple(bytes((initial,)) for initial in range(256))  # by initial byte
 _KEYS_MAX: Final = 1_024  # map keys whose other form is kept
 _SHORT_KEY_BYTES: Final = 24  # with the head, which then has the length
-_first: Final = itemgetter(0)
 
 
 def decode(wire: bytes, max_bytes: int = CONTROL_MAX_BYTES) -> Value:
@@ -46,7 +44,7 @@ def decode(wire: bytes, max_bytes: int = CONTROL_MAX_BYTES) -> Value:
         _refuse(f"{len(wire)} bytes, at most {max_bytes} allowed")
     reader = _Reader(wire)
     value = reader.item(0)
-    if reader.at != len(wire):
+    if reader.at != reader.size:
         _refuse("bytes after the end")
     return value
 
@@ -58,17 +56,17 @@ def _refuse(detail: str) -> NoReturn:
 class _Reader:
     """A cursor over the wire; ``items_left`` bounds the work, the depth argument bounds the stack."""
 
-    __slots__ = ("at", "items_left", "wire")
+    __slots__ = ("at", "items_left", "size", "wire")
 
     def __init__(self, wire: bytes) -> None:
-        self.wire = wire
+        self.wire, self.size = wire, len(wire)
         self.at = 0
         self.items_left = ITEMS_MAX
 
     def item(self, depth: int) -> Value:
         """Read the item at the cursor; ``depth`` counts the containers around it."""
-        wire, at = self.wire, self.at
-        if at >= len(wire):
+        wire, size, at = self.wire, self.size, self.at
+        if at >= size:
             _refuse("ends within an item")
         self.items_left -= 1
         if self.items_left < 0:
@@ -79,13 +77,13 @@ class _Reader:
         major = initial >> 5
         argument = initial & 0x1F
         at += 1
-        if argument == 24 and at < len(wire) and wire[at] >= 24:  # the usual length of a name or a key
+        if argument == 24 and at < size and wire[at] >= 24:  # the usual length of a name or a key
             argument, at = wire[at], at + 1
         elif argument >= 24:
             argument, at = self._long_argument(argument, at)
         if 2 <= major <= 3:
             end = at + argument
-            if end > len(wire):
+            if end > size:
                 _refuse("ends within a string")
             self.at = end
             return wire[at:end] if major == 2 else _text(wire[at:end])
@@ -98,16 +96,16 @@ class _Reader:
             _refuse("a tag inside")
         if depth >= CBOR_DEPTH_MAX:
             _refuse(f"nested deeper than {CBOR_DEPTH_MAX}")
-        if argument > len(wire) - at:
+        if argument > size - at:
             _refuse("ends within a container")
         if major == 4:
             return [self.item(depth + 1) for _ in range(argument)]
         return self._map(argument, depth + 1)
 
     def _map(self, pairs: int, depth: int) -> dict[str, Value]:
-        wire = self.wire
+        wire, size = self.wire, self.size
         result: dict[str, Value] = {}
-        previous, size = b"", len(wire)
+        previous = b""
         for _ in range(pairs):
             start = self.at
             end = start + wire[start] - 0x60 + 1 if start < size else 0
@@ -132,7 +130,7 @@ class _Reader:
             _refuse("an indefinite or reserved length")
         width = 1 << (info - 24)
         end = at + width
-        if end > len(self.wire):
+        if end > self.size:
             _refuse("ends within a head")
         argument = int.from_bytes(self.wire[at:end], "big")
         if argument < (24 if width == 1 else 1 << (4 * width)):
@@ -217,9 +215,9 @@ def _write(value: object, pieces: list[bytes], depth: int) -> None:
             _write(item, pieces, depth + 1)
     elif isinstance(value, dict | Mapping):  # the usual kind first
         pieces.append(_head(5, len(value)))
-        for key, item in sorted(((_key(key), item) for key, item in value.items()), key=_first):
-            pieces.append(key)
-            _write(item, pieces, depth + 1)
+        for key in sorted(value, key=_key):
+            pieces.append(_key(key))
+            _write(value[key], pieces, depth + 1)
     else:
         raise LocalError(f"cannot be written as CBOR: {type(value).__name__}")
 

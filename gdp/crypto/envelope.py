@@ -214,7 +214,7 @@ class Sealer:
 
 
 class Sealed(Sequence[bytes]):
-    """The frames of one message, sealed in order and on request; always the same bytes."""
+    """The frames of one message, ``parts`` of them, sealed in order and on request; always the same bytes."""
 
     def __init__(
         self,
@@ -231,7 +231,7 @@ class Sealed(Sequence[bytes]):
         self._cipher = cipher
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
-        self._head, self._parts, self._prefix = head, parts, prefix
+        self._head, self.parts, self._prefix = head, parts, prefix
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
         if isinstance(message, bytes):
@@ -246,7 +246,7 @@ class Sealed(Sequence[bytes]):
         self.size_bytes = size + parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
-        return self._parts
+        return self.parts
 
     @overload
     def __getitem__(self, at: int) -> bytes: ...
@@ -255,15 +255,16 @@ class Sealed(Sequence[bytes]):
     def __getitem__(self, at: slice) -> list[bytes]: ...
 
     def __getitem__(self, at: int | slice) -> bytes | list[bytes]:
-        parts = self._parts
+        parts = self.parts
         if not isinstance(at, slice):
             end = at % parts + 1 if -parts <= at < parts else parts
         elif at.stop is None or at.stop < 0:
             end = at.indices(parts)[1]
         else:
             end = at.stop if at.stop < parts else parts
-        if end > len(self._frames):
-            self._seal_until(end)
+        begin = len(self._frames)
+        if begin < end:
+            self._seal(begin, end)
         return self._frames[at]
 
     def set_pace(self, pace: int) -> None:
@@ -274,28 +275,28 @@ class Sealed(Sequence[bytes]):
     @property
     def largest(self) -> int:
         """Return the bytes of the largest frame, sealed or not."""
-        return self.size_bytes if self._parts == 1 else self._capacity + HEADER_BYTES + SEAL_BYTES
+        return self.size_bytes if self.parts == 1 else self._capacity + HEADER_BYTES + SEAL_BYTES
 
     def message(self) -> bytes:
         """Return the plaintext, to be sealed again under another number."""
         if self._origin is not None:
             return self._origin.message()
         frames = self._frames
-        if len(frames) < self._parts:
+        if len(frames) < self.parts:
             return self._prefix + self._message
         ends = [len(frame) for frame in frames]
         ends[-1] -= self._signature_bytes
         opened = [self._cipher.open(frame, end) for frame, end in zip(frames, ends, strict=True)]
         return b"".join([each[0] for each in opened if each is not None])
 
-    def _seal_until(self, end: int) -> None:
+    def _seal(self, begin: int, end: int) -> None:
         if self._origin is not None:
             self._message, self._origin = self._origin.message(), None
         frames, signs = self._frames, (self._signature_bytes, self._running)
-        frames += self._cipher.seal(self._head, len(frames), end, self._prefix, self._message, self._capacity, *signs)
-        if self._signer is not None and self._running is not None and end == self._parts:
+        frames += self._cipher.seal(self._head, begin, end, self._prefix, self._message, self._capacity, *signs)
+        if self._signer is not None and self._running is not None and end == self.parts:
             frames[-1] += self._signer.sign_digest(self._running.digest())
-        if end == self._parts:
+        if end == self.parts:
             self._message = b""  # the frames hold all of it now
 
 

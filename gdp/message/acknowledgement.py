@@ -15,7 +15,7 @@ from gdp.intervals import NEVER_S, READER
 from gdp.message.retransmission import repair_allowance
 from gdp.token_bucket import TokenBucket
 
-_BEYOND_ALL: Final = 1 << 64  # above every message number
+_BEYOND_ALL: Final = 1 << 64  # above every message number and position
 
 
 @dataclass(slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class ReaderPositions:
     Attributes:
         active: readers that block the window, by name.
         suspended: readers that do not, by name.
-        least_at: position that every active reader has acknowledged; None without one.
+        least_at: position that every active reader has acknowledged; above all positions without one.
         most_at: position of the most advanced active reader; 0 without one.
         least_number: lowest message number that an active reader lacks; above all numbers without one.
         most_number: highest message number before which an active reader lacks nothing; above all without one.
@@ -66,8 +66,8 @@ class ReaderPositions:
             at, number = each.acked_at, each.next_number
             least_at, most_at = at if at < least_at else least_at, at if at > most_at else most_at
             least, most = number if number < least else least, number if number > most else most
-        self.least_at: int | None = least_at if self.active else None
-        self.most_at, self.least_number, self.most_number = most_at, least, most if self.active else _BEYOND_ALL
+        self.least_at, self.most_at, self.least_number = least_at, most_at, least
+        self.most_number = most if self.active else _BEYOND_ALL
 
     def add(self, reader: bytes, acked_at: int, next_number: int, now_s: float) -> None:
         """Add an active reader, or restart one."""
@@ -105,10 +105,6 @@ class ReaderPositions:
         """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
         position = self.active.get(reader)
         return position is not None and position.next_number > number
-
-    def acked_at(self, otherwise: int) -> int:
-        """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
-        return otherwise if self.least_at is None else self.least_at
 
     def least(self) -> int:
         """Return the lowest message number that any reader lacks, suspended or not."""

@@ -20,7 +20,8 @@ BUNDLE_BYTES: Final = 48 << 10
 # the largest bundle that a reader accepts: it bounds how many messages one frame may yield
 BUNDLE_MAX_BYTES: Final = 64 << 10
 _LENGTH: Final = struct.Struct("!I")
-_SMALL: Final = 4  # this number of them, or more, go into one bundle
+LENGTH_BYTES: Final = _LENGTH.size  # of a message in a bundle, in addition
+SMALL: Final = 4  # a message is small if this number of its size fit into one bundle
 _ALONE_BYTES: Final = 184  # overhead of a seal of its own: the waiting bytes must not weigh less than the sealed ones
 
 
@@ -56,11 +57,6 @@ class Gathered:
         self.messages = deque[tuple[bytes, float | None]]()
         self.first = 0  # sequence number of the oldest
         self.held_bytes = 0
-
-    @staticmethod
-    def is_small(size: int, capacity: int) -> bool:
-        """Return whether several messages of this size fit into a bundle of ``capacity`` bytes."""
-        return _SMALL * (size + _LENGTH.size) <= capacity
 
     @property
     def oldest_bytes(self) -> int:

@@ -20,29 +20,28 @@ class RoundTripEstimator:
     Attributes:
         rtt_s: smoothed estimate; None before the first sample.
         deviation_s: smoothed mean deviation.
-        is_sampling: a sample is running.
+        sample: a position and when it was sent, until it is acknowledged; None: none is running.
     """
 
     def __init__(self) -> None:
         self.rtt_s: float | None = None
         self.deviation_s = 0.0
-        self._sample: tuple[int, float] | None = None  # (position, when it was sent)
-        self.is_sampling = False
+        self.sample: tuple[int, float] | None = None
 
     def handle_sent(self, sent_at: int, now_s: float) -> None:
         """Start a sample at a position that was just sent, unless one is running."""
-        if self._sample is None:
-            self._sample, self.is_sampling = (sent_at, now_s), True
+        if self.sample is None:
+            self.sample = sent_at, now_s
 
     def handle_acknowledged(self, acked_at: int, now_s: float) -> None:
         """Finish the sample if its position is acknowledged."""
-        if self._sample is not None and acked_at >= self._sample[0]:
-            self.add(now_s - self._sample[1])
+        if self.sample is not None and acked_at >= self.sample[0]:
+            self.add(now_s - self.sample[1])
             self.discard_sample()
 
     def discard_sample(self) -> None:
         """Discard the running sample: the acknowledgement of a retransmitted frame is ambiguous (Karn's rule)."""
-        self._sample, self.is_sampling = None, False
+        self.sample = None
 
     def add(self, sample_s: float) -> None:
         """Add a sample, in seconds."""

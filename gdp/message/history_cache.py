@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 
 @dataclass(slots=True, kw_only=True)
@@ -105,14 +106,10 @@ class HistoryCache:
 
     def beyond_depth(self, now_s: float, below: int) -> list[int]:
         """Return the numbers under ``below`` that no late joiner needs, oldest first."""
-        beyond, numbers = len(self.messages) - self.depth, list[int]()
+        beyond = max(len(self.messages) - self.depth, 0)
         if self.depth_bytes is None and self.age_s is None:
-            for _, number in zip(range(beyond), self.messages, strict=False):
-                if number >= below:
-                    break
-                numbers.append(number)
-            return numbers
-        held_bytes = self.held_bytes
+            return [number for number in islice(self.messages, beyond) if number < below]
+        held_bytes, numbers = self.held_bytes, list[int]()
         for number, message in self.messages.items():
             if number >= below:
                 break

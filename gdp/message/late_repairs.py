@@ -142,6 +142,9 @@ class LateRepairs:
 
     def handle_complete(self, number: int, part: int, now_s: float) -> None:
         """Process a message that a fragment completed; those before it delay it for at most ``HOLD_S``."""
+        if not self.incomplete:
+            self._highest = number if number > self._highest else self._highest
+            return
         entry = self.incomplete.pop(number, None)
         if entry is not None and part < entry.requested_end:
             self._handle_answer(entry, part, now_s)

@@ -81,12 +81,9 @@ class Ledger:
 
     def forget(self, below: int) -> None:
         """Forget message numbers under ``below``."""
-        gone: list[int] = []
-        for number in self._of:
+        for number in [*self._of]:
             if number >= below:
                 break
-            gone.append(number)
-        for number in gone:
             sequence, _ = self._of[number]
             if sequence in self._numbers:
                 del self._numbers[sequence]

@@ -28,6 +28,7 @@ class ReceiptCheck:
         self._spare = deque[int](maxlen=_SPARE_MAX)
         self._total = 0
         self._sent = self._stated = self._came = 0.0  # samples; those that came by the counts, and by the receipts
+        self._lost = 0.0  # share of the frames that are proven to be lost
 
     def sent(self, samples: Sequence[tuple[int, int]], place: int, *, is_repair: bool) -> None:
         """Note the samples among frames that leave, the first of which has ``place``."""
@@ -51,13 +52,11 @@ class ReceiptCheck:
             lost: of them, as the reader counts.
         """
         due, gain, self._total = self._take(place), total - self._total & RECEIPTS_MASK, total
-        if len(due) > _DUE_MAX:
-            return lost
         if due or self._spare:
+            if len(due) > _DUE_MAX:
+                return lost
             self._count(due, gain, max(1 - lost / frames, 0.0))
-        if self._stated - self._came <= _DOUBT * sqrt(self._sent):
-            return lost
-        return max(lost, round(frames * (1 - self._came / self._sent)))
+        return max(lost, round(frames * self._lost)) if self._lost else lost
 
     def _count(self, due: list[int], gain: int, stated: float) -> None:
         """Count the samples that were due: those that came by the counts, and those that the sum proves."""
@@ -68,6 +67,8 @@ class ReceiptCheck:
         self._sent = (self._sent + count) * kept
         self._stated = (self._stated + count * stated) * kept
         self._came = (self._came + (came & (1 << count) - 1).bit_count()) * kept
+        is_doubted = self._stated - self._came > _DOUBT * sqrt(self._sent)
+        self._lost = 1 - self._came / self._sent if is_doubted else 0.0
 
     def _take(self, place: int) -> list[int]:
         """Remove and return the samples up to a place."""

@@ -76,12 +76,12 @@ class SendWindow:
     def has_space(self) -> bool:
         """Return whether ``add`` would evict no message that a reader waits for."""
         is_idle = bool(self.readers.suspended) and not self.readers.active
-        return is_idle or self.cache.end_at - self.readers.acked_at(self._sent_at) < self._budget_bytes
+        return is_idle or self.cache.end_at - self._acked_at() < self._budget_bytes
 
     def is_acknowledged(self) -> bool:
         """Return whether every reader has everything, suspended ones included."""
         has_all = all(each.next_number > self._newest for each in self.readers.suspended.values())
-        return has_all and self.readers.acked_at(self._sent_at) == self.cache.end_at
+        return has_all and self._acked_at() == self.cache.end_at
 
     @property
     def sent(self) -> tuple[int, int]:
@@ -209,11 +209,12 @@ class SendWindow:
             position = self.cache.end_at
         else:
             position = self.cache.begin_of(acknack.next_number)
-        next_number = min(acknack.next_number, max(self._sent_before, self.sent[0]))  # no reader has more
+        sent = max(self._sent_before, self.unsent[0][0] if self.unsent else self._newest + 1)
+        next_number = acknack.next_number if acknack.next_number < sent else sent  # no reader has more
         suspended = self.readers.suspended.get(reader)
         if suspended is not None:
             # the others must not wait for it
-            if self.readers.active and position < self.readers.acked_at(self._sent_at):
+            if self.readers.active and position < self.readers.least_at:
                 suspended.next_number = max(suspended.next_number, next_number)
                 self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()
@@ -225,10 +226,9 @@ class SendWindow:
         if self.unsent:
             self.readers.refresh()
             self._skip_unwanted()
-        before = self.readers.acked_at(self._sent_at)
+        before = self.readers.least_at
         self.readers.acknowledge(state, min(position, self._sent_at), now_s)
-        acked_at = self.readers.acked_at(self._sent_at)
-        self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
+        self._flow.handle_acknowledged(self.readers.least_at - before, self.readers.least_at, now_s)
         if acknack.missing:
             self._request_repairs(reader, acknack, now_s, trip_s)
         self._release_acknowledged()
@@ -248,16 +248,16 @@ class SendWindow:
         least = readers.least_number if self.governing is None else readers.most_number
         if self.unsent and self.unsent[0][0] < least:
             self._skip_unwanted()
-        acked_at = self._sent_at if readers.least_at is None else readers.least_at
-        if self._sent_at == acked_at:
+        acked_at = readers.least_at if readers.least_at < self._sent_at else self._sent_at
+        if acked_at == self._sent_at:
             self._flow.restart_probe(now_s)
         if self.unsent:
             if readers.most_at >= self._sent_at:
                 readers.reset_stall_timers(self._sent_at, now_s)
-            first_at = readers.most_at if self.governing is not None else acked_at
+            first_at = acked_at if self.governing is None else readers.most_at
             may_reach, below = first_at + self._flow.window_bytes, least + FLIGHT_MESSAGES_MAX
             frames += self._new_frames(may_reach, below, limit - len(frames) if frames else limit)
-        if frames and not self.cache.repaired and not self._flow.round_trip.is_sampling:
+        if frames and not self.cache.repaired and self._flow.round_trip.sample is None:
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
         if not readers.active and not self.unsent:
             self._release_acknowledged()
@@ -272,20 +272,17 @@ class SendWindow:
 
     def probe_due(self, now_s: float) -> bool:
         """Return whether readers have been silent for too long while something is under way; backs off."""
-        least_at = self.readers.least_at
-        return least_at is not None and least_at != self._sent_at and self._flow.probe_due(now_s)
+        return self.readers.least_at < self._sent_at and self._flow.probe_due(now_s)
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next probe, or at which a reader becomes slow; infinity: never."""
         readers, flow = self.readers, self._flow
-        if readers.least_at is None:
-            return NEVER_S
         due_s = NEVER_S if readers.least_at == readers.most_at else readers.next_slow()
-        return flow.probe_at_s if readers.least_at != self._sent_at and flow.probe_at_s < due_s else due_s
+        return flow.probe_at_s if readers.least_at < self._sent_at and flow.probe_at_s < due_s else due_s
 
     def _repaired_frames(self, limit: int, now_s: float, repairs: RetransmissionQueue) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
-        messages, acked_at = self.cache.messages, self.readers.acked_at(self._sent_at)
+        messages, acked_at = self.cache.messages, self._acked_at()
         least = self.readers.least() if self.readers.suspended else 0
 
         def is_lacked(number: int, part: int) -> bool:
@@ -352,13 +349,17 @@ class SendWindow:
             now_s=now_s,
         )
 
+    def _acked_at(self) -> int:
+        """Return the position that every active reader has acknowledged; that of what was sent without one."""
+        return min(self.readers.least_at, self._sent_at)
+
     def _release_acknowledged(self) -> None:
-        messages, released = self.cache.messages, list[int]()
-        for number in self.cache.beyond_depth(self._now_s, self.readers.least()):
-            message = messages[number]
-            if self.readers.active and message.begin_at + message.size > self._sent_at:
+        released = self.cache.beyond_depth(self._now_s, self.readers.least())
+        while released and self.readers.active:
+            newest = self.cache.messages[released[-1]]
+            if newest.begin_at + newest.size <= self._sent_at:
                 break
-            released.append(number)
+            del released[-1]
         if released:
             self._release(released)
 

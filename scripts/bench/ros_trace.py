@@ -23,7 +23,7 @@ Calls = dict[str, list[Call]]  # of each seam, in order
 _PROXY: Final = {
     "take": "proxy.endpoints.ros2.wait_thread:WaitThread._drained",
     "expose": "proxy.bridge.exposed_topic:ExposedTopic._publish",
-    "seal": "gdp.crypto.envelope:Sealed._seal_until",
+    "seal": "gdp.crypto.envelope:Sealed._seal",
     "send": "gdp.ports.raw:RawPlane.transmit",
     "receive": "gdp.ports.raw:RawPlane.poll",
     "open": "gdp.message.reassembly:Reassembler.add_batch",

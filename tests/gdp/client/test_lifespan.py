@@ -94,13 +94,13 @@ def test_a_message_without_a_time_ages_from_the_next_poll_on() -> None:
 def test_a_dropped_message_is_never_sealed(monkeypatch: pytest.MonkeyPatch) -> None:
     pipe, _ = joined(deadline_s=DEADLINE_S)
     ends: list[int] = []
-    seal_until = Sealed._seal_until
+    seal = Sealed._seal
 
-    def record(frames: Sealed, end: int) -> None:
+    def record(frames: Sealed, begin: int, end: int) -> None:
         ends.append(end)
-        seal_until(frames, end)
+        seal(frames, begin, end)
 
-    monkeypatch.setattr(Sealed, "_seal_until", record)
+    monkeypatch.setattr(Sealed, "_seal", record)
     pipe.publisher.publish(LARGE, pipe.now_s)
     pipe.now_s += 1.0
     assert pipe.publisher.queue.drop_expired(pipe.now_s)

@@ -11,6 +11,7 @@ from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.send_options import PRIORITIES, Priority, SendOptions, is_urgent
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sent_frames import SentFrames
+from gdp.client.timer_queue import TimerQueue
 from gdp.frame.codec import decode
 from gdp.names import Name
 from tests.gdp.client.pipe import Pipe, publisher_of
@@ -87,7 +88,7 @@ class Flood(Publisher):
 
 
 def scheduled(*floods: Flood) -> SendScheduler:
-    turns = SendScheduler(lambda _: None)
+    turns = SendScheduler(TimerQueue())
     for flood in floods:
         turns.add(flood)
     return turns
@@ -173,8 +174,8 @@ def test_what_the_path_holds_back_is_due_when_the_path_says_so() -> None:
 
 
 def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:
-    asked: list[Publisher] = []
-    turns, publisher = SendScheduler(asked.append), read_by_one()
+    timers, publisher = TimerQueue[Publisher](), read_by_one()
+    turns = SendScheduler(timers)
     publisher.published = turns.add
     assert not turns.is_ready
     publisher.publish(b"one")
@@ -183,7 +184,7 @@ def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:
     assert decode(frames[0]).destination == Name(b"t" * 32)
     assert not turns.is_ready
     assert turns.poll_turn(101.0) == []
-    assert asked == [publisher]
+    assert list(timers.touched) == [publisher]
 
 
 def test_paths_are_reserved_for_a_publisher_to_several_readers_for_a_quarter_of_a_second_and_then_not_as_long() -> None:

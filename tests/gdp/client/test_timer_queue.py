@@ -24,7 +24,7 @@ class Clock:
 def timers_of(*clocks: Clock) -> TimerQueue[Clock]:
     timers = TimerQueue[Clock]()
     for clock in clocks:
-        timers.reschedule(clock)
+        timers.touched[clock] = None
     return timers
 
 
@@ -36,7 +36,7 @@ def test_whatever_is_put_off_or_brought_forward_the_first_is_known_and_none_is_m
     for _ in range(500):
         clock = chance.choice(clocks)
         clock.due_s = chance.choice((None, now_s + chance.random(), now_s + 10 * chance.random()))
-        timers.reschedule(clock)
+        timers.touched[clock] = None
         due = [each.due_s for each in clocks if each.due_s is not None]
         assert timers.next_due() == min(due, default=float("inf"))
         if chance.random() < 0.2:
@@ -53,7 +53,7 @@ def test_those_that_were_not_touched_are_not_asked() -> None:
     timers.next_due()
     for at in range(40):
         busy.due_s = 1.0 + at
-        timers.reschedule(busy)
+        timers.touched[busy] = None
         assert timers.next_due() == busy.due_s
     assert [clock.asked for clock in idle] == [1] * 100
 
@@ -63,10 +63,10 @@ def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
     timers = timers_of(clock)
     for at in range(1_000):
         clock.due_s = 1_000.0 - at / 2  # always sooner than the time before
-        timers.reschedule(clock)
+        timers.touched[clock] = None
         timers.next_due()
     clock.due_s = float("inf")
-    timers.reschedule(clock)
+    timers.touched[clock] = None
     assert timers.next_due() == float("inf")
     assert [len(each) for each in (timers._queue, timers._queue._heap, timers.touched)] == [0, 0, 0]
 

@@ -20,6 +20,7 @@ from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.send_options import PublisherSettings
 from gdp.client.send_scheduler import SendScheduler
+from gdp.client.timer_queue import TimerQueue
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.congestion.delivery_rate import Flight
 from gdp.crypto.keys import SigningKey
@@ -94,7 +95,7 @@ class SimulatedRobot:
         self._stall_s, self._stall_every_s, self._frame_s = stall_s, stall_every_s, frame_s
         self._stalled_until_s = {"robot": 0.0, "cloud": 0.0, "near switch": 0.0, "far switch": 0.0}
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._paths, self._turns = ReaderPaths(), SendScheduler(lambda _: None)
+        self._paths, self._turns = ReaderPaths(), SendScheduler(TimerQueue())
         self._notes = deque[tuple[float, Topic, bytes]]()
         self._arrivals = deque[tuple[float, Topic, bytes]]()
         self._robot_free_s = self._cloud_free_s = 0.0
