@@ -14,7 +14,7 @@ from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
 
-_PAUSES: Final = Backoff(POLL_S, 4 * POLL_S)
+_PAUSES: Final = Backoff(POLL_S, 2 * POLL_S)
 _REQUESTS_MAX: Final = 16  # of one turn
 
 
