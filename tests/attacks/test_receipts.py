@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -43,15 +44,15 @@ def test_b10_a_reader_that_says_to_have_all_frames_gets_no_more_than_its_path_ca
         if (a, b) == ("s1", "s2") and header.kind == Kind.DATA:
             sent[:] = sent[0] + len(frame), max(sent[1], header.parts)
 
-    def lie(*fields: object) -> AckNack:
-        report = AckNack(*fields)  # type: ignore[arg-type]
+    def lie(kind: type[AckNack], fields: Sequence[object]) -> AckNack:
+        report = kind(*fields)  # type: ignore[arg-type]
         all_frames = report.newest * sent[1] + report.newest_part + 1
         lies = {"received": all_frames, "frames": all_frames, "held_us": HELD_US}
         report = report if report.flags else report._replace(missing=(), lost=0, **lies)  # type: ignore[arg-type]
         return report._replace(next_number=report.newest, next_part=report.newest_part) if reliable else report
 
     world.network.taps.append(count)
-    monkeypatch.setattr(writer_proxy, "AckNack", lie)
+    monkeypatch.setattr(writer_proxy, "new_tuple", lie)
     for number in range(int((ADAPTS_S + MEASURED_S) * HZ)):
         world.network.call(number / HZ, partial(flow.publish, bytes(SIZE)))
     world.network.run(ADAPTS_S)

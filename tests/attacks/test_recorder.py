@@ -56,7 +56,7 @@ class Recorder:
     def __init__(self) -> None:
         self.sink = Sink()
         self.faults = Faults()
-        member = SimpleNamespace(losses_of=lambda _: Losses())
+        member = SimpleNamespace(losses_of=lambda _: Losses(), diagnostics=SimpleNamespace(clock_of=lambda *_: None))
         self.endpoint = RecordingEndpoint(cast(BagWriter, self.sink), [("/chatter", "a/msg/B")])
         context = BridgeContext(cast(Participant, member), Traffic(), self.faults)
         flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, RULE)

@@ -159,7 +159,7 @@ def _receive(data: bytes) -> object:
     assert isinstance(description, bytes)
     wire = RosMessage(0, 1, body, steps).to_wire()
     for is_live in (True, False):
-        member = SimpleNamespace(losses_of=lambda _: Losses())
+        member = SimpleNamespace(losses_of=lambda _: Losses(), diagnostics=SimpleNamespace(clock_of=lambda *_: None))
         context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
         dispatcher = EndpointDispatcher(cast(RosEndpoint, _Endpoint(is_live=is_live)))
         flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, _RULE)
