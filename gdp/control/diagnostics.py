@@ -153,9 +153,7 @@ class Diagnostics:
         self._waiting: list[_Asked] = []
         self._peers = Lru[_Peer](_PEERS_MAX)
         self._clocks = Lru[ClockOffset](_PEERS_MAX)
-        self._clock_from_s: float | None = (
-            None  # when the clock of our stamps showed 0: it says nothing of this machine
-        )
+        self._clock_from_s: float | None = None  # when our stamps' clock showed 0: it says nothing of this machine
         self._knows_us: OrderedDict[Name, None] = OrderedDict()  # members that have our certificate
         self._frames = TokenBuckets(*DIAGNOSTIC_FRAMES_RATE)
         self._requests = TokenBuckets(*DIAGNOSTICS_RATE)

@@ -14,6 +14,7 @@ from typing import Final, ParamSpec
 from gdp.client.participant import Participant
 from gdp.control.boundary import ErrorBoundary
 from gdp.errors import DropReason, RemoteError
+from gdp.message.clock_offset import ClockEstimate
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from proxy.bridge.call_tracer import CallTracer
@@ -37,14 +38,9 @@ class BridgeContext:
     tracer: CallTracer = field(default_factory=CallTracer)
     boundary: ErrorBoundary = field(default_factory=ErrorBoundary)
 
-    def clock_offset_ns(self, publisher: bytes, now_s: float, *, is_sure: bool) -> int:
-        """Return what a publisher's wall clock is ahead of ours; 0 if that is not known.
-
-        Args:
-            is_sure: 0 also where the bound of the error lets both be equal, so that machines with one time stay so.
-        """
-        clock = self.member.diagnostics.clock_of(Name(publisher), Timestamps(now_s, time.time()))
-        return 0 if clock is None or (is_sure and not clock.least_s) else round(1e9 * clock.offset_s)
+    def clock_of(self, publisher: bytes, now_s: float) -> ClockEstimate | None:
+        """Return what a publisher's wall clock is ahead of ours; None: that is not known."""
+        return self.member.diagnostics.clock_of(Name(publisher), Timestamps(now_s, time.time()))
 
     def report_error(self, what: str, event: EndpointError, fault: Fault) -> None:
         """Report an endpoint's error about a local name as ``fault``, unless the whole graph is unavailable."""

@@ -194,17 +194,18 @@ class ImportedTopic:
             return
         expander, incoming, headers, handle = channels[ros_message.channel]
         raw = incoming.decode(*expander.expand(ros_message))
+        clock = self._context.clock_of(publisher, now_s)
+        ahead_ns = 0 if clock is None else round(1e9 * clock.offset_s)
         if headers is not None:
-            is_moved = rule.stamps == "local"
-            ahead_ns = self._context.clock_offset_ns(publisher, now_s, is_sure=False) if is_moved else 0
-            raw = headers.rewrite(raw, StampShift(-ahead_ns, ros_message.stamp_ns))
+            by_ns = -ahead_ns if rule.stamps == "local" else 0
+            raw = headers.rewrite(raw, StampShift(by_ns, ros_message.stamp_ns))
         if len(raw) > rule.max_bytes:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
             return
         self._output.publish(handle, raw, Origin(ros_message.stamp_ns, delivered.sequence))
-        sent_ns = ros_message.stamp_ns - self._context.clock_offset_ns(publisher, now_s, is_sure=True)
-        latency_ms = (time.time_ns() - sent_ns) / 1e6
+        differs = clock is not None and clock.least_s > 0  # else the bound lets both be equal, and one time stays so
+        latency_ms = (time.time_ns() - ros_message.stamp_ns + (ahead_ns if differs else 0)) / 1e6
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
         self.stats.add(latency_ms, delivered.parts, delivered.hops, len(raw))
         traffic.latency.observe(latency_ms / 1e3)
