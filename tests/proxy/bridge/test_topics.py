@@ -142,7 +142,9 @@ def test_a_rule_that_ends_ends_its_flow_at_once(sites: Sites) -> None:
     assert not list(robot.member.publications)
 
 
-def test_a_message_that_arrives_when_its_flow_has_ended_is_counted(sites: Sites, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_that_arrives_when_its_flow_has_ended_is_counted(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, server, talker, ear = flowing(sites)
     with monkeypatch.context() as busy:
         busy.setattr(server.member, "poll_messages", list)  # what comes is not read yet
