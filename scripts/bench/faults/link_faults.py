@@ -3,7 +3,7 @@
 I/O. Needs root. This also works on kernels without netem. A program at the ingress of the receiving device, before the
 switch's own, sends each frame on a detour, which ends at the device again::
 
-    frame -> device -> near end of a veth pair -> far end -> thread: loses, doubles, delays -> near end -> device, marked
+    frame -> device -> near end of a veth pair -> far end -> thread that loses, doubles, delays -> back, marked
 
 A marked frame is passed on to the switch. Frames with different delays overtake each other. All of it depends on
 descriptors of this process and ends with them.
