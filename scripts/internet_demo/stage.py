@@ -43,4 +43,4 @@ class Stage(Overlay):
 
     def add_site(self, label: str, access: Access) -> Site:
         """Attach one more network."""
-        return self._laboratory.add_site(label, access, delay_ms=self._delay_ms, jitter_ms=self._delay_ms / 10)
+        return self._laboratory.add_site(label, access, delay_ms=self._delay_ms)
