@@ -1,7 +1,4 @@
-"""``fog logs``: what programs of machines wrote, and what they write while it runs.
-
-I/O.
-"""
+"""``fog logs``: what programs of machines wrote, and what they write while it runs."""
 
 from __future__ import annotations
 

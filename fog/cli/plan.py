@@ -1,7 +1,4 @@
-"""``fog plan``: number, offers and price of machines for a target. ``fog prices``: prices of machines.
-
-I/O.
-"""
+"""``fog plan``: number, offers and price of machines for a target. ``fog prices``: prices of machines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``fog scale``, ``push``, ``ssh`` and ``supervise``: verbs for existing clusters and machines.
-
-I/O.
-"""
+"""``fog scale``, ``push``, ``ssh`` and ``supervise``: verbs for existing clusters and machines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Result of ``fog plan``: pool, choices and price, with all assumptions.
-
-Sans-I/O.
-"""
+"""Result of ``fog plan``: pool, choices and price, with all assumptions."""
 
 from __future__ import annotations
 

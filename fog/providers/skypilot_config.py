@@ -1,7 +1,4 @@
-"""Settings of provider ``skypilot``: regions, and the software of a machine.
-
-Sans-I/O.
-"""
+"""Settings of provider ``skypilot``: regions, and the software of a machine."""
 
 from __future__ import annotations
 

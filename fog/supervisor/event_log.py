@@ -1,7 +1,4 @@
-"""Log of events of clusters and machines, in the journal and in the process log.
-
-I/O.
-"""
+"""Log of events of clusters and machines, in the journal and in the process log."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Events of a machine, derived from its records before and after an observation, for ``fog status --events``.
-
-Sans-I/O.
-"""
+"""Events of a machine, derived from its records before and after an observation, for ``fog status --events``."""
 
 from __future__ import annotations
 

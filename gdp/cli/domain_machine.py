@@ -1,7 +1,4 @@
-"""``gdp domain create``, ``token``, ``ls``, ``remove`` and ``serve``: a domain whose machines join with tokens.
-
-I/O.
-"""
+"""``gdp domain create``, ``token``, ``ls``, ``remove`` and ``serve``: a domain whose machines join with tokens."""
 
 from __future__ import annotations
 

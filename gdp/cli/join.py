@@ -1,7 +1,4 @@
-"""``gdp join``, ``gdp up`` and ``gdp agent``: a machine that becomes a member with a token, and its programs.
-
-I/O.
-"""
+"""``gdp join``, ``gdp up`` and ``gdp agent``: a machine that becomes a member with a token, and its programs."""
 
 from __future__ import annotations
 

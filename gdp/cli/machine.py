@@ -1,7 +1,4 @@
-"""Start of a machine's programs, for the commands that create or join a domain.
-
-I/O.
-"""
+"""Start of a machine's programs, for the commands that create or join a domain."""
 
 from __future__ import annotations
 

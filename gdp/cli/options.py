@@ -1,7 +1,4 @@
-"""Options that several sub-commands of ``gdp`` share.
-
-I/O.
-"""
+"""Options that several sub-commands of ``gdp`` share."""
 
 from __future__ import annotations
 

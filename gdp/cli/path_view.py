@@ -1,7 +1,4 @@
-"""Lines of ``gdp trace`` for people.
-
-Sans-I/O.
-"""
+"""Lines of ``gdp trace`` for people."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Salt of a name: its unguessable part, a secret that commands take.
-
-I/O.
-"""
+"""Salt of a name: its unguessable part, a secret that commands take."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``gdp top``: live rates of the names that this machine's nodes carry.
-
-I/O.
-"""
+"""``gdp top``: live rates of the names that this machine's nodes carry."""
 
 from __future__ import annotations
 

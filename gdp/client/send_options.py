@@ -1,7 +1,4 @@
-"""Settings of a publisher, and its send options: how fresh, how much and how often its messages leave.
-
-Sans-I/O.
-"""
+"""Settings of a publisher, and its send options: how fresh, how much and how often its messages leave."""
 
 from __future__ import annotations
 

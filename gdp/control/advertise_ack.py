@@ -1,7 +1,4 @@
-"""Acknowledgement of an advertisement: accepted, or rejected with a reason.
-
-Sans-I/O.
-"""
+"""Acknowledgement of an advertisement: accepted, or rejected with a reason."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Query to a RIB, and its responses: one for each advertiser of the name, one that there is none, or "unknown".
-
-Sans-I/O.
-"""
+"""Query to a RIB, and its responses: one for each advertiser of the name, one that there is none, or "unknown"."""
 
 from __future__ import annotations
 

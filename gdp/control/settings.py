@@ -1,7 +1,4 @@
-"""Node settings at start: marks of the new incarnation, randomness, and hello timing.
-
-Sans-I/O.
-"""
+"""Node settings at start: marks of the new incarnation, randomness, and hello timing."""
 
 from __future__ import annotations
 

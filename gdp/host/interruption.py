@@ -1,7 +1,4 @@
-"""Interruption of work by a signal, so that the caller can still remove what the work made.
-
-I/O.
-"""
+"""Interruption of work by a signal, so that the caller can still remove what the work made."""
 
 from __future__ import annotations
 

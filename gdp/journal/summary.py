@@ -1,7 +1,4 @@
-"""Summary of an incident for people: what came, went and was lost, by neighbour, kind and name, and when.
-
-Sans-I/O.
-"""
+"""Summary of an incident for people: what came, went and was lost, by neighbour, kind and name, and when."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What all parts of a relay share: its identity, its policy, its loop, and TLS contexts that follow renewals.
-
-I/O.
-"""
+"""What all parts of a relay share: its identity, its policy, its loop, and TLS contexts that follow renewals."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Switch node (``gdp-switch``): the core of a switch on real devices.
-
-I/O.
-"""
+"""Switch node (``gdp-switch``): the core of a switch on real devices."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Columns of text that are as wide as their content: nothing is cut, in a terminal or in a pipe.
-
-Sans-I/O.
-"""
+"""Columns of text that are as wide as their content: nothing is cut, in a terminal or in a pipe."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Diagnostic requests and tables for the control socket: from JSON fields to the core, and back.
-
-Sans-I/O.
-"""
+"""Diagnostic requests and tables for the control socket: from JSON fields to the core, and back."""
 
 from __future__ import annotations
 

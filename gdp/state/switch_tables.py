@@ -1,7 +1,4 @@
-"""Tables of a switch: routes, multicast trees, names, tunnels and the other switches.
-
-Sans-I/O.
-"""
+"""Tables of a switch: routes, multicast trees, names, tunnels and the other switches."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rows of the control command ``topics``: the names that a node carries, and its counts of each.
-
-Sans-I/O.
-"""
+"""Rows of the control command ``topics``: the names that a node carries, and its counts of each."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Command ``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names.
-
-I/O.
-"""
+"""Command ``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options that the doors share, and the course of a door's command.
-
-I/O.
-"""
+"""Options that the doors share, and the course of a door's command."""
 
 from __future__ import annotations
 

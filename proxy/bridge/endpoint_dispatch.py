@@ -1,7 +1,4 @@
-"""Endpoint dispatcher: delivers events of one endpoint to the owners of its handles.
-
-I/O.
-"""
+"""Endpoint dispatcher: delivers events of one endpoint to the owners of its handles."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Index of the calls under way at an action's server, by goal.
-
-Sans-I/O.
-"""
+"""Index of the calls under way at an action's server, by goal."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Queue of requests whose client is not described yet, with a fair quota for each client.
-
-Sans-I/O.
-"""
+"""Queue of requests whose client is not described yet, with a fair quota for each client."""
 
 from __future__ import annotations
 

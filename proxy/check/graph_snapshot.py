@@ -1,7 +1,4 @@
-"""Snapshot of live graphs: observes them for a while without carrying anything.
-
-I/O.
-"""
+"""Snapshot of live graphs: observes them for a while without carrying anything."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options that commands share which act as one node.
-
-I/O-free.
-"""
+"""Options that commands share which act as one node."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``gdp up --suggest``: writes a commented ``proxy.yaml`` from the live ROS graph.
-
-I/O.
-"""
+"""``gdp up --suggest``: writes a commented ``proxy.yaml`` from the live ROS graph."""
 
 from __future__ import annotations
 

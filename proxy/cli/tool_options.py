@@ -1,7 +1,4 @@
-"""Options and output of the commands that read or call one name as a member.
-
-I/O.
-"""
+"""Options and output of the commands that read or call one name as a member."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Recorder: a proxy without a live graph, whose bridge records or only counts what it imports.
-
-I/O.
-"""
+"""Recorder: a proxy without a live graph, whose bridge records or only counts what it imports."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Channels of a recording: conversion from rosbags' connections.
-
-Sans-I/O.
-"""
+"""Channels of a recording: conversion from rosbags' connections."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Service description for a caller: its request and its response, each described like a topic's messages.
-
-Sans-I/O.
-"""
+"""Service description for a caller: its request and its response, each described like a topic's messages."""
 
 from __future__ import annotations
 

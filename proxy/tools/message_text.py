@@ -1,7 +1,4 @@
-"""Messages as text: YAML as ``ros2 topic echo`` prints it, and JSON as rosbridge writes it; and back from YAML.
-
-Sans-I/O.
-"""
+"""Messages as text: YAML as ``ros2 topic echo`` prints it, and JSON as rosbridge writes it; and back from YAML."""
 
 from __future__ import annotations
 
