@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware, Offer
 from fog.plan.choice import BY_BOTH, Choice, Weights, choose
-from fog.plan.correlation import joint_over_regions
 from fog.plan.duration import duration_text
 from fog.plan.evidence import Measured
-from fog.plan.failure import chance_down, joint
+from fog.plan.failure import chance_down, joint, joint_over_regions
 from fog.plan.mix import Kind
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool, Standing, pool_for
 

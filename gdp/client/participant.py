@@ -29,7 +29,7 @@ from gdp.client.writer_proxy import WriterProxy
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.diagnostics import Diagnostics, Question
 from gdp.control.join import Join
-from gdp.control.query import Response
+from gdp.control.rib_statements import Response
 from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity

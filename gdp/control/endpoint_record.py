@@ -2,6 +2,10 @@
 
 Sans-I/O. A record names the WireGuard key of each uplink and the candidates at which it may answer, as ICE has them
 (RFC 8445, section 5.1). Records travel in enrolments, in files and through the RIB.
+
+The RIBs of one domain equalise a set of records. Its keys are names of switches, its ranks the sequences of records. A
+switch requests the records of switches by their whole names, each with the line of the record that it has. A RIB
+requests in the same way the switch's own record, so that a publication needs no acknowledgement of its own.
 """
 
 from __future__ import annotations
@@ -20,6 +24,9 @@ from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 from gdp.trust.domain import Policy
 
+ENDPOINTS: Final = b"endpoints"
+ENDPOINT_NAMES_MAX: Final = 64  # in one request of a switch
+_LEASE_BYTES: Final = 4
 CANDIDATES_MAX: Final = 16
 UPLINKS_MAX: Final = 4
 RECORD_MAX_BYTES: Final = 4 << 10
@@ -116,3 +123,15 @@ class EndpointRecord(Body):
         """Return if there are keys, and each candidate is of an uplink. Raises ``StatementError``: MALFORMED."""
         if not self.keys or any(each.uplink >= len(self.keys) for each in self.candidates):
             raise StatementError(DropReason.MALFORMED, "an endpoint record without the key of an uplink")
+
+
+def item_of(record: bytes, lease_s: float) -> bytes:
+    """Return the item of a record: what is left of its lease (ms, 4 bytes), and the signed record."""
+    return int(lease_s * 1_000).to_bytes(_LEASE_BYTES, "big") + record
+
+
+def record_in(item: bytes) -> tuple[bytes, float]:
+    """Return the record in an item, and what is left of its lease, in seconds. Raises ``StatementError``: MALFORMED."""
+    if len(item) <= _LEASE_BYTES:
+        raise StatementError(DropReason.MALFORMED, "an item without a record")
+    return item[_LEASE_BYTES:], int.from_bytes(item[:_LEASE_BYTES], "big") / 1_000

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of, record_in
+from gdp.control.endpoint_record import ENDPOINT_NAMES_MAX, ENDPOINTS, EndpointRecord, item_of, record_in
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, check_sequence, parse

@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gdp.control.advertise_ack import AdvertiseAck
-from gdp.control.query import Response
 from gdp.control.rib_replication import Key
+from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError

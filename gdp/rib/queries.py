@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.query import Query, Response
+from gdp.control.rib_statements import Query, Response
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError, StoreError

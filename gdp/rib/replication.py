@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.endpoint_sync import ENDPOINTS
+from gdp.control.endpoint_record import ENDPOINTS
 from gdp.control.rib_replication import Entry
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -21,8 +21,7 @@ from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState
 from gdp.rib.store import check_quota
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import Advertisement
-from gdp.trust.withdrawal import Withdrawal
+from gdp.trust.advertisement import Advertisement, Withdrawal
 
 COLD_S: Final = 3.0  # a RIB that just started denies no name before it compared with a peer, for so long at most
 

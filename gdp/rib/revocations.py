@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.control.query import Query
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import Query, RelayedStatement
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind

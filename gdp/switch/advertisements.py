@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
+from gdp.control.rib_statements import AdvertiseAck
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
@@ -30,10 +30,9 @@ from gdp.switch.relocation import Relocations
 from gdp.switch.rib_client import RibClient
 from gdp.switch.unicast import Unicast
 from gdp.token_bucket import TokenBuckets
-from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement, Withdrawal
 from gdp.trust.audit import Action
 from gdp.trust.right import HEARS, Right
-from gdp.trust.withdrawal import Withdrawal
 
 _SESSIONS_MAX: Final = 4_096  # more than the neighbours that a switch has
 _INCARNATION_BYTES: Final = 8  # at the end of an instance id

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.control.pace import ReaderPace
 from gdp.crypto.certificates import Role

@@ -10,10 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement, relayed
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response, relayed
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError

@@ -18,12 +18,10 @@ from __future__ import annotations
 import hashlib
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
 from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement, relayed
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse

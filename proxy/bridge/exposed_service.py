@@ -26,7 +26,7 @@ from gdp.service.frames import Answer, Request, Stop
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.cancellation import TRIGGER, Cancellation
+from proxy.bridge.cancellation import TRIGGER, Cancellation, GoalCalls
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT
 from proxy.bridge.core.bridge_election import presence_of, sign
@@ -34,7 +34,6 @@ from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import cancel_of, goal_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.ordered_server import OrderedServer
 from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender

@@ -10,8 +10,7 @@ import pytest
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.join import Join
 from gdp.control.link_state import LinkState, Scope
-from gdp.control.query import Query
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import Query, RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject

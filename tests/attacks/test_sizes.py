@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.link_state import LINKS_MAX, MEMBERS_MAX, RIBS_MAX, Adjacency, AttachedRib, LinkState, Scope
+from gdp.control.rib_statements import AdvertiseAck
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason

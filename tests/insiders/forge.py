@@ -21,7 +21,7 @@ from gdp.control.hello import CONFLICTS_MAX, COOKIE_BYTES, COOKIES_MAX, HEARD_MA
 from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
-from gdp.control.query import TRANSIT_MAX
+from gdp.control.rib_statements import TRANSIT_MAX
 from gdp.crypto import cbor
 from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.crypto.identity import Identity

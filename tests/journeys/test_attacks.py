@@ -10,9 +10,8 @@ import pytest
 
 from gdp.client.participant import Participant
 from gdp.client.rib_host import RibHost
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.join import Join
-from gdp.control.query import Response
+from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import StatementType, sign
 from gdp.errors import DropReason

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason

@@ -6,10 +6,9 @@ from itertools import count
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINTS, item_of, record_in
+from gdp.control.endpoint_record import ENDPOINTS, Candidate, CandidateType, EndpointRecord, item_of, record_in
 from gdp.control.endpoints import Endpoint
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse
