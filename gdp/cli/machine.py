@@ -15,8 +15,7 @@ import typer
 
 from gdp.cli.node import set_up_logging
 from gdp.enrolment.addresses import default_directory
-from gdp.enrolment.machine_programs import read_machine
-from gdp.enrolment.programs import MachineProgram, missing_ros
+from gdp.enrolment.programs import MachineProgram, missing_ros, read_machine
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.supervisor import Failures, supervise
 from gdp.enrolment.units import has_systemd, install_units

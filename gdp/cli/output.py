@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from gdp.cli.salt import NAME_SALT
+from gdp.cli.secret import NAME_SALT
+from gdp.cli.tables import columns
 from gdp.errors import LocalError
 from gdp.metadata import SALT
-from gdp.state.columns import columns
 from gdp.terminal import echo
 
 if TYPE_CHECKING:  # a short command loads nothing of keys

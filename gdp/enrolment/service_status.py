@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.config.machine_file import NODE_SECTIONS, section_source
 from gdp.config.yaml_source import read_yaml
-from gdp.enrolment.machine_programs import configured_identity
+from gdp.enrolment.programs import configured_identity
 from gdp.enrolment.units import UNIT_FOLDER, installed_units, systemctl
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import ANSWER_S

@@ -22,8 +22,7 @@ from gdp.limits import ADVERTISEMENTS_RATE, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import AttachedAdvertisement
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import AttachedAdvertisement, ForwardingState
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.relocation import Relocations

@@ -16,8 +16,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import JOINS_RATE
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import JoinedBranch
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import ForwardingState, JoinedBranch
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.relocation import Relocations
 from gdp.token_bucket import TokenBuckets

@@ -18,8 +18,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import KnownLocation
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import ForwardingState, KnownLocation
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
 from gdp.switch.relocation import Relocations

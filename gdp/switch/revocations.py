@@ -26,8 +26,7 @@ from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import AttachedAdvertisement, JoinedBranch, KnownLocation
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import AttachedAdvertisement, ForwardingState, JoinedBranch, KnownLocation
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement

@@ -6,8 +6,7 @@ from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphChanged, RosEndpoint
-from proxy.serial.channel import Channel, Qos
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, Service
 
 
 class EventHandler(Protocol):

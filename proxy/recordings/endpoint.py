@@ -22,8 +22,7 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.in_process import InProcessEndpoint
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 if TYPE_CHECKING:  # what records loads nothing that reads, and the reverse
     from proxy.recordings.reader import BagReader

@@ -15,8 +15,7 @@ from dataclasses import KW_ONLY, dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 _PROXY_NODE: Final = re.compile(r"gdp_proxy_[0-9a-f]{12}(_[0-9a-z_]*)?\Z")
 
