@@ -183,11 +183,7 @@ class SiteConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> SiteConfig:
-        """Read ``fog.yaml``.
-
-        Raises:
-            ConfigError: all errors of the file, each with line and column.
-        """
+        """Read ``fog.yaml``. Raises ``ConfigError``: all errors of the file, each with line and column."""
         return load(cls, path)
 
 
@@ -355,11 +351,7 @@ def with_gateway(site: Site, *, is_replica: bool) -> Site:
 
 
 def topology_now(site: Site) -> Gateway:
-    """Return a site's topology of the last launch.
-
-    Raises:
-        LocalError: the site's file cannot be read.
-    """
+    """Return a site's topology of the last launch. Raises ``LocalError``: the site's file cannot be read."""
     if site.file is not None:
         return site.topology
     return AUTOMATIC_REPLICA if _identifier(site.state)[1] else AUTOMATIC

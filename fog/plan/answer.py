@@ -70,11 +70,7 @@ class Answer:
 
 
 def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answer:
-    """Compute a plan.
-
-    Raises:
-        LocalError: an input is out of bounds, or no offer has enough hardware.
-    """
+    """Compute a plan. Raises ``LocalError``: an input is out of bounds, or no offer has enough hardware."""
     uptime_s = question.uptime_s or PAPER_UPTIME_S
     recovery_s = question.recovery_s or PAPER_RECOVERY_S
     factor = seen.factors[1]

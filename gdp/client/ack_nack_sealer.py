@@ -99,11 +99,7 @@ class AckNackSealer:
         return frames
 
     def sealer(self, epoch: int) -> ControlSealer:
-        """Return the sealer of reports under an epoch.
-
-        Raises:
-            KeyError: there is no secret of that epoch.
-        """
+        """Return the sealer of reports under an epoch. Raises ``KeyError``: there is no secret of that epoch."""
         if epoch not in self._sealers:
             key = control_key(self._shared, self._secrets[epoch], *self._context(Kind.ACKNACK))
             self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)

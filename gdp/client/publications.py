@@ -170,11 +170,7 @@ class Publications:
             streams.forget(party)
 
     def receive_introduction(self, header: Header, frame: bytes) -> None:
-        """Process a reader's introduction.
-
-        Raises:
-            RemoteError: it concerns nothing that is published here.
-        """
+        """Process a reader's introduction. Raises ``RemoteError``: it concerns nothing that is published here."""
         publisher = self._publishers.get(topic_of(header, frame))  # type: ignore[call-overload]
         if publisher is None:
             raise StatementError(DropReason.NOT_FOR_US)

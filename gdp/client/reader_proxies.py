@@ -65,11 +65,7 @@ class _Incarnation:
         self._openers: dict[bytes, ControlOpener] = {}  # by topic secret
 
     def open(self, header: Header, frame: bytes, secret: bytes, now_s: float) -> bytes:
-        """Return a report's body.
-
-        Raises:
-            EnvelopeError: REPLAYED, MALFORMED or BAD_TAG.
-        """
+        """Return a report's body. Raises ``EnvelopeError``: REPLAYED, MALFORMED or BAD_TAG."""
         self._numbers.check(header.number, now_s)
         opener = self._openers.get(secret)
         if opener is None:

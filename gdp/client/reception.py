@@ -49,11 +49,7 @@ class Reception:
         self._paces: dict[tuple[Name, Name], tuple[int, float]] = {}  # stated; and when again, by topic and publisher
 
     def receive(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
-        """Pass a frame to its writer proxy.
-
-        Raises:
-            StatementError: NOT_FOR_US.
-        """
+        """Pass a frame to its writer proxy. Raises ``StatementError``: NOT_FOR_US."""
         found = self._subscriptions.find(header, now_s)
         if found is None:
             raise StatementError(DropReason.NOT_FOR_US)

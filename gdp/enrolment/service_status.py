@@ -63,11 +63,7 @@ def known_units(directory: Path | None = None) -> list[str]:
 
 
 def unit_state(unit: str) -> UnitState:
-    """Return the state of a unit.
-
-    Raises:
-        LocalError: systemd does not answer.
-    """
+    """Return the state of a unit. Raises ``LocalError``: systemd does not answer."""
     text = systemctl(["show", *(f"--property={key}" for key in _KEYS), unit])
     shown = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     active = shown.get("ActiveState", "unknown")

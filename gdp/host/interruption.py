@@ -25,11 +25,7 @@ class Interrupted(Exception):  # noqa: N818  (not an error)
 
 
 async def interruptible(work: Coroutine[None, None, T]) -> T:
-    """Do the work and return its result.
-
-    Raises:
-        Interrupted: a signal cancelled it.
-    """
+    """Do the work and return its result. Raises ``Interrupted``: a signal cancelled it."""
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(work)
     caught: list[int] = []

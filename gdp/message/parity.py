@@ -57,11 +57,7 @@ class Parity:
 
     @classmethod
     def from_wire(cls, body: bytes) -> Parity:
-        """Return the parity of a body.
-
-        Raises:
-            EnvelopeError: MALFORMED, too short, or an index out of bounds.
-        """
+        """Return the parity of a body. Raises ``EnvelopeError``: MALFORMED, too short, or an index out of bounds."""
         if len(body) <= OVERHEAD_BYTES:
             raise EnvelopeError(DropReason.MALFORMED, "parity without a shard")
         first, index, count = _FIELDS.unpack_from(body)

@@ -36,11 +36,7 @@ _BURST: Final = 64  # frames of one port before the next port is read
 
 
 class ScapyPlane(NetdevPlane):
-    """``Plane`` over one Scapy socket per port.
-
-    Raises:
-        LocalError: as ``add_port``.
-    """
+    """``Plane`` over one Scapy socket per port. Raises ``LocalError``: as ``add_port``."""
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._sockets: dict[int, tuple[L2Socket, int]] = {}  # with the file descriptor, which is needed after a close

@@ -63,11 +63,7 @@ class DiagnosticCommands:
         )
 
     def show(self, arguments: Mapping[str, object]) -> Mapping[str, object]:
-        """Return one page of a table.
-
-        Raises:
-            LocalError: this kind of node has no such table.
-        """
+        """Return one page of a table. Raises ``LocalError``: this kind of node has no such table."""
         what = _text(arguments, "what")
         source = self.tables.get(what)
         if source is None:

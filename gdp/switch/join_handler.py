@@ -57,11 +57,7 @@ class JoinHandler:
             self._relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
 
     def handle_refresh(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Handle a refresh of joins, or the reply to one.
-
-        Raises:
-            StatementError: as ``handle_join``.
-        """
+        """Handle a refresh of joins, or the reply to one. Raises ``StatementError``: as ``handle_join``."""
         refresh = JoinRefresh.from_statement(statement)
         if statement.signer != neighbour.name or not (refresh.is_reply or neighbour.role.is_switch):
             raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
@@ -73,11 +69,7 @@ class JoinHandler:
             self._multicast.refresh(refresh, neighbour, now.mono_s)
 
     def handle_pace(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Handle the pace of an attached reader.
-
-        Raises:
-            StatementError: as ``handle_join``.
-        """
+        """Handle the pace of an attached reader. Raises ``StatementError``: as ``handle_join``."""
         pace = ReaderPace.from_fields(statement.expect(StatementType.PACE))
         if statement.signer != neighbour.name or neighbour.role.is_switch:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a pace is from an attached reader")

@@ -57,11 +57,7 @@ _HEX: Final = (XByteField, XShortField, XLongField)
 
 
 def dissector() -> str:
-    """Return the text of the Lua plugin.
-
-    Raises:
-        LocalError: a layer has a field without a form in Wireshark.
-    """
+    """Return the text of the Lua plugin. Raises ``LocalError``: a layer has a field without a form in Wireshark."""
     layers = list(dict.fromkeys(layer for pair in PAYLOADS.values() for layer in pair))
     places = {layer: at for at, layer in enumerate(layers, 1)}
     constants = {

@@ -37,11 +37,7 @@ _FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
 
 
 def from_connection(connection: Connection) -> Channel:
-    """Return the channel of one of rosbags' connections.
-
-    Raises:
-        LocalError: its messages are not CDR.
-    """
+    """Return the channel of one of rosbags' connections. Raises ``LocalError``: its messages are not CDR."""
     extra = connection.ext
     definition_format = _FORMATS[connection.msgdef.format]
     if isinstance(extra, ConnectionExtRosbag1):

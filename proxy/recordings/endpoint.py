@@ -42,11 +42,7 @@ class _TopicsEndpoint(InProcessEndpoint):
         self._put(GraphChanged())
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Refuse: a recording has its own definitions and no installed types.
-
-        Raises:
-            LocalError: always.
-        """
+        """Refuse: a recording has its own definitions and no installed types. Raises ``LocalError``: always."""
         raise LocalError(f"{self.label}: {topic}: its messages bring the definition of {type_name}")
 
     def service(self, name: str, type_name: str) -> Service:
@@ -107,11 +103,7 @@ class ReplayEndpoint(_TopicsEndpoint):
         return index in self._subscribed
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Subscribe to a topic.
-
-        Raises:
-            LocalError: the recording does not have it.
-        """
+        """Subscribe to a topic. Raises ``LocalError``: the recording does not have it."""
         del qos
         indexes = self.channels_of(topic, type_name)
         if not indexes:

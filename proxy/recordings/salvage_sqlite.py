@@ -82,11 +82,7 @@ def _journal(path: Path) -> Path:
 
 
 class SqliteSource:
-    """The readable part of a database.
-
-    Raises:
-        SalvageError: not even its topics can be read.
-    """
+    """The readable part of a database. Raises ``SalvageError``: not even its topics can be read."""
 
     def __init__(self, path: Path) -> None:
         self.channels: list[Channel] = []

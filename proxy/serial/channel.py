@@ -87,11 +87,7 @@ class Channel(FieldSet):
     callerid: Annotated[str | None, Keyed("c", TEXT, absent=None, is_omitted=True)] = None
 
     def to_wire(self) -> bytes:
-        """Return the bounded CBOR form.
-
-        Raises:
-            LocalError: a part is longer than a peer would accept.
-        """
+        """Return the bounded CBOR form. Raises ``LocalError``: a part is longer than a peer would accept."""
         wire = self.to_cbor()
         try:
             Channel.from_cbor(wire)

@@ -136,11 +136,7 @@ class MessageRecorder(Protocol):
     """An endpoint that keeps what a far publisher says of each message."""
 
     def record(self, handle: int, raw: bytes, origin: Origin) -> None:
-        """Record one message of a channel.
-
-        Raises:
-            LocalError: a recording cannot be written.
-        """
+        """Record one message of a channel. Raises ``LocalError``: a recording cannot be written."""
 
 
 class RosEndpoint(Protocol):
