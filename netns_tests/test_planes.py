@@ -20,8 +20,7 @@ from weakref import WeakKeyDictionary
 import pytest
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.frame.codec import ETHERTYPE, Kind, decode
 from gdp.ports import raw, sockets
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.mmsg import MmsgBatch

@@ -15,7 +15,7 @@ from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import seal_key
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import READER
 from gdp.message.acknack import AckNack
 from gdp.names import Name

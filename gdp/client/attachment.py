@@ -17,6 +17,7 @@ from typing import Final, TypeAlias
 
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello import NodeSettings
 from gdp.control.hello_port import TWO_HELLOS_S
 from gdp.control.join import Join, JoinRefresh
 from gdp.control.neighbour import Neighbour
@@ -25,7 +26,6 @@ from gdp.control.pace import ReaderPace
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.rib_statements import AdvertiseAck
-from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -34,8 +34,7 @@ from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind
 from gdp.intervals import SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name

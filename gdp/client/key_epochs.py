@@ -13,7 +13,7 @@ from gdp.client.identities import WriterIdentity
 from gdp.crypto.envelope import KeyContext, Opener, Sealer
 from gdp.crypto.parity_seal import ParityOpener, ParitySealer
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import EPOCH_GRACE_S
 from gdp.names import Name
 

@@ -20,8 +20,7 @@ from gdp.client.identities import WriterIdentity
 from gdp.crypto.control_seal import ControlOpener, ControlReplayWindow, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
-from gdp.frame.codec import Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind
 from gdp.intervals import FORGET_S, NEVER_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart

@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_record import UPLINKS_MAX, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import UPLINKS_MAX, CandidateType, Endpoint, EndpointRecord
 from gdp.names import Name
 from gdp.requests import Backoff
 

@@ -30,11 +30,11 @@ from gdp.frame.codec import (
     NUMBER_AT,
     PACE_AT,
     PART_AT,
+    Flag,
     Header,
     authenticated,
     encode,
 )
-from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 

@@ -40,10 +40,10 @@ from gdp.frame.codec import (
     NUMBER_AT,
     PACE_AT,
     PART_AT,
+    Flag,
     Header,
     encode,
 )
-from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
 __all__ = [

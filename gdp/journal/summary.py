@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from typing import Final
 
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, KIND_AT, SOURCE_AT
-from gdp.frame.kinds import CONTROL_FROM
+from gdp.frame.codec import CONTROL_FROM, DESTINATION_AT, HEADER_BYTES, KIND_AT, SOURCE_AT
 from gdp.journal.incident import Incident, well_formed
 from gdp.journal.replay import kind_of
 from gdp.names import Name

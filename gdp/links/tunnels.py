@@ -16,8 +16,7 @@ from types import MappingProxyType
 from typing import Final
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
-from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
+from gdp.control.endpoints import UPLINKS_MAX, Endpoint, EndpointRecord, inner_address, tunnel_vni
 from gdp.control.preshared_key import NO_KEY
 from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity

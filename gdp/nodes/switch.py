@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gdp.config.config import SwitchConfig
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError

@@ -24,13 +24,14 @@ from typing import Final
 from gdp import burst
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import (
+    CONTROL_FROM,
     ETHER_BYTES,
     FLAGS_AT,
     HOPS_AT,
     KIND_AT,
     OVERHEAD_BYTES,
+    Flag,
 )
-from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one

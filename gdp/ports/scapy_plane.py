@@ -21,8 +21,7 @@ from scapy.sendrecv import sendp, sniff
 from scapy.utils import str2mac
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import ETHER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.frame.layers import GDP
 from gdp.ports.mmsg import send_failure
 from gdp.ports.netdev import NetdevPlane

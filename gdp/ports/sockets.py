@@ -30,8 +30,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag, Kind
+from gdp.frame.codec import CONTROL_FROM, ETHER_BYTES, ETHERTYPE, FLAGS_AT, KIND_AT, Flag, Kind
 
 AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
 NO_RAW_SOCKETS: Final = f"raw sockets need root or CAP_NET_RAW; {AS_ROOT}"

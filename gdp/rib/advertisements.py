@@ -14,7 +14,7 @@ from gdp.control.rib_statements import AdvertiseAck, RelayedStatement
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.rib.revocations import send_revoking
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState

@@ -13,7 +13,7 @@ from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import LEASE_MIN_S, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn

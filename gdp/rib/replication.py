@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.endpoint_record import ENDPOINTS
+from gdp.control.endpoints import ENDPOINTS
 from gdp.control.rib_replication import Entry
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import CLOCK_SKEW_S
 from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.route import Route, Withdrawn

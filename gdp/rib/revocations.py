@@ -14,7 +14,7 @@ from typing import Final
 from gdp.control.rib_statements import Query, RelayedStatement
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.rib.state import RibCoreState

@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from gdp.control.endpoint_record import ENDPOINTS
+from gdp.control.endpoints import ENDPOINTS
 from gdp.control.presence import IdentityChecks
 from gdp.control.rib_replication import Entry, Key
 from gdp.crypto.certificates import Membership, Role

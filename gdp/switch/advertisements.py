@@ -17,7 +17,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.control.rib_statements import AdvertiseAck
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import ADVERTISEMENTS_RATE, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from gdp.control.join import NUMBERS_MAX, Join, JoinRefresh, Route
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff

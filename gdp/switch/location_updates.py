@@ -15,7 +15,7 @@ from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Re
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.forwarding_state import ForwardingState, KnownLocation

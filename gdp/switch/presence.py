@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from gdp.control.presence import Presence
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.unicast import Unicast

@@ -21,7 +21,7 @@ from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests

@@ -28,7 +28,7 @@ from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import REFUSED_S
 from gdp.names import Name
 from gdp.sansio import Timestamps

@@ -28,9 +28,8 @@ from scapy.fields import (
 from scapy.packet import Packet
 
 from gdp.errors import LocalError
-from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH
+from gdp.frame.codec import ETHERTYPE, HEADER_BYTES, HOPS_MASK, SECOND_PATH, VERSION, Kind
 from gdp.frame.diagnostic import SHOWN_BYTES
-from gdp.frame.kinds import ETHERTYPE, VERSION, Kind
 from gdp.frame.layers import (
     GDP,
     KIND_NAMES,

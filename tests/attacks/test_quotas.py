@@ -16,8 +16,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from gdp.intervals import Rate
 from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_RATE
 from gdp.metadata import Metadata

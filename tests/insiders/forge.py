@@ -31,8 +31,7 @@ from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.exchange.sync_message import ASKED_MAX, ITEMS_MAX, LACKING_MAX, SETS_MAX
 from gdp.exchange.sync_set import LINE_BYTES, line_of
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, encode
 from gdp.intervals import DAY_S
 from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT
 from gdp.message import bundle

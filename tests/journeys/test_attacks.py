@@ -15,8 +15,7 @@ from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import StatementType, sign
 from gdp.errors import DropReason
-from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, decode, encode
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame

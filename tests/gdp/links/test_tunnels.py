@@ -8,8 +8,8 @@ from typing import cast
 
 import pytest
 
+from gdp.control.hello import NodeSettings
 from gdp.control.preshared_key import NO_KEY
-from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import TunnelId
 from gdp.errors import LocalError
 from gdp.links import tunnels as tunnels_module

@@ -11,7 +11,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.intervals import CONNECT_S
 from gdp.links.relay_context import tls_context
 from gdp.relay.connection import ConnectionState, RelayConnection
