@@ -105,11 +105,7 @@ class KeyEpochs:
 
 
 class Openers:
-    """Openers of what one incarnation of a writer seals.
-
-    Args:
-        is_signed: its messages have signatures.
-    """
+    """Openers of what one incarnation of a writer seals; ``is_signed``: its messages have signatures."""
 
     def __init__(self, secrets: Secrets, publisher: Name, incarnation: int, topic: Name, *, is_signed: bool) -> None:
         self._secrets = secrets

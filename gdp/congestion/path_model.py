@@ -22,11 +22,7 @@ _LOSS_FRAMES: Final = 1_000
 
 
 class WindowedExtreme:
-    """Highest sample of a window, or the lowest one.
-
-    Args:
-        is_lowest: which of both.
-    """
+    """Highest sample of a window, or the lowest one; ``is_lowest``: which of both."""
 
     __slots__ = ("_sign", "_waiting")
 

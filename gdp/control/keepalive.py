@@ -215,11 +215,7 @@ class KeepaliveSession:
         *,
         poll: bool,
     ) -> bytes:
-        """Return the next keepalive, and schedule the one after it.
-
-        Args:
-            source: our name and incarnation.
-        """
+        """Return the next keepalive, and schedule the one after it; ``source``: our name and incarnation."""
         flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
         self.is_final_due = self.is_poll_due = False
         name, incarnation = source

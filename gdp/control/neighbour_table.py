@@ -24,11 +24,7 @@ Change = tuple[Neighbour, NeighbourState]
 
 
 class NeighbourTable:
-    """Neighbours of one node.
-
-    Attributes:
-        ports: by index, with the neighbours and candidates of each.
-    """
+    """Neighbours of one node; ``ports``: by index, with the neighbours and candidates of each."""
 
     def __init__(self) -> None:
         self.ports: dict[int, HelloPort] = {}

@@ -13,11 +13,7 @@ _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(Exception):  # noqa: N818  (not an error)
-    """A signal cancelled the work.
-
-    Attributes:
-        exit_code: exit code of a shell for that signal.
-    """
+    """A signal cancelled the work; ``exit_code``: exit code of a shell for that signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)

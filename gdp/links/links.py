@@ -48,11 +48,7 @@ class _Peer:
 
 
 class TunnelLinks:
-    """Decisions on the tunnels of a running switch.
-
-    Args:
-        underlays: a WireGuard device for each uplink.
-    """
+    """Decisions on the tunnels of a running switch; ``underlays``: a WireGuard device for each uplink."""
 
     def __init__(
         self,

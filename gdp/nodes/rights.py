@@ -42,11 +42,7 @@ _WRITABLE_BY_ALL: Final = stat.S_IWOTH
 
 
 def confine_switch(config: SwitchConfig, plane: str) -> None:
-    """Drop the rights that a switch does not need.
-
-    Args:
-        plane: the name of its data plane.
-    """
+    """Drop the rights that a switch does not need; ``plane``: the name of its data plane."""
     is_kernel = plane == "kernel"
     needs = Needs(
         capabilities=_DEVICE | (_PROGRAMS if is_kernel else frozenset()),

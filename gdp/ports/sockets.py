@@ -135,11 +135,7 @@ _BY_ADDRESS: Final = {
 
 
 def steps_of(traffic_class: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
-    """Return the filter of a traffic class.
-
-    Args:
-        neighbours: addresses, 6 bytes each; each one adds five steps.
-    """
+    """Return the filter of a traffic class; ``neighbours``: addresses, 6 bytes each; each one adds five steps."""
     steps: tuple[_Step, ...] = traffic_class.value
     if traffic_class not in _BY_ADDRESS:
         return steps

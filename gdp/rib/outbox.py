@@ -54,11 +54,7 @@ class RibOutbox:
         self.unknown_answers = 0
 
     def send_body(self, kind: Kind, body: Body, *to: Name, about: Key | None = None) -> None:
-        """Sign a body once, and send it to each of the names.
-
-        Args:
-            about: as of ``OutgoingStatement``.
-        """
+        """Sign a body once, and send it to each of the names; ``about``: as of ``OutgoingStatement``."""
         if to:
             wire = self._identity.signed(body)
             self._outgoing += [OutgoingStatement(name, kind, wire, about) for name in to]

@@ -17,11 +17,7 @@ LOAD_S: Final = 10.0  # until a replica counts as silent that has a snapshot to 
 
 
 class SnapshotRequests:
-    """At most one request at a time.
-
-    Args:
-        effects: requests to send are appended here.
-    """
+    """At most one request at a time; ``effects``: requests to send are appended here."""
 
     def __init__(self, effects: list[Ask | ReplicaCommand]) -> None:
         self._effects = effects

@@ -94,11 +94,7 @@ class LocationUpdates:
         return _location(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
 
     def receive(self, location: Location, statement: bytes, now_s: float) -> None:
-        """Store where an advertiser is, and update everything that depends on it.
-
-        Args:
-            statement: the proof of it.
-        """
+        """Store where an advertiser is, and update everything that depends on it; ``statement``: the proof of it."""
         is_ours = location.switch == self._state.me
         attachment = self._state.attached.get(location.name, location.advertiser)
         if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:

@@ -26,11 +26,7 @@ class _Question:
 
 
 class PresenceAnswers:
-    """Open questions of RIBs about attached nodes.
-
-    Attributes:
-        open: by the node that each is about.
-    """
+    """Open questions of RIBs about attached nodes; ``open``: by the node that each is about."""
 
     def __init__(self, state: ForwardingState, unicast: Unicast) -> None:
         self._state = state

@@ -23,11 +23,7 @@ def adaptation_of(rule: Rule) -> Adaptation:
 
 
 class PathAdaptation(Adaptation):
-    """Adaptation of one topic to its path.
-
-    Args:
-        bounds: of rate and quality.
-    """
+    """Adaptation of one topic to its path; ``bounds``: of rate and quality."""
 
     __slots__ = ("_controller", "_dropped", "_looked_s", "_on_way", "_refused")
 

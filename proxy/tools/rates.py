@@ -15,11 +15,7 @@ _UNITS = ((1e6, "MB"), (1e3, "KB"))
 
 
 class Arrivals:
-    """Arrival times and sizes of the latest messages of a topic.
-
-    Args:
-        window: most messages that count, at least 2.
-    """
+    """Arrival times and sizes of the latest messages of a topic; ``window``: most messages that count, at least 2."""
 
     def __init__(self, window: int) -> None:
         self._latest = deque[tuple[float, int]](maxlen=window)
@@ -39,11 +35,7 @@ class Arrivals:
 
 
 class Frequency(NamedTuple):
-    """Rate of messages, and the spread of the time between two of them.
-
-    Attributes:
-        window: messages in the window.
-    """
+    """Rate of messages, and the spread of the time between two of them; ``window``: messages in the window."""
 
     rate_hz: float
     min_s: float

@@ -71,11 +71,7 @@ class _Call:
 
 
 class RosbridgeSession:
-    """State of one connection.
-
-    Args:
-        goal_id: returns 16 random bytes.
-    """
+    """State of one connection; ``goal_id``: returns 16 random bytes."""
 
     def __init__(
         self, hub: Hub, number: int, queue: ClientQueue, now_s: Callable[[], float], goal_id: Callable[[], bytes]
