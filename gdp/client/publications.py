@@ -1,7 +1,4 @@
-"""Publications of a participant: a publisher for each name, and unicast streams where it serves or calls.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Publications of a participant: a publisher for each name, and unicast streams where it serves or calls."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Reception of a participant: frames go to their writer proxies; messages and reports come out.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Reception of a participant: frames go to their writer proxies; messages and reports come out."""
 
 from __future__ import annotations
 

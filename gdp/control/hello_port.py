@@ -1,7 +1,4 @@
-"""Port of the hello protocol: its session, its neighbours, and what hellos on it must carry.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Port of the hello protocol: its session, its neighbours, and what hellos on it must carry."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Neighbour table: the neighbours at all ports of a node, and what has changed about them since it was read.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Neighbour table: the neighbours at all ports of a node, and what has changed about them since it was read."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Plan of a switch's tunnels: which of its uplinks is joined to which uplink of a peer, and where to dial.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Plan of a switch's tunnels: which of its uplinks is joined to which uplink of a peer, and where to dial."""
 
 from __future__ import annotations
 

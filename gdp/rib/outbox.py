@@ -1,7 +1,4 @@
-"""Outbox of a RIB: it signs statements, and decides which members receive a route, its move or its end.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Outbox of a RIB: it signs statements, and decides which members receive a route, its move or its end."""
 
 from __future__ import annotations
 

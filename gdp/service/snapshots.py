@@ -1,7 +1,4 @@
-"""Snapshot requests of a replicated log: which replica is asked for its state, and until when.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Snapshot requests of a replicated log: which replica is asked for its state, and until when."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Adaptation of an exposed topic: its controller, and what the overlay's publisher shows of messages on their way.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Adaptation of an exposed topic: its controller, and what the overlay's publisher shows of messages on their way."""
 
 from __future__ import annotations
 

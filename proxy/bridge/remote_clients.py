@@ -1,7 +1,4 @@
-"""Remote clients of a local service: their liveness, decoders of their requests, and requests that wait for those.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Remote clients of a local service: their liveness, decoders of their requests, and requests that wait for those."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rates of a topic: messages and bytes in a window, as ``ros2 topic hz`` and ``ros2 topic bw`` state them.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Rates of a topic: messages and bytes in a window, as ``ros2 topic hz`` and ``ros2 topic bw`` state them."""
 
 from __future__ import annotations
 
