@@ -13,9 +13,10 @@ import typer
 from fog.cli.launch import WAIT_S, follow
 from fog.cli.market import choices, market, refusal
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened, the_cluster
-from fog.cli.views import print_json, stage
+from fog.cli.views import print_json
 from fog.cluster import ClusterPlan
 from fog.supervisor.background import ensure
+from fog.supervisor.core.record import stage
 from fog.supervisor.infrastructure import open_provider, set_up
 from gdp.cli.node import Logs, running
 from gdp.errors import LocalError

@@ -19,9 +19,10 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final
 
+from gdp.burst.cipher import TAG_BYTES
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.redundancy import CopyBudget
-from gdp.crypto.envelope import SIGNATURE_BYTES, TAG_BYTES, fragment_capacity
+from gdp.crypto.envelope import SIGNATURE_BYTES, fragment_capacity
 from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT, PACE_AT, PARTS_MASK, Flag
 from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.envelope import TAG_BYTES
+from gdp.burst.cipher import TAG_BYTES
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import (
     HEADER_BYTES,

@@ -46,25 +46,6 @@ from gdp.frame.codec import (
 )
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
 
-__all__ = [
-    "SALT_BYTES",
-    "SEAL_BYTES",
-    "SHARED_FLAGS",
-    "SIGNATURE_BYTES",
-    "TAG_BYTES",
-    "KeyContext",
-    "MessageKeys",
-    "Opened",
-    "Opener",
-    "Sealed",
-    "Sealer",
-    "Signer",
-    "digest_of",
-    "fragment_capacity",
-    "salt_of",
-    "seal_key",
-]
-
 SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its ciphertext
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32

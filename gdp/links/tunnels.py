@@ -25,12 +25,13 @@ from gdp.errors import LocalError
 from gdp.intervals import FORGET_S, UPKEEP_S
 from gdp.limits import COST_AUTO
 from gdp.names import Name
+from gdp.ports.tunnel.control import PeerState
 from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.rate_limit import limit_rate
 from gdp.ports.tunnel.uplink_routes import mark_of, remove_leftovers
 from gdp.ports.tunnel.vxlan import VXLAN_PORT, make_vxlan, remove_link, set_link_mtu
-from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
+from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore

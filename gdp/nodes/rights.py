@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Final
 from gdp.host.single_instance import lock_directory
 from gdp.nodes.audit import audit_folder
 from gdp.nodes.credentials import NodeConfig, watched_folders
-from gdp.ports.sandbox import Capability, Needs, confine
+from gdp.ports.confine.capabilities import Capability
+from gdp.ports.sandbox import Needs, confine
 
 if TYPE_CHECKING:  # a node loads its own configuration alone
     from gdp.config.config import RibConfig, SwitchConfig

@@ -36,7 +36,7 @@ from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import Port, ReceivedFrame
+from gdp.ports.plane import Port
 from gdp.ports.sockets import (
     TrafficClass,
     attach_drop_all_filter,
@@ -45,6 +45,7 @@ from gdp.ports.sockets import (
     open_port,
     tell_neighbours,
 )
+from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 from gdp.token_bucket import TokenBucket

@@ -25,9 +25,10 @@ from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.frame.layers import GDP
 from gdp.ports.mmsg import send_failure
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.plane import MAC_BYTES, Port
 from gdp.ports.readiness import readable
 from gdp.ports.sockets import NO_RAW_SOCKETS, attach_ethertype_filter, kernel_drops, large_buffers
+from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import Table
 

@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gdp.burst.cipher import SALT_BYTES
 from gdp.crypto.envelope import (
-    SALT_BYTES,
     SEAL_BYTES,
     SIGNATURE_BYTES,
     KeyContext,

@@ -15,7 +15,8 @@ from gdp.errors import LocalError
 from gdp.links import tunnels as tunnels_module
 from gdp.links.tunnels import Tunnel, Tunnels
 from gdp.names import Name
-from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.ports.tunnel.control import PeerState
+from gdp.ports.tunnel.wireguard import WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
