@@ -15,6 +15,7 @@ from gdp.crypto.schema import CERT, NAME, REASON, STATEMENT, Body, Keyed, many, 
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason
 from gdp.intervals import LEASE_MAX_S
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
 
@@ -48,6 +49,7 @@ class Response(Body):
         transit: domains through which that domain lets its traffic pass.
         lease_s: of the location, or of a negative response; 0: the advertisement ended, or the RIB does not know.
         sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
+        cost: of the path to the advertiser's switch, from that of a reader that wants costs.
     """
 
     TYPE = StatementType.ANSWER
@@ -58,6 +60,7 @@ class Response(Body):
     transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
     lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
     sequence: Annotated[int, Keyed("s", uint())] = 0
+    cost: Annotated[int | None, Keyed("k", uint(COST_UNREACHABLE), absent=None, is_omitted=True)] = None
 
     @property
     def is_negative(self) -> bool:
