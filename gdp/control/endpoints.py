@@ -27,9 +27,9 @@ from gdp.errors import DropReason, LocalError, StatementError
 from gdp.names import Name
 from gdp.trust.domain import Policy
 
-ENDPOINTS: Final = b"endpoints"
+ENDPOINTS: Final = b"endpoints"  # name of the set that RIBs equalise
 ENDPOINT_NAMES_MAX: Final = 64  # in one request of a switch
-_LEASE_BYTES: Final = 4
+_LEASE_BYTES: Final = 4  # of an item of that set
 CANDIDATES_MAX: Final = 16
 UPLINKS_MAX: Final = 4
 RECORD_MAX_BYTES: Final = 4 << 10

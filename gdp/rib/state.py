@@ -37,7 +37,7 @@ from gdp.trust.verifier import AdvertisementVerifier
 if TYPE_CHECKING:
     from gdp.diagnosis.facts import GoneFact
 
-_NAMES_MAX: Final = 4_096
+_NAMES_MAX: Final = 4_096  # whose former advertisers are kept
 _ADVERTISERS_MAX: Final = 16  # of one name
 _LAPSED: Final = "lapsed"
 _WITHDREW: Final = "withdrew"
