@@ -24,9 +24,10 @@ RIGHTS = {
     "viewer": {"/camera/image": [Right.READ], "/odom": [Right.READ]},
 }
 CLIENT = """
-import json, struct, sys
+import json, ssl, struct, sys
 from websockets.sync.client import connect
-with connect(sys.argv[1], subprotocols=["foxglove.websocket.v1"], max_size=None) as socket:
+context = ssl.create_default_context(cafile=sys.argv[2])
+with connect(sys.argv[1], ssl=context, subprotocols=["foxglove.websocket.v1"], max_size=None) as socket:
     print(json.loads(socket.recv())["op"], flush=True)
     channels = {}
     while len(channels) < 2:
@@ -79,11 +80,13 @@ def _configure(lab: SessionLab, label: str, *names: str) -> None:
     (lab.folder / f"{label}.yaml").write_text(yaml.safe_dump(config))
 
 
-def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -> None:
-    door = lab.python("-m", "gdp.cli.gdp", "foxglove", "viewer", "--json")
+def test_a_replayed_recording_reaches_a_foxglove_client_whole_through_tls(lab: SessionLab) -> None:
+    words = ["--domain", "domain", "--request", "viewer/node.csr", "--host", "127.0.0.1", "--out", "door.crt"]
+    lab.gdp("cert", "door", *words)
+    door = lab.python("-m", "gdp.cli.gdp", "foxglove", "viewer", "--tls", "door.crt", "--json")
     ready = json.loads(lines_of(door, 1)[0])
     assert (ready["event"], sorted(ready["reads"])) == ("ready", ["/camera/image", "/odom"])
-    client = lab.python("-c", CLIENT, ready["url"])
+    client = lab.python("-c", CLIENT, ready["url"], "domain/root.crt")
     info, channels = lines_of(client, 2)
     assert info == "serverInfo"
     assert json.loads(channels) == {

@@ -20,6 +20,8 @@ pytestmark = pytest.mark.netns
 
 STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"
 TIMEOUT_S = 1.0
+STOP = -1.0
+CONTROL = {"silence_s": 2.0, "stop": {"linear": {"x": STOP}}}
 PREFIX = "robot1"
 CROSSINGS = (
     Crossing("/odom", "nav_msgs/msg/Odometry", "a", "one"),
@@ -37,13 +39,14 @@ CROSSINGS = (
     Crossing("/leaving", SET_BOOL, "a", "b", "service"),
     Crossing("/prefixed", STRING, "a", "b", options={"prefix": PREFIX}),
     *(Crossing(f"/churn_{at}", STRING, "a", "b") for at in range(10)),
+    Crossing("/cmd_vel", "geometry_msgs/msg/Twist", "b dds", "a", options={"control": CONTROL}),
 )
 _ROS2 = """
 if 'reads' not in globals(): reads, talks = {}, {}
 from std_msgs.msg import String
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Image
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import TransformStamped, Twist, Vector3
 from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -279,6 +282,42 @@ def test_flows_resume_when_a_killed_proxy_is_started_again(a: Peer, b: Peer, pai
     say(a, 2, 102)
     until(lambda: said(b)[-1:] == [101], "all of /twice")
     assert [number for number in said(b) if number > 1] == list(range(2, 102))
+
+
+def control(pair: Pair, label: str, *words: str) -> str:
+    """Return who holds the control of ``/cmd_vel``, after a command through a proxy."""
+    verb, *others = words
+    printed = gdp_command("control", verb, "/cmd_vel", *others, "--node", pair.identity(label), "--json")
+    (reader,) = json.loads(printed)["readers"]
+    return str(reader["holder"])
+
+
+def writers(pair: Pair) -> list[object]:
+    """Return the publishers of ``/cmd_vel`` that proxy "a" knows."""
+    rows = json.loads(gdp_command("show", "peers", "--node", pair.identity("a"), "--json"))["rows"]
+    return [row["peer"] for row in rows if (row["local"], row["is"]) == ("/cmd_vel", "writer")]
+
+
+def test_one_of_two_publishers_drives_and_its_silence_is_answered_by_a_stop(a: Peer, b: Peer, pair: Pair) -> None:
+    other = node_of(pair, "dds")
+    a.tell("read(Twist, '/cmd_vel')")
+    for node, speed in ((b, 1.0), (other, 2.0)):
+        node.tell(f"!stick, m = node.create_publisher(Twist, '/cmd_vel', 10), Twist(linear=Vector3(x={speed}))")
+        node.tell("!timer = node.create_timer(0.05, lambda: stick.publish(m))")
+    speeds = "[each[0][0] for each in heard['/cmd_vel']]"
+    until(lambda: len(writers(pair)) == 2, "both publishers are known to the robot's proxy")
+    refused = 'gdp_drops_total{reason="not-in-control"}'
+    until(lambda: pair.proxy("a").metric(refused) > 0, "messages of a publisher without control")
+    assert control(pair, "b", "take") == "proxy-b"
+    a.waits_for(f"{speeds}[-1:]", [1.0])
+    assert set(a.tell(speeds)) <= {1.0, STOP}  # type: ignore[call-overload]
+    assert control(pair, "dds", "take", "--force") == "proxy-dds"
+    a.waits_for(f"{speeds}[-1:]", [2.0])
+    other.tell("!timer.cancel()")
+    a.waits_for(f"{speeds}[-1:]", [STOP])
+    b.tell("!timer.cancel()")
+    assert control(pair, "a", "show") == "proxy-dds"
+    assert control(pair, "a", "give") == ""
 
 
 @pytest.mark.nightly

@@ -28,6 +28,7 @@ from gdp.stores.issue import (
     admit,
     admit_node,
     install_membership,
+    issue_door,
     renew,
     renew_node,
     succeed_owner,
@@ -121,6 +122,31 @@ def issue(
     else:
         raise LocalError("cert issue: give either --node, or --request with --out")
     show({**_described(member), **written}, as_json=as_json)
+
+
+@app.command("door")
+def door(
+    domain: Domain,
+    request: Annotated[Path, typer.Option("--request", metavar="FILE", help="node.csr of the door's node")],
+    hosts: Annotated[
+        list[str], typer.Option("--host", metavar="HOST", help="a name or address for clients; repeatable")
+    ],
+    out: OutFile,
+    days: options.Days = MEMBER_DAYS,
+    force: options.Force = False,
+    as_json: options.Json = False,
+) -> None:
+    """Issue the TLS certificate of a door, for browsers and others that trust the domain's root.
+
+    \b
+    Example:
+      gdp cert door --domain keys/school --request viewer/node.csr --host 192.0.2.7 --out viewer/door.crt
+    """
+    if not force:
+        refuse_existing(out)
+    issued_ = parsed(request, lambda wire: issue_door(domain, wire, hosts, days=days), read_public(request))
+    write_all(out.parent, {out.name: public(to_pem(issued_))}, force=force)
+    show({"certificate": str(out), "hosts": hosts, "days": days}, as_json=as_json)
 
 
 @app.command("renew")

@@ -10,7 +10,7 @@ key's signature (RFC 6979 for those of this process).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from typing import Final
@@ -18,6 +18,7 @@ from typing import Final
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
@@ -133,11 +134,14 @@ class CertificateAuthority:
     def _issue(self, holder: SubjectInfo, validity: Validity) -> Membership:
         return Membership.from_wire(self.sign(holder, validity), self.root, validity.not_before_unix_s)
 
-    def sign(self, holder: SubjectInfo, validity: Validity) -> bytes:
+    def sign(self, holder: SubjectInfo, validity: Validity, hosts: Sequence[str] = ()) -> bytes:
         """Return a certificate, DER, that is no authority; the caller has decided about its holder.
 
+        Args:
+            hosts: names and addresses of a server, for clients that know nothing of domains but their root.
+
         Raises:
-            LocalError: it would outlive the root.
+            LocalError: it would outlive the root, or one of the hosts is none.
         """
         if validity.not_after_unix_s > self.root.validity.not_after_unix_s:
             raise LocalError("a certificate cannot outlive the root of its domain")
@@ -145,12 +149,14 @@ class CertificateAuthority:
         subject = distinguished_name(holder.unit, holder.label)
         key_id = x509.AuthorityKeyIdentifier(self.root.key_id or None, None, None)
         builder = (
-            _builder(self.next_serial(), issuer, subject, holder.subject, holder.key, validity)
+            _builder(self.next_serial(), issuer, subject, holder.subject, holder.key, validity, hosts=hosts)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_key_usage(is_authority=False), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
             .add_extension(key_id, critical=False)
         )
+        if hosts:
+            builder = builder.add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         return signed_certificate(builder, self.key)
 
 
@@ -176,6 +182,7 @@ def _builder(
     key: PublicKey,
     validity: Validity,
     retires_unix_s: int | None = None,
+    hosts: Sequence[str] = (),
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
@@ -185,7 +192,7 @@ def _builder(
         .public_key(key.point)
         .not_valid_before(_moment(validity.not_before_unix_s))
         .not_valid_after(_moment(validity.not_after_unix_s))
-        .add_extension(alternative_names(subject, retires_unix_s), critical=False)
+        .add_extension(alternative_names(subject, retires_unix_s, hosts), critical=False)
     )
 
 

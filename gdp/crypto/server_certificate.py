@@ -1,12 +1,13 @@
-"""Certificate of a domain's enrolment server: a leaf that the domain's root issues for TLS.
+"""Certificates that the domain's root issues to servers for TLS: to the enrolment server, and to doors.
 
-Sans-I/O. Its unit is ``enrolment``, which is no role of a node: no member's certificate serves in its place. Source:
-RFC 5280; RFC 5929, section 4 (its hash binds what is said to the TLS connection).
+Sans-I/O. Their units ``enrolment`` and ``door`` are no roles of nodes: no member's certificate serves in their place,
+nor one of them as a membership. Source: RFC 5280; RFC 5929, section 4 (a hash binds what is said to the connection).
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Final
 
 from gdp.crypto.ca import CertificateAuthority
@@ -14,11 +15,12 @@ from gdp.crypto.certificates import Root
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
-from gdp.crypto.x509_profile import SubjectInfo, bad, read
+from gdp.crypto.x509_profile import SubjectInfo, bad, read, read_request
 from gdp.errors import DropReason, StatementError
 from gdp.metadata import Metadata
 
 _UNIT: Final = "enrolment"
+_DOOR: Final = "door"
 
 
 def issue_server_certificate(authority: CertificateAuthority, key: PublicKey, validity: Validity) -> bytes:
@@ -26,6 +28,24 @@ def issue_server_certificate(authority: CertificateAuthority, key: PublicKey, va
     label = authority.root.label
     subject = Subject.of(Metadata({"kind": _UNIT, "name": label}), key.compressed)
     return authority.sign(SubjectInfo(subject, _UNIT, label, key), validity)
+
+
+def issue_door_certificate(
+    authority: CertificateAuthority, request: bytes, hosts: Sequence[str], validity: Validity
+) -> bytes:
+    """Return the certificate, DER, by which the door of a node shows its hosts to clients that trust the root.
+
+    Args:
+        request: of the node, PKCS #10, DER or PEM.
+        hosts: names and addresses under which clients connect.
+
+    Raises:
+        StatementError: the request is not valid.
+        LocalError: the certificate would outlive the root, or one of the hosts is none.
+    """
+    node = read_request(request)
+    subject = Subject.of(Metadata({"kind": _DOOR, "name": node.label}), node.key.compressed)
+    return authority.sign(SubjectInfo(subject, _DOOR, node.label, node.key), validity, hosts)
 
 
 def verify_server_certificate(wire: bytes, root: Root, unix_s: float) -> None:

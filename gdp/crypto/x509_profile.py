@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Final, TypeVar
 
 from cryptography import x509
@@ -42,6 +43,7 @@ DOMAIN_UNIT: Final = "domain"
 
 _T = TypeVar("_T")
 _UNIX_SECOND: Final = re.compile(r"[0-9]{1,12}", re.ASCII)
+_HOST: Final = re.compile(r"(?=.{1,253}\Z)[a-z0-9]([a-z0-9-]*[a-z0-9])?(\.[a-z0-9]([a-z0-9-]*[a-z0-9])?)*", re.I | re.A)
 _PEM: Final = b"-----"
 
 _UNDERSTOOD: Final = frozenset(
@@ -133,16 +135,30 @@ def distinguished_name(unit: str, label: str) -> x509.Name:
     )
 
 
-def alternative_names(subject: Subject, retires_unix_s: int | None = None) -> x509.SubjectAlternativeName:
+def alternative_names(
+    subject: Subject, retires_unix_s: int | None = None, hosts: Iterable[str] = ()
+) -> x509.SubjectAlternativeName:
     """Return the URIs that carry a name and its parts.
 
     Args:
         retires_unix_s: of a root that succeeds another: until when that one is trusted.
+        hosts: names and addresses of a server, by which its clients know it.
     """
     texts = [NAME_URI + subject.name.to_text(), METADATA_URI + subject.digest.hex()]
     if retires_unix_s is not None:
         texts += [FOUNDER_URI + subject.owner_key.hex(), f"{RETIRES_URI}{retires_unix_s}"]
-    return x509.SubjectAlternativeName([x509.UniformResourceIdentifier(text) for text in texts])
+    uris = [x509.UniformResourceIdentifier(text) for text in texts]
+    return x509.SubjectAlternativeName([*uris, *map(_host, hosts)])
+
+
+def _host(text: str) -> x509.GeneralName:
+    """Return an address, or a name of DNS (RFC 5280, section 4.2.1.6). Raises ``LocalError``: it is neither."""
+    try:
+        return x509.IPAddress(ip_address(text))
+    except ValueError:
+        if not _HOST.fullmatch(text):
+            raise LocalError(f"expected the name or the address of a host, not {text!r}") from None
+        return x509.DNSName(text)
 
 
 def _strictly(wire: bytes, reader: Callable[[bytes], _T]) -> _T:

@@ -121,12 +121,13 @@ def tls_context(identity: Identity, policy: Policy, *, is_server: bool) -> ssl.S
     for root in policy.roots.values():
         for each in root.lineage:
             context.load_verify_locations(cadata=each.wire)
-    _load_own(context, to_pem(identity.membership) + key.to_pem())
+    load_own(context, to_pem(identity.membership) + key.to_pem())
     return context
 
 
-def _load_own(context: ssl.SSLContext, pem: bytes) -> None:
-    descriptor = os.memfd_create("gdp-relay", os.MFD_CLOEXEC)
+def load_own(context: ssl.SSLContext, pem: bytes) -> None:
+    """Load certificate and private key. Raises ``LocalError``: the TLS library refuses them."""
+    descriptor = os.memfd_create("gdp-tls", os.MFD_CLOEXEC)
     try:
         os.write(descriptor, pem)
         context.load_cert_chain(f"/proc/self/fd/{descriptor}")

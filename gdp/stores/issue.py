@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +16,7 @@ from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Membership, Role, Root, Unverified
 from gdp.crypto.identity import Identity, NodeKeys, node_metadata
 from gdp.crypto.keys import SigningKey
+from gdp.crypto.server_certificate import issue_door_certificate
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError, StatementError
@@ -206,6 +207,14 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
     member = authority.issue(request, _within(authority.root, now, days))
     _issued(domain, member, now)
     return member
+
+
+def issue_door(
+    domain: Path, request: bytes, hosts: Sequence[str], *, days: float = MEMBER_DAYS, unix_s: float | None = None
+) -> bytes:
+    """Return the TLS certificate, DER, of the door of a node that made a request; as ``issue_door_certificate``."""
+    authority = load_domain(domain)
+    return issue_door_certificate(authority, request, hosts, _within(authority.root, _now(unix_s), days))
 
 
 def admit_node(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
@@ -14,6 +16,7 @@ from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json
 from gdp.cli.secret import Secret
 from gdp.errors import LocalError
+from gdp.host_port import split_host_port
 from gdp.links.uplink import wait_for_device
 from proxy.cli.tool_options import Delegations, Iface
 
@@ -59,6 +62,10 @@ def door_token(file: Path | None, *, no_token: bool) -> str:
     return token
 
 
+Tls = Annotated[
+    Path | None,
+    typer.Option("--tls", metavar="FILE", help="Serve wss:// by this certificate, as 'gdp cert door' issues it."),
+]
 DoorNode = Annotated[
     Path,
     typer.Argument(
@@ -75,6 +82,7 @@ class DoorOptions(NamedTuple):
     """Options of every door: who may connect, and which member it is."""
 
     token_file: TokenFile = None
+    tls: Tls = None
     no_token: NoToken = False
     iface: Iface = None
     delegations: Delegations = None
@@ -104,5 +112,19 @@ def serve_door(
     config, _ = member_config(node, options.iface, options.delegations)
     token = door_token(options.token_file, no_token=options.no_token)
     settings = DoorSettings(label=label, listen=listen, origins=tuple(origins), subprotocols=subprotocols, token=token)
+    if options.tls is None and not _is_loopback(split_host_port(listen)[0]):
+        log.warning("other machines may read what clients send, token included: %s is no loopback; see --tls", listen)
     wait_for_device(config.iface, options.await_iface)
-    run_door(config, lambda rights: DoorEndpoint(settings, new_session, rights), json=options.json)
+    run_door(
+        config,
+        lambda rights, tls: DoorEndpoint(replace(settings, tls=tls), new_session, rights),
+        certificate=options.tls,
+        json=options.json,
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -26,7 +26,7 @@ from gdp.access_token import is_access_token, query_token
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
 from gdp.host_port import split_host_port
-from gdp.intervals import FORGET_S
+from gdp.intervals import CONNECT_S, FORGET_S
 from gdp.ports.socket_owners import SocketOwners
 from gdp.ports.tcp_server import listen_tcp
 from gdp_extensions.doors.core.arrivals import Arrivals
@@ -39,6 +39,8 @@ from proxy.serial.channel import Channel, Qos, Service
 from proxy.serial.standard_types import known_channel
 
 if TYPE_CHECKING:
+    from ssl import SSLContext
+
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
@@ -53,6 +55,7 @@ OUTPUT_MAX_BYTES: Final = 64 << 20  # messages of the bridge that wait for the s
 MESSAGE_MAX_BYTES: Final = 32 << 20  # of one message of a client
 ARRIVING_MAX_BYTES: Final = 64 << 20  # of the messages of all clients that have not come whole yet
 WAITING_MAX_BYTES: Final = 256 << 20  # of what waits for all clients
+STRANGERS_MAX: Final = 64  # connections that have shown no token yet; beyond, the oldest ends
 _REPORT_S: Final = 1.0  # at most one report of dropped messages a second
 _TRY_AGAIN: Final = 1013  # close code of the IANA registry
 
@@ -66,6 +69,7 @@ class DoorSettings:
         origins: values of the header Origin that are accepted; a client without the header is no browser, and accepted.
         subprotocols: WebSocket subprotocols, one of which a client must speak; none: it needs no subprotocol.
         token: that a client of another user, or from elsewhere, states in its URL; empty: none states it.
+        tls: context of the server; None: what passes is not encrypted.
     """
 
     label: str
@@ -73,6 +77,7 @@ class DoorSettings:
     origins: tuple[str, ...] = ()
     subprotocols: tuple[str, ...] = ()
     token: str = field(default="", repr=False)
+    tls: SSLContext | None = None
     clients_max: int = 64
     queue_max_bytes: int = DATA_MAX_BYTES
     queue_max_messages: int = DATA_MAX_MESSAGES
@@ -111,6 +116,7 @@ class DoorEndpoint(InProcessEndpoint):
         self._heard: deque[tuple[Event, _Client | None]] = deque()  # events, and whose they are
         self._speaker: _Client | None = None  # whose message is being processed
         self._arrivals = Arrivals["ServerConnection"](ARRIVING_MAX_BYTES)
+        self._strangers: dict[ServerConnection, None] = {}
         self._input_bytes = 0  # written by the server's thread
         self._taken_bytes = 0  # written by the bridge's thread
         self._output_bytes = 0  # written by the bridge's thread
@@ -161,7 +167,8 @@ class DoorEndpoint(InProcessEndpoint):
     @property
     def _origin(self) -> str:
         host, port = self.address
-        return f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+        scheme = "ws" if self._settings.tls is None else "wss"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
     def dropped(self) -> int:
@@ -320,10 +327,17 @@ class DoorEndpoint(InProcessEndpoint):
         from websockets.asyncio.server import ServerConnection, serve
         from websockets.typing import Origin, Subprotocol
 
-        arrivals = self._arrivals
+        arrivals, strangers = self._arrivals, self._strangers
 
         class Connection(ServerConnection):
-            """Connection whose bytes are counted before the library keeps them."""
+            """Connection that is counted, and its bytes before the library keeps them."""
+
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                """Process the begin of the connection."""
+                super().connection_made(transport)
+                strangers[self] = None
+                if len(strangers) > STRANGERS_MAX:
+                    next(iter(strangers)).transport.abort()
 
             def data_received(self, data: bytes) -> None:
                 """Process bytes of the client."""
@@ -335,12 +349,15 @@ class DoorEndpoint(InProcessEndpoint):
             def connection_lost(self, exc: Exception | None) -> None:
                 """Process the end of the connection."""
                 arrivals.end(self)
+                strangers.pop(self, None)
                 super().connection_lost(exc)
 
         server = await serve(
             self._attend,
             create_connection=Connection,
             sock=self._socket,
+            ssl=self._settings.tls,
+            ssl_handshake_timeout=None if self._settings.tls is None else CONNECT_S,
             process_request=self._admit,
             origins=[None, *map(Origin, self._settings.origins)],
             subprotocols=[Subprotocol(each) for each in self._settings.subprotocols] or None,
@@ -370,6 +387,7 @@ class DoorEndpoint(InProcessEndpoint):
     async def _attend(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
 
+        self._strangers.pop(connection, None)
         if len(self._clients) >= self._settings.clients_max:
             await connection.close(_TRY_AGAIN, f"this door has {len(self._clients)} clients already")
             return

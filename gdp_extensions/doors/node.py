@@ -5,27 +5,36 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gdp.cli.node import emit, emit_wait, report
 from gdp.intervals import TICK_S, TURN_S
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.terminal import echo
 from gdp_extensions.doors.endpoint import DoorEndpoint
+from gdp_extensions.doors.tls import DoorTls
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.config.config import ProxyConfig
 from proxy.node.node import ProxyNode, run_node
 
+if TYPE_CHECKING:
+    from ssl import SSLContext
+
 log = logging.getLogger(__name__)
 
-OpenDoor = Callable[[Callable[[], DelegatedRules]], DoorEndpoint]
+OpenDoor = Callable[[Callable[[], DelegatedRules], "SSLContext | None"], DoorEndpoint]
 
 
-def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
-    """Serve clients until stopped; SIGHUP or ``gdp reload`` reads the delegations again.
+def run_door(config: ProxyConfig, open_door: OpenDoor, *, certificate: Path | None, json: bool) -> None:
+    """Serve clients until stopped; SIGHUP or ``gdp reload`` reads the delegations and the certificate again.
+
+    Args:
+        certificate: of TLS, as for ``DoorTls``; None: no TLS.
 
     Raises:
-        LocalError: keys, delegations, the device or the address are not as stated.
+        LocalError: keys, delegations, the certificate, the device or the address are not as stated.
     """
     sys.setswitchinterval(TURN_S)
     with run_node(config, emit_wait if json else None) as node:
@@ -33,11 +42,14 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
         state = [rules_of(list(held))]
         for name, reason in state[0].left_out:
             log.warning("delegation not offered name=%s reason=%s", name, reason)
-        door = open_door(lambda: state[0])
+        tls = None if certificate is None else DoorTls(certificate, node.identity)
+        door = open_door(lambda: state[0], None if tls is None else tls.context)
         try:
             node.state.bridge = bridge = Bridge(node.state.context, state[0], [door], held)
 
             def reload() -> None:
+                if tls is not None:
+                    tls.read_certificate()
                 again = DelegationStore(config.delegations, node.identity)
                 state[0] = rules_of(list(again))
                 bridge.reload(state[0], again)

@@ -492,6 +492,10 @@ class Bridge:
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
             return
         self._undelegated.pop(key, None)
+        if self._bypasses_control(key, flow_spec):
+            detail = "a rule has this topic under exclusive control, and another name brings it, too: use one name"
+            self._failed[key] = ConfigProblem(flow_spec.local, Fault.REFUSED, detail)
+            return
         if flow_spec.name in self._finishing:
             self._close_finishing(flow_spec.name)
         try:
@@ -509,6 +513,13 @@ class Bridge:
             self._timed_topics[flow] = flow_spec.local
         self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
+
+    def _bypasses_control(self, key: _Key, flow_spec: FlowSpec) -> bool:
+        """Return whether two names would bring one local topic, of which one is under exclusive control."""
+        if key.is_exposed or key.kind != "topic":
+            return False
+        others = (its[0] for each, its in self._flows.items() if each[:-1] == key[:-1])
+        return any(flow_spec.rule.control or each.rule.control for each in others)
 
     def _make(self, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
         context = self._context

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,6 +24,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from gdp.errors import GdpError, LocalError
 from gdp.ports.socket_owners import SocketOwners
+from gdp_extensions.doors import command, node
 from gdp_extensions.doors.command import door_token
 from gdp_extensions.doors.core.arrivals import Arrivals
 from gdp_extensions.doors.core.client_queue import ClientQueue
@@ -30,9 +32,10 @@ from gdp_extensions.doors.core.foxglove_session import FoxgloveSession
 from gdp_extensions.doors.core.hub import Hub
 from gdp_extensions.doors.core.parameters import GET, LIST, SET
 from gdp_extensions.doors.core.rosbridge_session import IDS_MAX, RosbridgeSession
-from gdp_extensions.doors.endpoint import DoorEndpoint, DoorSettings
+from gdp_extensions.doors.endpoint import STRANGERS_MAX, DoorEndpoint, DoorSettings
 from lab.process import until
 from proxy.endpoints.core.endpoint import Event
+from proxy.node import member_config
 from proxy.serial.standard_types import known_channel
 from tests.draws import draws
 from tests.gdp_extensions.doors import test_foxglove_door as foxglove
@@ -137,6 +140,22 @@ def test_z02_a_door_has_a_new_token_at_each_start_unless_a_private_file_names_on
     file.write_text("short")
     with pytest.raises(LocalError, match="at least 16 characters"):
         door_token(file, no_token=False)
+
+
+def test_z02_an_address_other_than_loopback_without_tls_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = SimpleNamespace(iface="viewer0")
+    monkeypatch.setattr(member_config, "member_config", lambda *_: (config, tmp_path))
+    monkeypatch.setattr(command, "wait_for_device", lambda *_: None)
+    monkeypatch.setattr(node, "run_door", lambda *_, **__: None)
+    for listen, tls, warnings in (
+        ("127.0.0.1:9090", None, 0), ("localhost:9090", None, 0), ("[::1]:9090", None, 0),
+        ("0.0.0.0:9090", tmp_path / "door.crt", 0), ("0.0.0.0:9090", None, 1),
+    ):  # fmt: skip
+        caplog.clear()
+        command.serve_door("door", RosbridgeSession, tmp_path, listen, (), command.DoorOptions(tls=tls))  # type: ignore[arg-type]
+        assert sum("--tls" in each.getMessage() for each in caplog.records) == warnings, listen
 
 
 def test_z02_a_door_without_a_token_says_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -317,6 +336,19 @@ def test_z03_messages_that_never_end_cost_their_senders_the_connection() -> None
         until(lambda: door.clients <= 7, PATIENCE_S)
         assert door.clients >= 6
         assert is_served(other)
+
+
+def test_z03_connections_that_say_nothing_are_bounded_and_the_oldest_gives_way() -> None:
+    with door_of() as door, ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(door.address)) for _ in range(STRANGERS_MAX)]
+        until(lambda: len(door._strangers) == STRANGERS_MAX)
+        with connect("ws://{}:{}".format(*door.address)) as client:
+            silent[0].settimeout(PATIENCE_S)
+            with suppress(ConnectionResetError):
+                assert silent[0].recv(1) == b""
+            until(lambda: door.clients == 1 and len(door._strangers) == STRANGERS_MAX - 1)
+            client.send(json.dumps({"op": "call_service", "service": "/rosapi/topics"}))
+            assert "values" in json.loads(client.recv(PATIENCE_S))
 
 
 def test_z03_of_messages_on_their_way_the_one_that_began_first_gives_way() -> None:

@@ -35,6 +35,7 @@ from proxy.endpoints.core.qos import default
 from proxy.serial.standard_types import known_channel
 from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.bridge import known
+from tests.proxy.bridge import test_actions as actions
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 
@@ -48,6 +49,7 @@ def door_of(rights: DelegatedRules | None = None, **bounds: int) -> DoorEndpoint
         origins=("https://app.example",),
         subprotocols=SUBPROTOCOLS,
         token="",
+        tls=None,
         **bounds,
     )
     return DoorEndpoint(
@@ -371,5 +373,43 @@ def test_a_service_of_the_robot_is_called_through_the_overlay(tmp_path: Path) ->
             wanted = struct.pack("<BIII", 3, service["id"], 7, 3) + b"cdr" + known.switched("done")
             assert received(sites, foxglove) == wanted
             assert asked == [known.switch(on=True)]
+    finally:
+        door.shut_down()
+
+
+def test_a_goal_is_its_services_and_topics_for_a_client_without_words_for_actions(tmp_path: Path) -> None:
+    sites = Sites(tmp_path)
+    robot = sites.add(ROBOT, expose=[actions.RULE])
+    door = cast("DoorEndpoint", with_door(sites, expose=[], imports=[actions.RULE]).endpoints[0])
+    try:
+        server = actions.ActionServer(robot.graph)
+        offered, channels = dict[str, int](), dict[str, int]()
+        with client(door) as foxglove:
+
+            def call(part: str, raw: bytes) -> None:
+                service = offered[f"{actions.AT}{part}"]
+                foxglove.send(struct.pack("<BIII", 2, service, 1, 3) + b"cdr" + raw)
+
+            def answer() -> bytes:
+                data = received(sites, foxglove)
+                assert isinstance(data, bytes)
+                return data[16:] if data[0] == 3 else data[13:]
+
+            while len(offered) < 3 or len(channels) < 2:
+                fields = json.loads(received(sites, foxglove))
+                offered |= {each["name"]: each["id"] for each in fields.get("services", ())}
+                channels |= {each["topic"]: each["id"] for each in fields.get("channels", ())}
+            subscribe(foxglove, 1, channels[f"{actions.AT}feedback"])
+            until(lambda: bool(readers(door)))
+            call("send_goal", actions.goal(1, 10))
+            assert answer() == actions.ACCEPTED
+            call("get_result", actions.goal_id(1))
+            until(lambda: bool(sites.run(0.05) and server.results.waiting))
+            server.feedback.publish(actions.sequence(1, 0, 1))
+            assert answer() == actions.sequence(1, 0, 1)
+            call("cancel_goal", actions.goal_id(1))
+            assert answer() == actions.CANCELED
+            server.results.waiting[0][1](actions.result(0, 1, 1))
+            assert answer() == actions.result(0, 1, 1)
     finally:
         door.shut_down()

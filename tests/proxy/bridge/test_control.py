@@ -14,6 +14,7 @@ from gdp.control.diagnostics import Reply
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.message.clock_offset import ClockEstimate
+from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ports.plane import Plane
 from gdp.state.snapshot import short_id
@@ -25,7 +26,7 @@ from proxy.bridge.liveliness import names_from_fields
 from proxy.node.control_answer import answer_control
 from proxy.node.proxy_state import ProxyState, proxy_handlers
 from tests.proxy.bridge.known import channel, channels, services
-from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites
+from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named
 from tests.proxy.endpoints.fake import FakeGraph, Publication
 
 TWIST: Final = "geometry_msgs/msg/Twist"
@@ -286,6 +287,23 @@ def test_a_type_that_the_robot_does_not_have_is_stopped_by_the_far_definition(si
     stick.publish(twist(1.0))
     assert sites.run(2, lambda: len(ear.heard) == 2)
     assert ear.heard == [twist(1.0), twist(0.0)]
+
+
+@pytest.mark.parametrize("second", ["", ", control: exclusive"])
+def test_another_name_does_not_bring_a_topic_past_its_control(drive: Drive, second: str) -> None:
+    other, held = f"{DRIVE}, metadata: {{of: other}}", named("/cmd_vel", TWIST)
+    rule = f"{DRIVE}, control: {{silence_s: 0.5, stop: {{linear: {{x: {STOP}}}}}}}"
+    drive.sites.reload(drive.desks[OTHER], expose=[other])
+    imports = [rule, f"name: /**, metadata: {{of: other}}{second}"]
+    drive.sites.reload(drive.robot, imports=imports, holds=[held, Metadata({**held, "of": "other"})])
+    drive.sites.run(2)
+    drive.act(SERVER, "take")
+    drive.drive(OTHER, 2.0)
+    assert drive.speeds == []
+    (problem,) = drive.robot.bridge.problems
+    assert "use one name" in problem.detail
+    drive.drive(SERVER, 1.0)
+    assert drive.speeds[-1] == 1.0
 
 
 def test_holder_and_refused_messages_are_shown(drive: Drive) -> None:
