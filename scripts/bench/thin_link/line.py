@@ -83,10 +83,7 @@ class Line:
         return Used(up, down, after["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
-        try:
-            return self._process.ask(report=True, **order)
-        except BrokenPipeError:
-            return self._process.read(0.0)  # raises FailedError with the reason
+        return self._process.ask(report=True, **order)
 
 
 def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
