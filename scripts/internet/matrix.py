@@ -156,11 +156,10 @@ def _wait_for_direct(
     expected = {at for at, pair in enumerate(pairs) if allows_direct(*pair)}
     found: dict[int, float] = {}
     while True:
-        tunnels = {host.label: overlay.tunnels(host) for host in hosts["a"]}
+        links = {host.label: overlay.links(host) for host in hosts["a"]}
         now_s = time.monotonic() - begun_s
         for at, (one, other) in enumerate(ends):
-            row = tunnels[one.label].get(other.label, {})
-            if row.get("direct") and row.get("up"):
+            if any(each.is_direct and each.peer == other.label for each in links[one.label]):
                 found.setdefault(at, now_s)
         if expected <= found.keys() or time.monotonic() > deadline_s:
             return found
