@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -141,8 +141,8 @@ def open_line(
     path = lab.directory / f"{line}.json"
     settings = {
         "devices": ends,
-        "up": conditions.up.to_fields(),
-        "down": conditions.down.to_fields(),
+        "up": asdict(conditions.up),
+        "down": asdict(conditions.down),
         "seed": conditions.seed,
     }
     path.write_text(json.dumps(settings), encoding="ascii")

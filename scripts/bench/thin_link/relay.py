@@ -186,7 +186,7 @@ def main() -> None:
     """Run the relay of the command line."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
     settings: Mapping[str, Any] = json.loads(Path(sys.argv[1]).read_text(encoding="ascii"))
-    directions = [Direction.from_fields(settings[side]) for side in ("up", "down")]
+    directions = [Direction(**settings[side]) for side in ("up", "down")]
     seed = int(settings["seed"])
     up, down = (each.channel(2 * seed + at) for at, each in enumerate(directions))
     one, other = settings["devices"]
