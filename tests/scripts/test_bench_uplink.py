@@ -18,7 +18,7 @@ from machine import data_folder
 from report import Rounds
 from thin_link import score
 from thin_link.channel import Channel, ConstantRate, Loss, TraceRate
-from thin_link.conditions import Conditions, Direction, load_trace
+from thin_link.conditions import Conditions, load_trace
 from thin_link.exchange import Exchange, Window
 from thin_link.line import Flow, Used
 from thin_link.score import Report, idle_ms, link_figures, merged, stream_figures, whole_share
