@@ -19,10 +19,10 @@ from rich.console import Console
 from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import RunRegistry, outer_uid
-from internet.laboratory import TOOLS, Laboratory
 from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Display, Outcome, Pace, run_scenario
 from lab.command import console_of, end_on_signals, exit_with, new_app, tell
+from lab.internet.laboratory import TOOLS, Laboratory
 
 _PACE: Final = Pace()
 

@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 
 import gdp
 from gdp.trust.right import Right
-from internet.access import Access, allows_direct
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
+from lab.internet.access import Access, allows_direct
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
 
 _LOOK_S: Final = 0.25
 _GROUP: Final = 3
