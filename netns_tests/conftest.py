@@ -17,7 +17,7 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.table import Table
-from internet.laboratory import TOOLS, Laboratory
+from lab.internet.laboratory import TOOLS, Laboratory
 from lab.machine import LabMachine
 from lab.namespaces import Space
 from lab.process import python_path

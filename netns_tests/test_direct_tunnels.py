@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from internet.access import Access
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
 from lab.process import until
 
 pytestmark = [

@@ -15,9 +15,9 @@ import pytest
 from gdp.control.endpoints import Endpoint
 from gdp.host.run_registry import RunRegistry
 from gdp.ports.sockets import large_buffers
-from internet.access import TRAITS, Access
-from internet.host import ETHERNET, Host
-from internet.laboratory import Laboratory
+from lab.internet.access import TRAITS, Access
+from lab.internet.host import ETHERNET, Host
+from lab.internet.laboratory import Laboratory
 from lab.machine import LabMachine
 from lab.process import calling
 

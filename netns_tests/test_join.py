@@ -16,9 +16,9 @@ from gdp.errors import GdpError
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
-from internet.access import Access
-from internet.host import Host
-from internet.laboratory import Laboratory
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
 from lab.machine import GDP, gdp
 from lab.process import until
 from netns_tests.test_trace import traced

@@ -10,9 +10,9 @@ import shutil
 
 import pytest
 
-from internet.access import Access
-from internet.laboratory import Laboratory
-from internet.matrix import measure
+from lab.internet.access import Access
+from lab.internet.laboratory import Laboratory
+from lab.internet.matrix import measure
 
 pytestmark = pytest.mark.netns
 

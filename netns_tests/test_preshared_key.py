@@ -13,10 +13,10 @@ import pytest
 from gdp.control.tunnel_plan import underlay_ifname
 from gdp.ports.tunnel.uapi import socket_path
 from gdp.stores.keyring import CARD, load_card
-from internet.access import Access
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
 from lab.process import until
 
 pytestmark = [

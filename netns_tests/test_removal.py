@@ -12,8 +12,8 @@ import pytest
 
 import gdp
 from gdp.trust.right import Right
-from internet.laboratory import Laboratory
 from internet_demo.stage import Stage
+from lab.internet.laboratory import Laboratory
 from lab.process import until
 
 pytestmark = [

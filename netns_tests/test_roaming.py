@@ -15,12 +15,12 @@ import pytest
 
 import gdp
 from gdp.trust.right import Right
-from internet.access import Access
-from internet.flow import open_sessions
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
-from internet.site import Site
+from lab.internet.access import Access
+from lab.internet.flow import open_sessions
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
+from lab.internet.site import Site
 from lab.process import until
 from netns_tests.lifetimes import LEASE_S
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from gdp.host.run_registry import RunRegistry
-from internet.access import Access
-from internet.fresh_machine import FreshMachine
-from internet.laboratory import Laboratory
+from lab.internet.access import Access
+from lab.internet.fresh_machine import FreshMachine
+from lab.internet.laboratory import Laboratory
 
 pytestmark = [
     pytest.mark.netns,

@@ -24,9 +24,9 @@ from report import Rounds, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
-from internet.access import Access
-from internet.fresh_machine import FreshMachine, TypedCommand, typed_commands
-from internet.laboratory import Laboratory
+from lab.internet.access import Access
+from lab.internet.fresh_machine import FreshMachine, TypedCommand, typed_commands
+from lab.internet.laboratory import Laboratory
 from lab.process import FailedError, LabProcess, new_run
 
 PAGE: Final = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "internet.md"

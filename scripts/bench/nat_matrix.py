@@ -4,7 +4,7 @@
     sudo .venv/bin/python scripts/bench/nat_matrix.py --json           for programs
     sudo .venv/bin/python scripts/bench/nat_matrix.py --kinds public symmetric
 
-Exit status: 0 every pair is as ``internet.access`` says, 1 one is not.
+Exit status: 0 every pair is as ``lab.internet.access`` says, 1 one is not.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import sys
 from report import print_table
 
 from gdp.host.run_registry import RunRegistry
-from internet.access import Access
-from internet.laboratory import Laboratory
-from internet.matrix import Outcome, Pair, batches, measure
+from lab.internet.access import Access
+from lab.internet.laboratory import Laboratory
+from lab.internet.matrix import Outcome, Pair, batches, measure
 from lab.process import new_run
 
 KINDS = [each.value for each in Access]

@@ -187,7 +187,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, title: st
     """Print a table whose first ``words`` columns are words, and all others figures."""
     table = Table(title=title or None, title_justify="left")
     for at, heading in enumerate(head):
-        table.add_column(heading, justify="left" if at < words else "right")
+        table.add_column(heading, justify="left" if at < words else "right", no_wrap=words == 1 and at == 0)
     for row in rows:
         table.add_row(*row)
     _console().print(table)
@@ -210,16 +210,12 @@ def show(title: str, state: MachineState, settings: Settings, over: Rounds, targ
         "; ".join(f"{key}: {_setting_text(value)}" for key, value in settings.items()), highlight=False, soft_wrap=True
     )
     for case in over.cases():
-        columns = over.columns(case)
-        table = Table(title=case, title_justify="left")
-        table.add_column("", no_wrap=True)
-        for column in columns:
-            table.add_column(column, justify="right")
+        columns, rows = over.columns(case), []
         for contender, cases in over.values.items():
             if case in cases:
                 spreads = (over.spread(contender, case, column) for column in columns)
-                table.add_row(contender + state.mark, *("-" if spread is None else str(spread) for spread in spreads))
-        console.print(table)
+                rows.append((contender + state.mark, *("-" if spread is None else str(spread) for spread in spreads)))
+        print_table(("", *columns), rows, title=case)
     for target in targets:
         console.print(str(target), markup=False, highlight=False, soft_wrap=True)
 

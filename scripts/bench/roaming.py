@@ -21,11 +21,11 @@ from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.trust.right import Right
-from internet.access import Access
-from internet.flow import NumberedFlow, open_sessions
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.site import Site
+from lab.internet.access import Access
+from lab.internet.flow import NumberedFlow, open_sessions
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.site import Site
 from lab.process import new_run, until
 
 TOPIC: Final = "flow"

@@ -103,13 +103,8 @@ def call(end: End, settings: Settings) -> None:
         else:
             end.finish()
 
-    def look() -> None:
-        if time.monotonic() > until_s + _PATIENCE_S:
-            end.finish()  # an answer did not come
-
-    end.every(1.0, look)
     go_on()
-    end.run()
+    end.run(settings["seconds"] + _PATIENCE_S)  # an answer may not come
     calls.report()
 
 
@@ -123,15 +118,13 @@ def load(end: End, settings: Settings) -> None:
         now_s = time.monotonic()
         while calls.sent < count and begun_s + calls.sent * gap_s <= now_s:
             calls.begin(clients[calls.sent % len(clients)], finish_if_all)
-        if now_s > begun_s + count * gap_s + _PATIENCE_S:
-            end.finish()
 
     def finish_if_all() -> None:
         if calls.answered == count:
             end.finish()
 
     end.every(_TICK_S, tick)
-    end.run()
+    end.run(count * gap_s + _PATIENCE_S)
     calls.report()
 
 

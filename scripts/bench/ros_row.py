@@ -55,7 +55,6 @@ class Row(UndoneOnExit):
         bridged: whether the direct path leads through three bridges instead of one cable.
         ring: the overlay in place of the row: A and B are its first and its last switch.
         cores: of each machine of the ring; None: the machines share all cores.
-        shared_memory: whether the processes of one machine share memory; else they use UDP there too.
         program: of the proxies, before ``--config``.
 
     Raises:
@@ -72,7 +71,6 @@ class Row(UndoneOnExit):
         bridged: bool = False,
         ring: Topology | None = None,
         cores: Mapping[str, int] | None = None,
-        shared_memory: bool = True,
         program: Sequence[str] = ("-m", "proxy.cli.proxy"),
     ) -> None:
         overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
@@ -83,8 +81,7 @@ class Row(UndoneOnExit):
         cables = tuple(Link(a, b, mtu=mtu) for a, b in pairwise(direct))
         domains = (*overlay.domains, *([DomainPlan("direct", bridges)] if bridges else []))
         topology = Topology((*overlay.links, *cables), domains, overlay.attachments)
-        self._has_shared_memory, ends = shared_memory, tuple(self._machines.values())
-        self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else (), cores=cores)
+        self._lab = Lab(run, topology, own_shared_memory=tuple(self._machines.values()), cores=cores)
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.namespaces[node].bridge(_BRIDGE, (before, after))
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
@@ -117,7 +114,7 @@ class Row(UndoneOnExit):
         return sum(processor_s(pid) for pid in self.proxies)
 
     def _environment(self, domain: int) -> list[str]:
-        return ros_environment(self._nodes.files, domain, shared_memory=self._has_shared_memory)
+        return ros_environment(self._nodes.files, domain, shared_memory=True)
 
     def _admit(self, side: str, carried: Mapping[str, Sequence[Carried]]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""

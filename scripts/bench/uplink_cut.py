@@ -23,9 +23,9 @@ from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.trust.right import Right
-from internet.access import Access
-from internet.flow import NumberedFlow, open_sessions
-from internet.laboratory import Laboratory
+from lab.internet.access import Access
+from lab.internet.flow import NumberedFlow, open_sessions
+from lab.internet.laboratory import Laboratory
 from lab.process import new_run, until
 
 UPLINKS: Final = ("wlan0", "wwan0")

@@ -17,12 +17,12 @@ from typing import Final
 
 import bench_path  # noqa: F401 - finds the packages of scripts
 from image_request import TYPE
-from pyroute2 import IPRoute
 
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import MACHINE_DEVICE, UP
 from fog_demo.cluster import Cluster
 from gdp.host import netns_files
+from lab.namespaces import received
 from lab.process import LabProcess
 
 SERVICE: Final = "/tag"
@@ -72,13 +72,11 @@ class TagCluster(Cluster):
         A frame that the kernel forwards bypasses the counter of its sender.
         """
         machines = [find(self._runs, each.id) for each in self.machines()]
-        far = netns_files.inside(machines[0].gateway, partial(_received, UP))
-        near = self.inside(partial(_received, self._site.uplink))
-        at_machines = (netns_files.inside(each.netns_path, partial(_received, MACHINE_DEVICE, UP)) for each in machines)
+        far = netns_files.inside(machines[0].gateway, partial(_bytes, UP))
+        near = self.inside(partial(_bytes, self._site.uplink))
+        at_machines = (netns_files.inside(each.netns_path, partial(_bytes, MACHINE_DEVICE, UP)) for each in machines)
         return far, near, sum(at_machines)
 
 
-def _received(*devices: str) -> int:
-    with IPRoute() as ipr:
-        links = [link for link in ipr.get_links() if link.get_attr("IFLA_IFNAME") in devices]
-        return sum(int(link.get_attr("IFLA_STATS64")["rx_bytes"]) for link in links)
+def _bytes(*devices: str) -> int:
+    return sum(received(devices, "rx_bytes").values())

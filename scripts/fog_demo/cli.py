@@ -5,8 +5,6 @@ I/O. Exit status: 0 no failure, 1 a failure, 2 wrong input, 130 and 143 for Ctrl
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,8 +13,8 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from fog_demo.scenario import Display, Outcome, Pace, run_scenario
-from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
+from fog_demo.scenario import Display, Pace, run_scenario
+from lab.command import console_of, end_on_signals, exit_with, new_app, tell
 
 _PACE: Final = Pace()
 
@@ -57,21 +55,12 @@ def _run(launch_file: Path, pace: Pace, console: Console, as_json: bool) -> int:
     end_on_signals()
     with Display(console) as display:
         outcome = run_scenario(launch_file, pace, display)
-    _tell(outcome, console, as_json=as_json)
-    return FAILED if outcome.counts.failed or not outcome.counts.requests else PASSED
-
-
-def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
-    for what, seconds in outcome.steps_s.items():
-        console.print(f"{what}: {seconds:.2f} s", highlight=False)
-    if as_json:
-        document = {
-            **asdict(outcome.counts),
-            "by_machine": dict(outcome.counts.by_machine),
-            "steps_s": outcome.steps_s,
-            "events": [asdict(each) for each in outcome.events],
-        }
-        json.dump(document, sys.stdout, indent=1)
-        sys.stdout.write("\n")
-    else:
-        console.print(outcome.summary, style="bold red" if outcome.counts.failed else "bold green", highlight=False)
+    document = {
+        **asdict(outcome.counts),
+        "by_machine": dict(outcome.counts.by_machine),
+        "steps_s": outcome.steps_s,
+        "events": [asdict(each) for each in outcome.events],
+    }
+    lines = (f"{what}: {seconds:.2f} s" for what, seconds in outcome.steps_s.items())
+    has_failed = bool(outcome.counts.failed or not outcome.counts.requests)
+    return tell(console, lines, outcome.summary, document, failed=has_failed, as_json=as_json)

@@ -5,9 +5,7 @@ I/O. Exit status: 0 nothing lost, 1 something lost, 2 wrong input, 130 and 143 f
 
 from __future__ import annotations
 
-import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
@@ -17,15 +15,14 @@ from typing import Annotated, Final
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
 from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import RunRegistry, outer_uid
-from internet.laboratory import TOOLS, Laboratory
 from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Display, Outcome, Pace, run_scenario
-from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
+from lab.command import console_of, end_on_signals, exit_with, new_app, tell
+from lab.internet.laboratory import TOOLS, Laboratory
 
 _PACE: Final = Pace()
 
@@ -78,19 +75,13 @@ def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, conso
     finally:
         let_nothing_interrupt()
         run.end()
-    _tell(outcome, console, as_json=as_json)
-    return FAILED if outcome.lost or outcome.doubled or not outcome.images else PASSED
-
-
-def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
-    for reason in (*outcome.reasons, *outcome.drawing):
-        console.print(escape(reason), highlight=False, soft_wrap=True)
-    for event in outcome.events:
-        console.print(f"longest pause {event.pause_s * 1e3:5.0f} ms: {event.text}", highlight=False)
-    if as_json:
-        json.dump(asdict(outcome), sys.stdout, indent=1)
-        sys.stdout.write("\n")
-        return
     what = "images and commands" if outcome.drawing else f"images to two readers, {outcome.calls} calls"
-    summary = f"{outcome.images} {what}, {outcome.doubled} doubled, {outcome.lost} lost"
-    console.print(summary, style="bold red" if outcome.lost else "bold green", highlight=False)
+    pauses = (f"longest pause {each.pause_s * 1e3:5.0f} ms: {each.text}" for each in outcome.events)
+    return tell(
+        console,
+        (*outcome.reasons, *outcome.drawing, *pauses),
+        f"{outcome.images} {what}, {outcome.doubled} doubled, {outcome.lost} lost",
+        asdict(outcome),
+        failed=bool(outcome.lost or outcome.doubled or not outcome.images),
+        as_json=as_json,
+    )

@@ -18,12 +18,12 @@ from typing import Any, Final, NamedTuple
 
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
-from internet.access import Access
-from internet.host import Host
-from internet.laboratory import Laboratory
 from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
 from lab.dds import UDP_PROFILE
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
 from lab.process import LabProcess
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import MASTER_PORT, Graph

@@ -16,13 +16,13 @@ from rich.table import Table
 from rich.text import Text
 
 from gdp.trust.right import Right
-from internet.access import Access
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Link
 from internet_demo.stage import WIFI, WWAN, Stage
 from internet_demo.traffic import CAMERA, PLAN, Traffic
 from lab.command import StepDisplay
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Link
 
 _PLAIN_EVERY_S: Final = 2.5
 _WAYS: Final = (("direct", True), ("border", False))

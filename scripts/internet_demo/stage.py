@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from internet.access import Access
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
-from internet.site import Site
+from lab.internet.access import Access
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
+from lab.internet.site import Site
 
 WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import gdp
-from internet.flow import NumberedFlow
+from lab.internet.flow import NumberedFlow
 
 CAMERA: Final = "/camera/image"
 PLAN: Final = "/plan"

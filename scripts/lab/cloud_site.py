@@ -7,7 +7,6 @@ makes it, and the data centre's machines join it by their tokens, from behind NA
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import socket
 import sys
@@ -15,7 +14,6 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import closing, suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,30 +22,21 @@ from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run
-from gdp.management.control_client import ask_node, find_control_socket
-from gdp.state.control_protocol import Command
 from lab.datacenter import CALLER
-from lab.debian import cache_folder
+from lab.debian import built_once
 from lab.ec2 import UBUNTU
 from lab.machine import GDP, LabMachine
 from lab.process import ROOT, LabProcess, until
 
 _COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
-_STATUS_S: Final = 5.0
 _ROS: Final = ("ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-std-msgs")
 
 
 def wheelhouse(folder: Path) -> Path:
     """Return a folder with the wheels of a machine; those of other projects are kept between runs."""
-    recipe = (ROOT / "requirements" / "ros2.lock").read_bytes() + (ROOT / "pyproject.toml").read_bytes()
-    kept = cache_folder() / f"wheels-{sha256(recipe + repr(_ROS).encode()).hexdigest()[:12]}"
-    if not kept.exists():
-        for older in cache_folder().glob("wheels-*"):
-            shutil.rmtree(older)
-        fresh = cache_folder() / f"new-{os.getpid()}"
-        wheels(fresh, [str(ROOT / "scripts" / "fog_demo"), *_ROS], build=["empy"])
-        fresh.rename(kept)
-    shutil.copytree(kept, folder)
+    recipe = (ROOT / "requirements" / "ros2.lock").read_text() + (ROOT / "pyproject.toml").read_text() + repr(_ROS)
+    wanted = [str(ROOT / "scripts" / "fog_demo"), *_ROS]
+    shutil.copytree(built_once("wheels", recipe, lambda fresh: wheels(fresh, wanted, build=["empy"])), folder)
     build_wheel(ROOT, folder)
     return folder
 
@@ -146,9 +135,8 @@ class CloudSite(FogSite):
         log = self._border.logged
         assert self._border.code is None, log
         with suppress(GdpError):
-            nodes = (find_control_socket(self.border / each) for each in ("switch", "rib", "proxy"))
             return "listening on TCP port" in log and all(
-                ask_node(each, Command.STATUS, _STATUS_S).is_ok for each in nodes
+                map(self.host.status, ("border/switch", "border/rib", "border/proxy"))
             )
         return False
 

@@ -5,10 +5,11 @@ I/O; prints. Exit codes: 0 passed, 1 failed, 2 wrong input, or what the command 
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import FrameType
 from typing import Final, NoReturn
 
@@ -63,6 +64,17 @@ def exit_with(work: Callable[[], int]) -> None:
         errors.print(escape(str(error)))
         code = _WRONG_INPUT
     raise typer.Exit(code)
+
+
+def tell(console: Console, lines: Iterable[str], summary: str, document: object, *, failed: bool, as_json: bool) -> int:
+    """Print what a demonstration came to, in lines and a summary, or as JSON in place of that; return the exit code."""
+    for line in lines:
+        console.print(escape(line), highlight=False, soft_wrap=True)
+    if as_json:
+        sys.stdout.write(json.dumps(document, indent=1) + "\n")
+    else:
+        console.print(summary, style="bold red" if failed else "bold green", highlight=False)
+    return FAILED if failed else PASSED
 
 
 class StepDisplay(ClosedOnExit):

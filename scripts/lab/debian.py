@@ -80,6 +80,23 @@ def cache_folder() -> Path:
     return folder
 
 
+def built_once(kind: str, recipe: str, build: Callable[[Path], object]) -> Path:
+    """Return a folder that is kept between runs, and built if there is none of this recipe; older ones are deleted."""
+    kept = cache_folder() / f"{kind}-{hashlib.sha256(recipe.encode()).hexdigest()[:12]}"
+    with (cache_folder() / f"{kind}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not kept.exists():
+            for older in cache_folder().glob(f"{kind}-*"):
+                shutil.rmtree(older)
+            fresh = Path(tempfile.mkdtemp(prefix="new-", dir=cache_folder()))
+            try:
+                build(fresh / "made")
+                (fresh / "made").rename(kept)
+            finally:
+                shutil.rmtree(fresh, ignore_errors=True)
+    return kept
+
+
 def debian_root() -> Path:
     """Return the image's folder; it is built first if it is not there.
 
@@ -87,19 +104,7 @@ def debian_root() -> Path:
         subprocess.CalledProcessError: a package cannot be had.
     """
     recipe = repr((_codename(), _INCLUDED, _OFFERED, _CLOUD_CONFIG, _NETWORK, _MASKED, _ENABLED, _sources(Path("/"))))
-    root = cache_folder() / f"debian-{hashlib.sha256(recipe.encode()).hexdigest()[:12]}"
-    with (cache_folder() / "debian.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not root.exists():
-            for older in cache_folder().glob("debian-*"):
-                shutil.rmtree(older)
-            fresh = Path(tempfile.mkdtemp(prefix="new-", dir=cache_folder()))
-            try:
-                _build(fresh / "root")
-                (fresh / "root").rename(root)
-            finally:
-                shutil.rmtree(fresh, ignore_errors=True)
-    return root
+    return built_once("debian", recipe, _build)
 
 
 def _build(root: Path) -> None:

@@ -285,11 +285,11 @@ def _mac(own: int, other: int) -> str:
     return f"{_MAC_PREFIX}:{own:02x}:{other:02x}"
 
 
-def received(devices: Sequence[str]) -> dict[str, int]:
-    """Return how many frames have come in, by device."""
+def received(devices: Sequence[str], what: str = "rx_packets") -> dict[str, int]:
+    """Return how many frames, or ``rx_bytes``, have come in, by device that is there."""
     with IPRoute() as here:
         links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
-    return {device: links[device]["rx_packets"] for device in devices}
+    return {device: links[device][what] for device in devices if device in links}
 
 
 def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:

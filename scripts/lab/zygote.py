@@ -65,7 +65,7 @@ _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog
 _NATIVE: Final = {"rclpy", "cyclonedds"}  # they leave their network in destructors
 _PLAIN: Final = re.compile(r"(?:[\w ./:,=@+%-]|'[^']*')+")  # a shell takes it for words
 _DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
-_PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet", "internet_demo", "fog_demo", "lab")
+_PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
 _SPACES: Final = ("ipc", "mnt", "pid", "user", "uts")

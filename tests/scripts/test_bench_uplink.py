@@ -18,7 +18,7 @@ from machine import data_folder
 from report import Rounds
 from thin_link import score
 from thin_link.channel import Channel, ConstantRate, Loss, TraceRate
-from thin_link.conditions import Conditions, Direction, load_trace
+from thin_link.conditions import Conditions, load_trace
 from thin_link.exchange import Exchange, Window
 from thin_link.line import Flow, Used
 from thin_link.score import Report, idle_ms, link_figures, merged, stream_figures, whole_share
@@ -166,7 +166,6 @@ def test_each_direction_of_a_recording_has_its_own_rate(tmp_path: Path) -> None:
     assert found.up.mean_bits_s == pytest.approx(1.2e6)
     assert found.down.mean_bits_s == pytest.approx(12e6)
     assert (found.up.loss, found.up.burst) == (0.02, 8.0)
-    assert Direction.from_fields(found.up.to_fields()) == found.up
 
 
 def test_a_missing_recording_is_named_with_the_option_for_its_folder(tmp_path: Path) -> None:

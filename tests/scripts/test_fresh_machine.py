@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from internet.fresh_machine import TypedCommand, typed_commands
+from lab.internet.fresh_machine import TypedCommand, typed_commands
 from tests.pages import ROOT
 
 

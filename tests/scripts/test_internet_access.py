@@ -6,8 +6,8 @@ from itertools import product
 
 import pytest
 
-from internet.access import TRAITS, Access, allows_direct, core_rules, router_rules
-from internet.matrix import batches
+from lab.internet.access import TRAITS, Access, allows_direct, core_rules, router_rules
+from lab.internet.matrix import batches
 from tests.pages import ROOT
 
 PAGE = ROOT / "docs/reference/internet-access.md"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from internet.flow import NumberedFlow
+from lab.internet.flow import NumberedFlow
 from lab.process import FailedError, until
 
 

@@ -23,6 +23,7 @@ from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import Disk, StoreCluster
+from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
@@ -51,7 +52,7 @@ JOURNAL_MIB: Final = 64  # about two hours of a switch, or what it takes in a mi
 _BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 
 
-class Overlay:
+class Overlay(ClosedOnExit):
     """Network of a plan; a context manager that removes everything.
 
     Args:
@@ -111,10 +112,8 @@ class Overlay:
         for member in plan.members:
             self._admit(member)
 
-    def __enter__(self) -> Overlay:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End all processes, and remove the faults."""
         self._links.close()
         if self.store is not None:
             self.store.close()

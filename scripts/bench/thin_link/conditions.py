@@ -5,10 +5,10 @@ Sans-I/O, but for ``load_trace`` (one file). Words of the command line become ``
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gdp.errors import LocalError
 from thin_link.channel import OPPORTUNITY_BYTES, Channel, ConstantRate, Loss, Rate, TraceRate
@@ -33,7 +33,7 @@ class Direction:
     fifo_bytes: int
     loss: float
     burst: float
-    opportunities_ms: tuple[int, ...] = ()
+    opportunities_ms: Sequence[int] = ()
 
     @property
     def mean_bits_s(self) -> float:
@@ -45,15 +45,6 @@ class Direction:
         rate: Rate = TraceRate(self.opportunities_ms) if self.opportunities_ms else ConstantRate(self.bits_s)
         loss = Loss(self.loss, self.burst, seed)
         return Channel(rate, delay_ns=round(self.delay_ms * 1e6), fifo_bytes=self.fifo_bytes, loss=loss)
-
-    def to_fields(self) -> dict[str, Any]:
-        """Return what ``from_fields`` reads, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_fields(cls, fields: Mapping[str, Any]) -> Direction:
-        """Return the direction of ``to_fields``."""
-        return cls(**{**fields, "opportunities_ms": tuple(fields["opportunities_ms"])})
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +88,7 @@ def fifo_bytes(bits_s: float, rtt_ms: float, fifo: str) -> int:
     return max(round(bits_s * seconds / 8), _LEAST_FRAMES * FRAME_BYTES)
 
 
-def mean_bits_s(opportunities_ms: tuple[int, ...]) -> float:
+def mean_bits_s(opportunities_ms: Sequence[int]) -> float:
     """Return the mean rate of a recording."""
     return len(opportunities_ms) * OPPORTUNITY_BYTES * 8e3 / opportunities_ms[-1]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -83,10 +83,7 @@ class Line:
         return Used(up, down, after["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
-        try:
-            return self._process.ask(report=True, **order)
-        except BrokenPipeError:
-            return self._process.read(0.0)  # raises FailedError with the reason
+        return self._process.ask(report=True, **order)
 
 
 def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
@@ -144,8 +141,8 @@ def open_line(
     path = lab.directory / f"{line}.json"
     settings = {
         "devices": ends,
-        "up": conditions.up.to_fields(),
-        "down": conditions.down.to_fields(),
+        "up": asdict(conditions.up),
+        "down": asdict(conditions.down),
         "seed": conditions.seed,
     }
     path.write_text(json.dumps(settings), encoding="ascii")

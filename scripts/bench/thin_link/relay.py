@@ -21,6 +21,7 @@ import select
 import socket
 import sys
 import time
+from array import array
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from peers.jsonl import say
+from report import percentile
 
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
@@ -49,8 +51,6 @@ _PRIORITY: Final = 20
 _TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
 _EARLY_NS: Final = 30_000  # a frame may leave so much before it is due; waking costs as much
 _PAUSE_NS: Final = 100_000  # shortest wait for a due frame, so that frames leave in batches
-_BUCKET_NS: Final = 10_000
-_BUCKETS: Final = 2_000
 _TCP: Final = b"\x08\x00\x45"  # IPv4 without options, at the EtherType
 _PORT: Final = MARKED_PORT.to_bytes(2, "big")
 
@@ -74,7 +74,7 @@ class _Relay:
         self._batch: MmsgBatch = make_batch(_SLOT_BYTES)
         self._drops = [0] * (max(DropReason) + 1)
         self._oversized = 0
-        self._late = [0] * (_BUCKETS + 1)  # frames by lateness, in buckets of 10 us
+        self._late_ns = array("q")  # of each frame since the last report
         self._start_ns = time.monotonic_ns()
 
     def run(self, control: int) -> None:
@@ -125,7 +125,7 @@ class _Relay:
 
     def _send_due(self, way: _Way) -> None:
         """Send the due frames, a batch for each run of frames with one Ethernet header."""
-        waiting, late = way.waiting, self._late
+        waiting, late_ns = way.waiting, self._late_ns
         while waiting:
             now_ns = time.monotonic_ns() - self._start_ns
             if waiting[0][0] > now_ns + _EARLY_NS:
@@ -133,7 +133,7 @@ class _Relay:
             head, frames = waiting[0][1], list[bytes]()
             while waiting and len(frames) < SLOTS and waiting[0][0] <= now_ns + _EARLY_NS and waiting[0][1] == head:
                 due_ns, _, frame = waiting.popleft()
-                late[min(max(now_ns - due_ns, 0) // _BUCKET_NS, _BUCKETS)] += 1
+                late_ns.append(max(now_ns - due_ns, 0))
                 frames.append(frame)
             self._batch.send(way.sink, frames, head, self._drops)
 
@@ -154,19 +154,10 @@ class _Relay:
             oversized=self._oversized,
             refused=sum(self._drops),
             kernel_drops=sum(kernel_drops(way.source) for way in self._ways),
-            late_us=self._late_us(0.99),
+            late_us=percentile(self._late_ns, 0.99) / 1e3 if self._late_ns else 0.0,
             **sides,
         )
-        self._late = [0] * (_BUCKETS + 1)
-
-    def _late_us(self, share: float) -> float:
-        """Return the lateness that a share of the frames did not exceed since the last report."""
-        left = share * sum(self._late)
-        for bucket, count in enumerate(self._late):
-            left -= count
-            if left <= 0:
-                return (bucket + 1) * _BUCKET_NS / 1e3 if count else 0.0
-        return _BUCKETS * _BUCKET_NS / 1e3
+        self._late_ns = array("q")
 
 
 def _open(device: str) -> socket.socket:
@@ -195,7 +186,7 @@ def main() -> None:
     """Run the relay of the command line."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
     settings: Mapping[str, Any] = json.loads(Path(sys.argv[1]).read_text(encoding="ascii"))
-    directions = [Direction.from_fields(settings[side]) for side in ("up", "down")]
+    directions = [Direction(**settings[side]) for side in ("up", "down")]
     seed = int(settings["seed"])
     up, down = (each.channel(2 * seed + at) for at, each in enumerate(directions))
     one, other = settings["devices"]

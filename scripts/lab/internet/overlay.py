@@ -25,9 +25,9 @@ from gdp.enrolment.programs import programs_of
 from gdp.errors import GdpError
 from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, load_card
-from internet.host import Host
-from internet.laboratory import Laboratory
 from lab.credentials import NameRights, grant
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
 from lab.process import until
 
 _DOMAIN: Final = "lab"

@@ -15,10 +15,10 @@ from itertools import pairwise
 from typing import Final
 
 import gdp
-from internet.access import Access
-from internet.host import Host
-from internet.overlay import Overlay
 from lab.credentials import NameRights
+from lab.internet.access import Access
+from lab.internet.host import Host
+from lab.internet.overlay import Overlay
 from lab.process import FailedError
 
 HZ: Final = 100.0

@@ -20,13 +20,13 @@ from functools import cached_property, partial
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final
 
-from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
+from lab.internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
 from lab.machines import DELAY_LINE
 from lab.namespaces import IpNamespace, clear_offloads
 from lab.process import LabProcess
 
 if TYPE_CHECKING:
-    from internet.laboratory import Laboratory
+    from lab.internet.laboratory import Laboratory
 
 _CORE_END, _ROUTER_END = "169.254.0.1", "169.254.0.2"  # RFC 3927, on every link towards the core
 _CORE_END6, _ROUTER_END6 = "fe80::1", "fe80::2"

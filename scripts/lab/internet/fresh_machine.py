@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from internet.host import Host
+from lab.internet.host import Host
 from lab.machine import LabMachine
 from lab.process import ROOT, LabProcess
 

@@ -14,9 +14,9 @@ from typing import Final
 from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from internet.access import Access, core_rules
-from internet.host import ETHERNET, Host
-from internet.site import Site
+from lab.internet.access import Access, core_rules
+from lab.internet.host import ETHERNET, Host
+from lab.internet.site import Site
 from lab.namespaces import IpNamespace
 from lab.process import end_processes
 

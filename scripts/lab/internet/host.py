@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from internet.access import LAN
-from internet.site import Lease, Site
+from lab.internet.access import LAN
+from lab.internet.site import Lease, Site
 from lab.machine import LabMachine
 from lab.namespaces import IpNamespace
 
 if TYPE_CHECKING:
-    from internet.laboratory import Laboratory
+    from lab.internet.laboratory import Laboratory
 
 ETHERNET: Final = "eth0"
 _FIRST_METRIC: Final = 100

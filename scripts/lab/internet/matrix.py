@@ -17,10 +17,10 @@ from typing import Final, NamedTuple
 
 import gdp
 from gdp.trust.right import Right
-from internet.access import Access, allows_direct
-from internet.host import Host
-from internet.laboratory import Laboratory
-from internet.overlay import Overlay
+from lab.internet.access import Access, allows_direct
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.overlay import Overlay
 
 _LOOK_S: Final = 0.25
 _GROUP: Final = 3
@@ -156,11 +156,10 @@ def _wait_for_direct(
     expected = {at for at, pair in enumerate(pairs) if allows_direct(*pair)}
     found: dict[int, float] = {}
     while True:
-        tunnels = {host.label: overlay.tunnels(host) for host in hosts["a"]}
+        links = {host.label: overlay.links(host) for host in hosts["a"]}
         now_s = time.monotonic() - begun_s
         for at, (one, other) in enumerate(ends):
-            row = tunnels[one.label].get(other.label, {})
-            if row.get("direct") and row.get("up"):
+            if any(each.is_direct and each.peer == other.label for each in links[one.label]):
                 found.setdefault(at, now_s)
         if expected <= found.keys() or time.monotonic() > deadline_s:
             return found
