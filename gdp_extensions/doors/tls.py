@@ -11,7 +11,7 @@ from pathlib import Path
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import SoftwareKey
 from gdp.errors import LocalError
-from gdp.links.relay_tls import load_own
+from gdp.links.relay_context import load_own
 from gdp.stores.files import read_private, read_public
 
 _KEY = b"PRIVATE KEY-----"
