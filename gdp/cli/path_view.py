@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import NAME_BYTES, Name
 
 _WORDS: Final = {"publish": "published by", "serve": "served by"}
@@ -20,13 +21,23 @@ def path_lines(name: str, path: Mapping[str, object]) -> Iterator[str]:
     hops = _dicts(path.get("hops"))
     if path.get("answered"):
         where = f"{path['role']} of {path['domain_label']}"
-        yield f"{end} ({where}): {len(hops)} switch{'' if len(hops) == 1 else 'es'}, {_ms(path.get('rtt_ms'))}"
+        count = f"{len(hops)} switch{'' if len(hops) == 1 else 'es'}"
+        yield f"{end} ({where}): {count}, {_ms(path.get('rtt_ms'))}{_cost(path)}"
     else:
-        yield f"{end}, which does not answer"
+        yield f"{end}, which does not answer{_cost(path)}"
     for hop in hops:
         yield from _hop_lines(hop)
     if any(hop.get("needs_right") for hop in hops):
         yield "     branches are shown to switches, and to nodes with a right on the name"
+
+
+def _cost(path: Mapping[str, object]) -> str:
+    """Return the cost of the path to a server, and whether it is the nearest that answers."""
+    cost = path.get("cost")
+    if not isinstance(cost, int):
+        return ""
+    nearest = ": the nearest that answers" if path.get("is_nearest") else ""
+    return f", {'no path' if cost == COST_UNREACHABLE else f'cost {cost}'}{nearest}"
 
 
 def _hop_lines(hop: Mapping[str, object]) -> Iterator[str]:

@@ -35,7 +35,8 @@ def trace(name: NameText, timeout: Budget = 0.45, node: Node = None, as_json: op
     """Show each switch between here and the members that publish or serve a name, and the tree branches below them.
 
     A switch of our own domain tells its links and branches. One of another domain tells domain and delay only, unless
-    its configuration names our domain (domain.diagnostics).
+    its configuration names our domain (domain.diagnostics). Of several servers the nearest comes first: rules with
+    replication nearest ask the first one that answers.
     The exit code is 1 if a member that advertises the name did not answer.
 
     \b
@@ -53,7 +54,10 @@ def trace(name: NameText, timeout: Budget = 0.45, node: Node = None, as_json: op
         probe = PathProbe(connection, asked)
         found: list[Mapping[str, object]] = []
         for place in places:
-            found.append({"right": place.right, **probe.path_to(place.node, time.monotonic() + timeout)})
+            path = {"right": place.right, "cost": place.cost, **probe.path_to(place.node, time.monotonic() + timeout)}
+            has_nearest = any(each["is_nearest"] for each in found)
+            is_nearest = place.cost is not None and bool(path["answered"]) and not has_nearest
+            found.append({**path, "is_nearest": is_nearest})
             if not as_json:
                 for line in path_lines(name, found[-1]):
                     echo(line)

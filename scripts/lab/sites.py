@@ -101,6 +101,7 @@ class Sites:
 
     @property
     def now_s(self) -> float:
+        """Return the present second."""
         return self.world.network.now.mono_s
 
     def set_delay(self, a: str, b: str, delay_s: float) -> None:
@@ -136,6 +137,7 @@ class Sites:
         self.cores[label] = SessionCore(member, [topic], lambda: next(self._starts))
 
     def label(self, site: int) -> str:
+        """Return the label of a site's replica."""
         return f"s{site}/edge{site}"
 
     def serve(self, site: int) -> None:
@@ -146,6 +148,7 @@ class Sites:
         self.send(label)
 
     def send(self, label: str) -> None:
+        """Send the pending frames of a member."""
         self.cores[label].member.flush(self.now_s)
         self.world.network.send_pending(label)
 
