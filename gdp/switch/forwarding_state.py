@@ -9,7 +9,6 @@ from __future__ import annotations
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.crypto.identity import Identity
 from gdp.limits import COST_UNREACHABLE
-from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.attached_readers import AttachedReaders
 from gdp.switch.dependents import Dependents
@@ -17,7 +16,7 @@ from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.name_cache import Location
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
-from gdp.switch.paths import Path, Paths
+from gdp.switch.paths import Paths
 from gdp.switch.table import Table
 from gdp.switch.trees import Trees
 from gdp.trust.domain import Policy
@@ -76,13 +75,10 @@ class ForwardingState:
         self.verifier = AdvertisementVerifier(policy)
         self.now = Timestamps(0.0, 0.0)
 
-    def path_to(self, place: Location, allowed: frozenset[Name]) -> Path | None:
-        """Return the path to a location on another switch through allowed domains, or None."""
-        return self.paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain})
-
     def cost_of(self, place: Location) -> int:
         """Return the cost of the path from this switch to a location, ``COST_UNREACHABLE`` without a path."""
         if place.switch == self.me:
             return 0
-        path = self.path_to(place, self.policy.transit)
+        allowed = self.policy.transit & place.transit | {place.domain}
+        path = self.paths.to_switch(place.switch, place.domain, allowed)
         return COST_UNREACHABLE if path is None else min(path.distance, COST_UNREACHABLE)

@@ -237,7 +237,12 @@ class Unicast:
 
     def _nearest(self, takers: list[Location], allowed: frozenset[Name], now_s: float) -> tuple[Path, float] | None:
         """Return the path to the nearest location, and how long its entry stands; a stale one is checked again soon."""
-        ways = [(place, way) for place in takers if (way := self._state.path_to(place, allowed))]
+        paths = self._state.paths
+        ways = [
+            (place, way)
+            for place in takers
+            if (way := paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
+        ]
         if not ways:
             return None
         best, way = min(ways, key=lambda each: (each[1].distance, each[0].advertiser))

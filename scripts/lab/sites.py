@@ -66,6 +66,7 @@ class Sites:
     executed: dict[bytes, list[str]] = field(default_factory=dict)
     at: int = 0
     uplink_bytes: int = 0  # of requests
+    uplink_frames: int = 0
     out: set[int] = field(default_factory=set)  # sites whose replica cannot answer
     frozen: set[str] = field(default_factory=set)  # replicas
 
@@ -250,3 +251,4 @@ class Sites:
     def _tap(self, _at_s: float, a: str, _b: str, frame: bytes) -> None:
         if a == ROBOT and decode(frame, ETHER_BYTES).kind in (Kind.DATA, Kind.PARITY):
             self.uplink_bytes += len(frame)
+            self.uplink_frames += 1
