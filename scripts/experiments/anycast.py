@@ -124,4 +124,4 @@ def _samples(sites: Sites, begun_s: float) -> Sequence[Sample]:
 if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--turns", type=int, default=TURNS, help="moves, and deaths (default: %(default)s)")
-    run_experiment(parser, measure)
+    run_experiment(parser, measure, is_timed=False)
