@@ -29,10 +29,13 @@ class Place:
 
     node: str  # 64 hex digits
     right: str
+    cost: int | None = None  # of the path to a server
 
 
 def find_places(connection: NodeConnection, name: Name) -> list[Place]:
-    """Return the members that publish or serve a name; a member's own name is where that member is.
+    """Return the members that publish or serve a name, the nearest server first.
+
+    A member's own name is where that member is.
 
     Raises:
         LocalError: the switch does not answer, or refuses.
@@ -42,6 +45,8 @@ def find_places(connection: NodeConnection, name: Name) -> list[Place]:
         raise LocalError("the switch of this node does not answer; look at 'gdp show neighbors'")
     result = found.get("result")
     places = result.get("places", []) if isinstance(result, Mapping) else []
-    known = [Place(str(each["node"]), str(each["right"])) for each in places if isinstance(each, Mapping)]
-    carrying = [each for each in known if each.right in _CARRIES]
+    known = [
+        Place(str(each["node"]), str(each["right"]), each.get("cost")) for each in places if isinstance(each, Mapping)
+    ]
+    carrying = sorted([each for each in known if each.right in _CARRIES], key=lambda each: each.cost or 0)
     return carrying or [each for each in known if each.node == name.to_text()]

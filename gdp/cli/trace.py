@@ -18,6 +18,7 @@ from gdp.cli.path_probe import PathProbe
 from gdp.cli.ping import NameText
 from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import NAME_BYTES, Name
 from gdp.terminal import echo
 
@@ -36,7 +37,8 @@ def trace(name: NameText, timeout: Budget = 0.45, node: Node = None, as_json: op
     """Show each switch between here and the members that publish or serve a name, and the tree branches below them.
 
     A switch of our own domain tells its links and branches. One of another domain tells domain and delay only, unless
-    its configuration names our domain (domain.diagnostics).
+    its configuration names our domain (domain.diagnostics). Of several servers the nearest comes first: rules with
+    replication nearest ask the first one that answers.
     The exit code is 1 if a member that advertises the name did not answer.
 
     \b
@@ -54,7 +56,10 @@ def trace(name: NameText, timeout: Budget = 0.45, node: Node = None, as_json: op
         probe = PathProbe(connection, asked)
         found: list[Mapping[str, object]] = []
         for place in places:
-            found.append({"right": place.right, **probe.path_to(place.node, time.monotonic() + timeout)})
+            path = {"right": place.right, "cost": place.cost, **probe.path_to(place.node, time.monotonic() + timeout)}
+            has_nearest = any(each["is_nearest"] for each in found)
+            is_nearest = place.cost is not None and bool(path["answered"]) and not has_nearest
+            found.append({**path, "is_nearest": is_nearest})
             if not as_json:
                 for line in path_lines(name, found[-1]):
                     echo(line)
@@ -74,13 +79,23 @@ def path_lines(name: str, path: Mapping[str, object]) -> Iterator[str]:
     hops = _dicts(path.get("hops"))
     if path.get("answered"):
         where = f"{path['role']} of {path['domain_label']}"
-        yield f"{end} ({where}): {len(hops)} switch{'' if len(hops) == 1 else 'es'}, {_ms(path.get('rtt_ms'))}"
+        count = f"{len(hops)} switch{'' if len(hops) == 1 else 'es'}"
+        yield f"{end} ({where}): {count}, {_ms(path.get('rtt_ms'))}{_cost(path)}"
     else:
-        yield f"{end}, which does not answer"
+        yield f"{end}, which does not answer{_cost(path)}"
     for hop in hops:
         yield from _hop_lines(hop)
     if any(hop.get("needs_right") for hop in hops):
         yield "     branches are shown to switches, and to nodes with a right on the name"
+
+
+def _cost(path: Mapping[str, object]) -> str:
+    """Return the cost of the path to a server, and whether it is the nearest that answers."""
+    cost = path.get("cost")
+    if not isinstance(cost, int):
+        return ""
+    nearest = ": the nearest that answers" if path.get("is_nearest") else ""
+    return f", {'no path' if cost == COST_UNREACHABLE else f'cost {cost}'}{nearest}"
 
 
 def _hop_lines(hop: Mapping[str, object]) -> Iterator[str]:

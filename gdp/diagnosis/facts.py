@@ -55,6 +55,7 @@ class FlowFact:
         writers: far publishers or servers that this node knows; ``live``: those that were heard.
         absent: far publishers whose route ended and that may return.
         connected: far servers that keep up; ``silent``: far servers that stopped to report.
+        ranking: far servers in the order of their paths' costs, where requests go to the nearest: name and reason.
         messages: local messages taken for the overlay; ``sent``: of these, what left.
         received: messages of the overlay that were published here.
         full_parts: fragments of full size that came, of messages that need several.
@@ -100,6 +101,7 @@ class FlowFact:
     absent: int = 0
     connected: int = 0
     silent: int = 0
+    ranking: tuple[str, ...] = ()
     messages: int = 0
     sent: int = 0
     received: int = 0

@@ -23,8 +23,9 @@ def arrives(view: View) -> Iterator[Found]:
     for end in view.importers:
         flow = end.flow
         if flow.kind != "topic" and flow.connected and not _failures(flow.faults):
-            text = f"It answers: {flow.connected} server{'s' if flow.connected > 1 else ''} of {flow.local} connected."
-            yield text, ""
+            text = f"It answers: {flow.connected} server{'s' if flow.connected > 1 else ''} of {flow.local} connected"
+            nearest = f"; requests go to {', then '.join(flow.ranking)}" if flow.ranking else ""
+            yield f"{text}{nearest}.", ""
         lost = sum(flow.lost.values()) - flow.lost.get("thinned", 0)
         if flow.received and lost <= flow.received // 10 and not flow.odd_qos:
             age = "now" if flow.idle_s is None else f"{flow.idle_s:.2f} s ago"

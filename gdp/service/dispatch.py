@@ -16,7 +16,7 @@ When a server that owes a response refuses, declines or goes, the next untried s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
@@ -156,6 +156,13 @@ class Dispatch(Generic[A]):
     def servers(self) -> list[Name]:
         """Return the servers that are there, leaving ones included."""
         return list(self._servers)
+
+    def ranking(self, now_s: float) -> list[tuple[Name, int, bool]]:
+        """Return the servers with ``Mode.NEAREST``, the one that is asked first: cost, and whether it is silent."""
+        if (nearest := self._nearest) is None:
+            return []
+        ranked = self._ranked(self._servers, now_s)
+        return [(server, nearest.cost(server), nearest.is_silent(server)) for server in ranked]
 
     def begin(
         self,
@@ -320,7 +327,10 @@ class Dispatch(Generic[A]):
     def _untried(self, call: _Call[A], now_s: float) -> list[Name]:
         """Return the servers to ask next, the best first; leaving ones come last."""
         free = [server for server in self._servers if server not in call.owing and server not in call.refused]
-        ranked, nearest = self._latencies.ranked(free, now_s), self._nearest
+        return self._ranked(free, now_s)
+
+    def _ranked(self, servers: Iterable[Name], now_s: float) -> list[Name]:
+        ranked, nearest = self._latencies.ranked(servers, now_s), self._nearest
         if nearest is None:
             return sorted(ranked, key=self._servers.__getitem__)
         return sorted(ranked, key=lambda each: (self._servers[each], nearest.is_silent(each), nearest.cost(each)))

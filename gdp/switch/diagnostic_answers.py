@@ -92,6 +92,7 @@ class DiagnosticAnswers:
                 "node": each.advertisement.node,
                 "right": each.advertisement.right.value,
                 "switch": me,
+                **({"cost": 0} if each.advertisement.right is Right.SERVE else {}),
             }
             for each in self._state.attached.named(question.name)
         }
@@ -108,6 +109,7 @@ class DiagnosticAnswers:
                 "right": location.right.value,
                 "switch": location.switch,
                 "domain": location.domain,
+                **({"cost": self._state.cost_of(location)} if location.right is Right.SERVE else {}),
             }
             locations.setdefault(location.advertiser, known)
         return {"places": [locations[node] for node in sorted(locations)]}

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.crypto.identity import Identity
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.attached_readers import AttachedReaders
 from gdp.switch.local_advertisements import LocalAdvertisements
-from gdp.switch.name_cache import NameCache
+from gdp.switch.name_cache import Location, NameCache
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
 from gdp.switch.paths import Paths
@@ -119,3 +120,11 @@ class ForwardingState:
         self.dependents = Dependents(self.attached, self.resolver.cache, self.readers, self.trees)
         self.verifier = AdvertisementVerifier(policy)
         self.now = Timestamps(0.0, 0.0)
+
+    def cost_of(self, place: Location) -> int:
+        """Return the cost of the path from this switch to a location, ``COST_UNREACHABLE`` without a path."""
+        if place.switch == self.me:
+            return 0
+        allowed = self.policy.transit & place.transit | {place.domain}
+        path = self.paths.to_switch(place.switch, place.domain, allowed)
+        return COST_UNREACHABLE if path is None else min(path.distance, COST_UNREACHABLE)

@@ -16,7 +16,6 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Kind
-from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.forwarding_state import ForwardingState, KnownLocation
@@ -195,7 +194,7 @@ class LocationUpdates:
             return
         cost, reader = None, self._state.readers.of(location.name).get(at)
         if reader is not None and reader.advertisement.wants_costs:
-            cost = reader.costs[location.advertiser] = self._cost_of(location)
+            cost = reader.costs[location.advertiser] = self._state.cost_of(location)
         self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s, cost))
 
     def paths_changed(self, now_s: float) -> None:
@@ -203,14 +202,8 @@ class LocationUpdates:
         for at, reader in self._state.readers.wanting_costs():
             right = reader.advertisement.right
             for location in self._state.resolver.cache.of(reader.advertisement.name, now_s):
-                if reader.costs.get(location.advertiser) != self._cost_of(location):
+                if reader.costs.get(location.advertiser) != self._state.cost_of(location):
                     self.send_to_reader(at, right, location, now_s)
-
-    def _cost_of(self, location: Location) -> int:
-        if location.switch == self._state.me:
-            return 0
-        path = self._unicast.path_to(location, self._state.policy.transit)
-        return COST_UNREACHABLE if path is None else min(path.distance, COST_UNREACHABLE)
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
         """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""

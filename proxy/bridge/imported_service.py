@@ -119,6 +119,11 @@ class ImportedService(ServiceFlow):
         """Return the servers that can be asked now."""
         return list(self._calls[0].servers)
 
+    def ranking(self, now_s: float) -> list[str]:
+        """Return the servers in the order of their paths' costs, where requests go to the nearest: name and reason."""
+        ranked = self._calls[0].ranking(now_s) if isinstance(self._calls[0], Dispatch) else []
+        return [f"{name.short} (cost {cost}{', silent' if silent else ''})" for name, cost, silent in ranked]
+
     @property
     def late(self) -> int:
         """Return how many responses were not the first."""

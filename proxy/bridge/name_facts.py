@@ -21,6 +21,7 @@ from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity, Role
@@ -46,6 +47,7 @@ _RIGHTS: Final[dict[tuple[bool, bool], Right]] = {  # is it a topic, is it expos
     (False, True): Right.SERVE,
     (False, False): Right.CALL,
 }
+_RANKED_MAX: Final = 8
 _PART: Final = {"topic": "", "service": "", "action": f"{ACTION_INFIX}send_goal"}
 
 
@@ -198,6 +200,8 @@ def _flow_fact(
             "lost": flow.stats.losses.by_label(),
             "idle_s": None if flow.last_s is None else round(now.mono_s - flow.last_s, 3),
         }
+    elif isinstance(flow, ImportedService):
+        known["ranking"] = tuple(flow.ranking(now.mono_s)[:_RANKED_MAX])
     return FlowFact(**known)  # type: ignore[arg-type]
 
 

@@ -31,6 +31,7 @@ class MachineState:
         load_before: runnable processes, mean over the last minute.
         commit: of the code, with ``-dirty`` after it where the code differs from it; empty: not known.
         date: of the bench, in UTC, such as 2026-11-28; empty: not known.
+        is_timed: other work changes the figures; not so those of a virtual clock.
     """
 
     kernel: str
@@ -40,11 +41,12 @@ class MachineState:
     load_before: float
     commit: str = ""
     date: str = ""
+    is_timed: bool = True
 
     @property
     def is_busy(self) -> bool:
-        """Return whether other work took more than half of the cores."""
-        return self.load_before > self.cores / 2
+        """Return whether other work took more than half of the cores, and matters."""
+        return self.is_timed and self.load_before > self.cores / 2
 
     @property
     def mark(self) -> str:

@@ -15,7 +15,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -211,9 +211,14 @@ def run_experiment(
     parser: argparse.ArgumentParser,
     measure: Callable[[Options], Report | Computed],
     words: Sequence[str] | None = None,
+    *,
+    is_timed: bool = True,
 ) -> None:
-    """Run an experiment to its tables, page, picture and JSON. ``words``: as ``sys.argv[1:]``."""
-    options, state = parser.parse_args(words), machine_state()
+    """Run an experiment to its tables, page, picture and JSON.
+
+    ``words``: as ``sys.argv[1:]``. ``is_timed``: other work of the machine changes the figures.
+    """
+    options, state = parser.parse_args(words), replace(machine_state(), is_timed=is_timed)
     folder: Path | None = options.out or (None if options.quick else OUTPUT)
     with clean_exit():
         if folder is not None:

@@ -27,7 +27,7 @@ from report import progress
 from results import machines_of, page_of, rows_of
 from skeleton import add_allow_load, clean_exit
 
-EXPERIMENTS: Final = ("offload", "table1", "fig4", "fig5", "fig6", "fig7", "fig9", "outages", "availability")
+EXPERIMENTS: Final = ("offload", "table1", "fig4", "fig5", "fig6", "fig7", "fig9", "outages", "availability", "anycast")
 _HERE: Final = Path(__file__).parent
 _SETTLES_S: Final = 300.0  # five times the mean over which the system counts its load
 _LOOK_S: Final = 5.0

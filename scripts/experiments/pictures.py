@@ -55,8 +55,18 @@ def save_distributions(path: Path, title: str, panels: Mapping[str, Mapping[str,
     save(figure, path, title)
 
 
-def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequence[Span], from_s: float) -> None:
-    """Draw each request as a point, coloured by the machine that answered; grey: a machine was away; red: failed."""
+def save_timeline(
+    path: Path,
+    title: str,
+    samples: Sequence[Sample],
+    spans: Sequence[Span],
+    from_s: float,
+    moves: Sequence[float] = (),
+) -> None:
+    """Draw each request as a point, coloured by the machine that answered; grey: a machine was away; red: failed.
+
+    ``moves``: seconds of the timeline, each a dotted line.
+    """
     figure, axis = plt.subplots(figsize=(11, 3.6), layout="constrained")
     machines = sorted({each.machine for each in samples if each.is_right} | {span.machine for span in spans})
     colours = dict(zip(machines, cycle(_COLOURS[1:]), strict=False))
@@ -66,6 +76,8 @@ def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequ
         axis.scatter(times, latencies, s=5, color=colours[machine], label=f"answered by {machine}")
     for span in spans:
         axis.axvspan(span.from_s, span.to_s, color=colours[span.machine], alpha=0.15, lw=0)
+    for moved_s in moves:
+        axis.axvline(moved_s, color="black", ls=":", lw=0.8)
     failed = [each for each in samples if not each.is_right]
     axis.scatter(
         [each.begun_s - from_s for each in failed], [1e3 * each.latency_s for each in failed], s=24, color="red"

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.intervals import OWING
+from lab.sites import Request, Sites
 from tests.draws import draws
-from tests.journeys.sites import Request, Sites
 
 MOVED_S, BACK_S, TAKEN_OVER_S = 1.0, 3.0, 0.3
 NOTICED_S: Final = TAKEN_OVER_S + OWING.lease_s  # a replica that hears no one reports until it has lost its switch

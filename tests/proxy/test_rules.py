@@ -107,7 +107,7 @@ BAD = [
     ("name: /a, replication: {mode: all}", "replication: only services and actions have this"),
     (
         "name: /a, kind: service, replication: {mode: most}",
-        "replication.mode: expected 'all', 'some', 'hedged'",
+        "replication.mode: expected 'all', 'some', 'hedged' or 'nearest'",
     ),
     ("name: /a, kind: service, replication: {copies: 0}", "replication.copies: expected greater than or equal to 1"),
     ("name: /a, kind: service, replication: {budget: 2}", "replication.budget: expected less than or equal to 1"),

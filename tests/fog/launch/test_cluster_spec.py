@@ -83,7 +83,7 @@ def test_what_is_found_out_gets_the_keys_for_all() -> None:
         ({"services": {"/plan": "nav_msgs/msg/Path"}}, "expected one such as nav_msgs/srv/GetPlan"),
         ({"services": {"/plan": {"type": "nav_msgs/srv/GetPlan", "stpo": "/x"}}}, "stpo: expected type"),
         ({"services": {"/plan": {"type": "nav_msgs/srv/GetPlan", "stop": "/stop"}}}, 'stop goes with "at_once": 1'),
-        ({"replication": "twice"}, "expected all, some, hedged"),
+        ({"replication": "twice"}, "expected all, some, hedged, nearest"),
         ({"replication": {"mode": "all", "copy": 2}}, "copy: expected mode"),
         ({"timeout_s": 0}, "timeout_s=0"),
         ({"idle": "soon"}, "span of time"),

@@ -31,7 +31,10 @@ class Node:
     def __init__(self, label: str, role: str = "proxy") -> None:
         self.label = label
         self.role = role
-        self.places: list[dict[str, str]] = [{"node": ROBOT, "right": "publish"}, {"node": OTHER, "right": "read"}]
+        self.places: list[dict[str, str | int]] = [
+            {"node": ROBOT, "right": "publish"},
+            {"node": OTHER, "right": "read"},
+        ]
         self.is_silent = False
         self.is_ping_lost = False
         self.asked: list[Mapping[str, object]] = []
@@ -161,6 +164,19 @@ def test_a_trace_prints_the_switches_and_their_branches(capsys: pytest.CaptureFi
         "  2  a switch of school  1.50 ms  (tells our domain no more)",
     ]
     assert last.startswith("traced in ")
+
+
+def test_a_trace_of_a_service_names_the_nearest_server_first_and_the_cost_of_each_path(
+    node: Node, capsys: pytest.CaptureFixture[str]
+) -> None:
+    node.places = [{"node": OTHER, "right": "serve", "cost": 60}, {"node": ROBOT, "right": "serve", "cost": 20}]
+    assert gdp("trace", "/scan") == 0
+    first, second = [each for each in capsys.readouterr().out.splitlines() if "served by" in each]
+    assert first.endswith("1.50 ms, cost 20: the nearest that answers")
+    assert second.endswith("cost 60")
+    assert gdp("trace", "/scan", "--json") == 0
+    paths = json.loads(capsys.readouterr().out)["paths"]
+    assert [(each["cost"], each["is_nearest"]) for each in paths] == [(20, True), (60, False)]
 
 
 def test_a_trace_to_a_silent_member_exits_with_1(node: Node, capsys: pytest.CaptureFixture[str]) -> None:

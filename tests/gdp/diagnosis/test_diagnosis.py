@@ -53,6 +53,14 @@ def test_the_reader_that_governs_a_topic_is_named_with_its_path(side: str) -> No
     assert named in answer.sentence
 
 
+def test_the_servers_are_named_in_the_order_in_which_requests_go_to_them() -> None:
+    flow = replace(
+        FLOW, kind="service", connected=2, silent=1, ranking=("75e…0fc (cost 20)", "0a1…b2c (cost 0, silent)")
+    )
+    answer = diagnose(facts(flow=flow))
+    assert answer.sentence.endswith("connected; requests go to 75e…0fc (cost 20), then 0a1…b2c (cost 0, silent).")
+
+
 def test_messages_for_faster_readers_only_are_no_fault_and_the_switch_that_left_them_out_is_named() -> None:
     flow = replace(FLOW, received=10, idle_s=0.03, lost={"thinned": 30})
     switch = SwitchFacts(name=SWITCH, drops={"thinned": 31})

@@ -6,6 +6,7 @@ import random
 import struct
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
 from gdp.service.dispatch import Dispatch
 from gdp.service.frames import Answer, Outcome
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.imported_service import ImportedService
 from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
@@ -37,7 +39,7 @@ from tests.proxy.bridge.test_actions import (
 
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
 PLACES = ("nuc3/a", "nuc3/b", "nuc5/c")
-MODES = ["mode: all", "mode: some, copies: 2", "mode: hedged, budget: 0.5"]
+MODES = ["mode: all", "mode: some, copies: 2", "mode: hedged, budget: 0.5", "mode: nearest"]
 
 
 @pytest.fixture
@@ -113,6 +115,38 @@ def test_a_late_first_copy_is_hedged_and_then_cancelled(sites: Sites) -> None:
     assert sites.run(0.1, lambda: caller.outcomes == [switched("yes")])
     sites.run(0.5)
     assert [stop.asked for stop in stops] == [1, 0]
+
+
+def test_the_nearest_server_alone_is_asked_wherever_the_robot_is_and_the_next_one_after_its_death(
+    tmp_path: Path,
+) -> None:
+    nodes = ("nuc1", "nuc3", "nuc5")
+    links = tuple(Link(*ends) for ends in pairwise(nodes))
+    sites = Sites(tmp_path, topology=Topology(links, (DomainPlan("lab", nodes),), (Attachment("nuc1", "rib", "rib"),)))
+    machines = [sites.add(place, expose=[SWITCH]) for place in ("nuc5/far", "nuc3/near")]
+    locals_ = [LocalServer(machine.graph, answer=lambda _: switched("yes")) for machine in machines]
+    client = sites.add(ROBOT, imports=[f"{SWITCH}, timeout_s: 60, replication: {{mode: nearest}}"])
+    caller, far = Client(client.graph), machines[0].member.name.short
+    sites.run(0.5)
+    assert sites.run(5, heard_by(client, 2))
+    imported = client.bridge.flows[0][1]
+    assert isinstance(imported, ImportedService)
+
+    def asked(count: int) -> list[int]:
+        """Call, and return how many requests each server has had."""
+        flow(sites, caller, 0.05, count)
+        sites.run(0.05 * count + 0.3)
+        return [local.asked for local in locals_]
+
+    assert asked(10) == [0, 10]
+    sites.world.roam(ROBOT, "nuc5")
+    sites.run(1)
+    assert asked(10) == [10, 10]
+    assert imported.ranking(sites.now_s)[0] == f"{far} (cost 0)"
+    sites.kill(machines[0])
+    caller.call(switch(on=True))
+    assert sites.run(0.35, lambda: len(caller.outcomes) == 21)
+    assert imported.ranking(sites.now_s)[1] == f"{far} (cost 0, silent)"
 
 
 def test_what_waits_at_a_server_when_its_call_ends_is_never_given_to_it(sites: Sites) -> None:

@@ -65,6 +65,7 @@ class Sites:
     executed: dict[bytes, list[str]] = field(default_factory=dict)
     at: int = 0
     uplink_bytes: int = 0  # of requests
+    uplink_frames: int = 0
     out: set[int] = field(default_factory=set)  # sites whose replica cannot answer
     frozen: set[str] = field(default_factory=set)  # replicas
 
@@ -100,6 +101,7 @@ class Sites:
 
     @property
     def now_s(self) -> float:
+        """Return the present second."""
         return self.world.network.now.mono_s
 
     def set_delay(self, a: str, b: str, delay_s: float) -> None:
@@ -135,6 +137,7 @@ class Sites:
         self.cores[label] = SessionCore(member, [topic], lambda: next(self._starts))
 
     def label(self, site: int) -> str:
+        """Return the label of a site's replica."""
         return f"s{site}/edge{site}"
 
     def serve(self, site: int) -> None:
@@ -145,6 +148,7 @@ class Sites:
         self.send(label)
 
     def send(self, label: str) -> None:
+        """Send the pending frames of a member."""
         self.cores[label].member.flush(self.now_s)
         self.world.network.send_pending(label)
 
@@ -246,3 +250,4 @@ class Sites:
     def _tap(self, _at_s: float, a: str, _b: str, frame: bytes) -> None:
         if a == ROBOT and decode(frame, ETHER_BYTES).kind in (Kind.DATA, Kind.PARITY):
             self.uplink_bytes += len(frame)
+            self.uplink_frames += 1

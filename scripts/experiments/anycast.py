@@ -1,0 +1,127 @@
+"""Anycast: a robot roams among three replicas behind 5, 20 and 80 ms, which are killed; the nearest one answers.
+
+.venv/bin/python scripts/experiments/anycast.py                  # writes docs/experiments/anycast.*
+.venv/bin/python scripts/experiments/anycast.py --quick          # a few seconds: does it work?
+
+The network is simulated, with the cores of real nodes and a virtual clock.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from experiment import Finding, Report, command_line, run_experiment
+from page_text import text_of
+from pictures import Span, save_timeline
+from samples import Sample, p99
+from skeleton import Options
+
+from lab.sites import Sites
+
+TURNS: Final = 40
+QUICK: Final = 2
+APART_S: Final = (0.015, 0.06)
+NEAR_S: Final = 0.005
+SIZE: Final = 1_000
+_HZ: Final = 20.0
+_MOVED_S: Final = 1.0
+_PHASE_S: Final = 3.0  # after a move, after a death and after a restart
+_SHOWN: Final = 8  # turns, in the picture
+_SEED: Final = 37
+
+
+@dataclass(slots=True)
+class _Roaming:
+    """Turns of one robot: it moves, the nearest replica is killed, and starts again.
+
+    Attributes:
+        moved: seconds of the moves.
+        spans: in which a replica was away.
+        next_s: seconds from each death to the next answer, without the round trip to the next replica.
+        away: requests that the nearest replica did not answer, begun a second after a move or later.
+        settled: how many were begun then.
+        reached_s: seconds from each move to the first request that the nearest replica answered.
+    """
+
+    sites: Sites
+    moved: list[float] = field(default_factory=list)
+    spans: list[Span] = field(default_factory=list)
+    next_s: list[float] = field(default_factory=list)
+    reached_s: list[float] = field(default_factory=list)
+    away: int = 0
+    settled: int = 0
+
+    def turn(self, place: int) -> None:
+        """Move to a place; there the nearest replica dies and returns."""
+        sites = self.sites
+        sites.call_often(3 * _PHASE_S, 1 / _HZ)
+        sites.roam(place)
+        moved_s = sites.now_s
+        self.moved.append(moved_s)
+        sites.run(_PHASE_S)
+        since = [each for each in sites.requests if each.begun_s >= moved_s]
+        settled = [each for each in since if moved_s + _MOVED_S <= each.begun_s < sites.now_s - 0.1]
+        self.settled += len(settled)
+        self.away += sum(each.by != sites.label(place) for each in settled)
+        reached = [each.begun_s - moved_s for each in since if each.by == sites.label(place)]
+        self.reached_s.append(min(reached, default=_PHASE_S))
+        sites.kill(place)
+        died_s = sites.now_s
+        (following,) = sites.nearest()
+        sites.run(_PHASE_S)
+        answers = [each.answered_s for each in sites.requests if each.by == sites.label(following)]
+        first_s = min(each for each in answers if each > died_s)
+        self.next_s.append(first_s - died_s - sites.trip_s(following))
+        sites.restart(place)
+        sites.run(_PHASE_S)
+        self.spans.append(Span(f"site {place}", died_s, died_s + _PHASE_S))
+
+
+def measure(options: Options) -> Report:
+    """Let a robot roam among replicas that die."""
+    turns, chance = QUICK if options.quick else options.turns, random.Random(_SEED)
+    sites = Sites(apart_s=APART_S, near_s=NEAR_S, size=SIZE)
+    roaming, begun_s, before, place = _Roaming(sites), sites.now_s, sites.uplink_frames, 0
+    for _ in range(turns):
+        place = chance.choice([each for each in range(len(APART_S) + 1) if each != place])
+        roaming.turn(place)
+    sites.run(_PHASE_S)
+    copies, frames = sum(map(len, sites.executed.values())) / len(sites.executed), sites.uplink_frames - before
+    shown = [each for each in _samples(sites, begun_s) if each.begun_s < 3 * _PHASE_S * _SHOWN]
+    spans = [Span(each.machine, each.from_s - begun_s, each.to_s - begun_s) for each in roaming.spans[:_SHOWN]]
+    moves = [each - begun_s for each in roaming.moved[:_SHOWN]]
+    return Report(
+        "anycast",
+        "Anycast: the nearest of three replicas",
+        {"all requests": _samples(sites, begun_s)},
+        [
+            Finding(
+                "at the nearest replica, a second after a move, %", 100 * (1 - roaming.away / roaming.settled), 100
+            ),
+            Finding("from a move to the first request there, worst, s", max(roaming.reached_s), _MOVED_S, True),
+            Finding("next answer after a death, less the round trip, p99, ms", 1e3 * p99(roaming.next_s), 300, True),
+            Finding("executions of a request, mean", copies),
+            Finding("frames on the uplink for a request of one frame", frames / len(sites.requests), 1.1, True),
+        ],
+        text_of("anycast", hz=_HZ, size=SIZE, turns=turns),
+        {"turns": turns, "requests": len(sites.requests), "clock": "virtual"},
+        lambda path, title: save_timeline(path, title, shown, spans, 0.0, moves),
+    )
+
+
+def _samples(sites: Sites, begun_s: float) -> Sequence[Sample]:
+    return [
+        Sample(
+            "/plan", each.begun_s - begun_s, each.answered_s - each.begun_s, f"site {each.by[1:2]}", 0.0, bool(each.by)
+        )
+        for each in sites.requests
+    ]
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__)
+    parser.add_argument("--turns", type=int, default=TURNS, help="moves, and deaths (default: %(default)s)")
+    run_experiment(parser, measure, is_timed=False)
