@@ -25,9 +25,9 @@ from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE, "node": Right.SERVE}
 _GIVES: Final = frozenset(GIVING.values())
-TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
+TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL, "node": Right.CALL}
 
 
 def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:

@@ -205,12 +205,12 @@ class Spread(Section):
 
 
 class Rule(Section):
-    """What crosses: one topic, service or action, or all of a pattern.
+    """What crosses: one topic, service, action or node, or all of a pattern. A node brings what it has.
 
     The 256-bit names follow from kind, name, type, metadata and owner.
     """
 
-    model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind("topic"), _by_kind("service"), _by_kind("action")]})
+    model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind(kind) for kind in TYPE_FORMS]})
 
     kind: Kind = Field(default="topic", description="What it is about.")
     name: NamePattern = Field(description="Full ROS name that all sides know, or a pattern.")
@@ -339,6 +339,7 @@ class Rule(Section):
 
     _denied: tuple[str, ...] = PrivateAttr(default=())
     _is_of_recording: bool = PrivateAttr(default=False)
+    _node_rule: Rule | None = PrivateAttr(default=None)
 
     def within(self, prefix: str | None, denied: tuple[str, ...]) -> Rule:
         """Return the rule as it applies in a file.
@@ -356,6 +357,17 @@ class Rule(Section):
         rule = self.model_copy(update=changes)
         rule._is_of_recording = True
         return rule
+
+    def of_node(self, kind: Kind, local_name: str, type_name: str) -> Rule:
+        """Return the rule of one topic, service or action of a node that this rule of kind ``node`` is about."""
+        rule = self.model_copy(update={"kind": kind, "name": local_name, "type_name": type_name, "remap": None})
+        rule._node_rule = self
+        return rule
+
+    @property
+    def stated(self) -> Rule:
+        """Return the rule as it is in the file: itself, or the rule of the node that brings it."""
+        return self._node_rule or self
 
     @property
     def extra(self) -> dict[str, str | int]:
@@ -445,7 +457,10 @@ class Rule(Section):
 
     def denied_by(self, local_name: str) -> str | None:
         """Return the pattern under ``deny`` that covers a local name or its name on the overlay; None: none does."""
-        names = (local_name, self.global_name_of(local_name))
+        return self.denies(local_name, self.global_name_of(local_name))
+
+    def denies(self, *names: str) -> str | None:
+        """Return the pattern under ``deny`` that covers one of these names; None: none does."""
         return next((pattern for pattern in self._denied if any(covers(pattern, name) for name in names)), None)
 
     @property
@@ -463,8 +478,18 @@ class Rule(Section):
 
     def global_name_of(self, local_name: str) -> str:
         """Return the name that all sides use for a local name that ``matches``."""
-        name = local_name if self.is_pattern else self.name
+        return self.prefixed(local_name if self.is_pattern else self.name)
+
+    def prefixed(self, name: str) -> str:
+        """Return a name within the rule's namespace on the overlay."""
         return f"/{self.prefix}{name}" if self.prefix else name
+
+    def local_name_of(self, global_name: str) -> str | None:
+        """Return what this machine calls a name that all sides know; None: it lies outside the rule's namespace."""
+        if not self.prefix:
+            return global_name
+        name = global_name.removeprefix(f"/{self.prefix}")
+        return name if name.startswith("/") and name != global_name else None
 
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
         """Return the metadata that the overlay name of a matching local name digests."""
@@ -487,14 +512,13 @@ class Rule(Section):
             return None
         if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
             return None
-        if self.prefix:
-            if not name.startswith(f"/{self.prefix}/"):
-                return None
-            name = name.removeprefix(f"/{self.prefix}")
+        own = self.local_name_of(name)
+        if own is None:
+            return None
         if self.is_pattern:
-            local = name if matches(self.name, name) else None
+            local = own if matches(self.name, own) else None
         else:
-            local = self.local if name == self.name else None
+            local = self.local if own == self.name else None
         return None if local is None or self.denied_by(local) is not None else local
 
     @field_validator("type_name")

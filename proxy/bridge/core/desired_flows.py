@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.ros_names import Kind
+from gdp.ros_names import NODE_TYPE, Kind
 from proxy.bridge.core.action_interface import action_of
 from proxy.bridge.faults import Fault
 from proxy.config import matching
@@ -71,7 +71,9 @@ def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator
 
 def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
     """Yield a flow for each local publisher or server that a rule exposes; problems are added to ``complaints``."""
-    for (kind, local), types in _shown(graph, _SHOWS).items():
+    shown = _shown(graph, _SHOWS)
+    shown |= {("node", end.node): {NODE_TYPE} for end in graph if end.node and not end.is_proxy}
+    for (kind, local), types in shown.items():
         first = choose(rules, kind, local)
         if first is None:
             continue
@@ -111,11 +113,10 @@ def imported(
 def _imported(
     rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
 ) -> Iterator[FlowSpec]:
-    for rule in rules:
-        if not rule.is_pattern and rule.type_name and not rule.is_denied:
-            yield FlowSpec(False, rule.local, rule.type_name, rule.overlay_name, rule)
+    stated = [rule for rule in rules if rule.stated is rule]
+    yield from _named(stated)
     for metadata, name in held:
-        found = matching.imported(rules, name, metadata)
+        found = matching.imported(stated, name, metadata)
         if found is not None:
             yield FlowSpec(False, found[1], str(metadata["type"]), name, found[0])
     for (kind, local), types in wanted.items():
@@ -123,6 +124,14 @@ def _imported(
             asked = choose(rules, kind, local, type_name)
             if asked is not None:
                 yield FlowSpec(False, local, type_name, asked.overlay_name_of(local, type_name), asked)
+    yield from _named([rule for rule in rules if rule.stated is not rule])
+
+
+def _named(rules: Sequence[Rule]) -> Iterator[FlowSpec]:
+    for rule in rules:
+        type_name = rule.type_name or (NODE_TYPE if rule.kind == "node" else "")
+        if not rule.is_pattern and type_name and not rule.is_denied:
+            yield FlowSpec(False, rule.local, type_name, rule.overlay_name_of(rule.local, type_name), rule)
 
 
 def _shown(graph: Graph, roles: Mapping[Kind, Role]) -> dict[tuple[Kind, str], set[str]]:

@@ -1,0 +1,95 @@
+"""Rules that a rule of kind ``node`` stands for: one for each topic, service and action of its nodes.
+
+Sans-I/O. What a node publishes or serves goes in the direction of its rule; what it subscribes to goes the other way.
+Its clients are only described: which machine serves them is for the rule of that service to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple, TypeAlias
+
+from gdp.ros_names import ACTION_INFIX, Kind, is_of_every_node
+from proxy.bridge.core.action_interface import action_of, is_part
+from proxy.config.matching import choose
+from proxy.config.rule import Rule
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
+from proxy.wire.node import NodeEntity
+
+FarNodes: TypeAlias = Mapping[str, Graph]  # the nodes of other machines, by their names here, each with its entities
+_PLAIN: Final[dict[Role, Kind]] = {Role.PUBLISHES: "topic", Role.SUBSCRIBES: "topic", Role.SERVES: "service"}
+
+
+class Brought(NamedTuple):
+    """Rules that nodes bring, by direction."""
+
+    expose: list[Rule]
+    imports: list[Rule]
+
+
+def nodes_in(rules: Sequence[Rule], graph: Graph) -> dict[str, tuple[Rule, list[GraphEntity]]]:
+    """Return the local nodes that rules of kind ``node`` mean, each with its rule and its entities."""
+    found: dict[str, tuple[Rule, list[GraphEntity]]] = {}
+    of_kind = [rule for rule in rules if rule.kind == "node"]
+    for end in graph if of_kind else ():
+        if end.node in found:
+            found[end.node][1].append(end)
+        elif end.node and not end.is_proxy and (rule := choose(of_kind, "node", end.node)) is not None:
+            found[end.node] = rule, [end]
+    return found
+
+
+def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Graph]]) -> Brought:
+    """Return the rules of what local nodes have that a rule exposes, and of what far nodes have.
+
+    Args:
+        far: the entities of each node that is imported, with its rule.
+    """
+    rules = Brought([], [])
+    for rule, ends in nodes_in(expose, graph).values():
+        _add(rules.expose, rules.imports, rule, ends)
+    for rule, far_ends in far:
+        _add(rules.imports, rules.expose, rule, far_ends)
+    return rules
+
+
+def _add(same: list[Rule], other: list[Rule], rule: Rule, ends: Iterable[GraphEntity]) -> None:
+    found = {(end.role is Role.SUBSCRIBES, *thing) for end in ends if (thing := _thing(end)) is not None}
+    for is_other, kind, name, type_name in sorted(found):
+        if rule.denies(name, rule.prefixed(name)) is None:
+            (other if is_other else same).append(rule.of_node(kind, name, type_name))
+
+
+def _thing(end: GraphEntity) -> tuple[Kind, str, str] | None:
+    """Return kind, name and type of what crosses for this entity; None: nothing does."""
+    if (action := action_of(end)) is not None and end.role is Role.SERVES:
+        return "action", *action
+    kind = _PLAIN.get(end.role)
+    if kind is None or is_part(end.name) or not end.type_name:
+        return None
+    if end.role is Role.SUBSCRIBES and is_of_every_node("topic", end.name):
+        return None  # it hears this graph's; another machine's would look like its own
+    return kind, end.name, end.type_name
+
+
+def described(rule: Rule, ends: Iterable[GraphEntity]) -> list[NodeEntity]:
+    """Return a node's entities for other machines, without denied ones."""
+    found = {
+        NodeEntity(end.role, rule.prefixed(end.name), end.type_name, end.qos)
+        for end in ends
+        if end.type_name and rule.denies(_whole(end.name), rule.prefixed(_whole(end.name))) is None
+    }
+    return sorted(found, key=lambda each: (each.role.value, each.name, each.type_name, repr(each.qos)))
+
+
+def local_ends(rule: Rule, node: str, entities: Iterable[NodeEntity]) -> Iterator[GraphEntity]:
+    """Yield a far node's entities as they appear here, without denied ones and those outside the rule's namespace."""
+    for role, shared, type_name, qos in entities:
+        name = rule.local_name_of(shared)
+        if name is not None and rule.denies(_whole(name), _whole(shared)) is None:
+            yield GraphEntity(role, name, type_name, node, "", qos=qos)
+
+
+def _whole(name: str) -> str:
+    """Return the name of the action that a name is a part of; other names are kept."""
+    return name.partition(ACTION_INFIX)[0]
