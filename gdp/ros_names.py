@@ -13,7 +13,8 @@ import functools
 import re
 from typing import Final, Literal, TypeAlias
 
-Kind: TypeAlias = Literal["topic", "service", "action", "node"]
+Interface: TypeAlias = Literal["topic", "service", "action"]
+Kind: TypeAlias = Interface | Literal["node"]
 
 NODE_TYPE: Final = "gdp/Node"  # of every node: what its 256-bit name digests
 ACTION_INFIX: Final = "/_action/"  # between an action's name and its parts; ROS 2 design article on actions
@@ -54,6 +55,18 @@ def is_name(text: str) -> bool:
 def resolved(text: str) -> str:
     """Return the full name of a name that is relative to the root namespace, as ROS resolves it; others are kept."""
     return text if text.startswith(("/", "~")) else f"/{text}"
+
+
+def prefixed(prefix: str | None, name: str) -> str:
+    """Return a name, or a pattern, within a namespace; without one it is kept."""
+    return f"/{prefix}{name}" if prefix else name
+
+
+def unprefixed(prefix: str | None, name: str) -> str | None:
+    """Return the name without its namespace; None: it lies outside of it."""
+    if not prefix:
+        return name
+    return name.removeprefix(f"/{prefix}") if name.startswith(f"/{prefix}/") else None
 
 
 def is_pattern(text: str) -> bool:

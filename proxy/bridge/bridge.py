@@ -24,7 +24,7 @@ from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_node, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
-from proxy.bridge.core.node_rules import FarNodes, brought
+from proxy.bridge.core.node_rules import Brought, FarNodes, brought
 from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -38,6 +38,7 @@ from proxy.bridge.node_flow import ExposedNode, ImportedNode
 from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
+from proxy.config.brought_rule import stated
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.core.endpoint import (
@@ -211,6 +212,17 @@ class Bridge:
     def labels(self) -> list[str]:
         """Return the display names of the graphs."""
         return [dispatcher.endpoint.label for dispatcher in self._dispatchers]
+
+    @property
+    def brought(self) -> Brought:
+        """Return the rules of what the nodes have that rules are about."""
+        rules = Brought([], [])
+        for at, dispatcher in enumerate(self._dispatchers):
+            expose = [rule for rule in self.rules.expose if self.rules.endpoint_of(rule) == at]
+            here = self._brought(at, expose, dispatcher.graph())
+            rules.expose.extend(here.expose)
+            rules.imports.extend(here.imports)
+        return rules
 
     @property
     def stats(self) -> list[TopicStats]:
@@ -498,10 +510,14 @@ class Bridge:
         config = self.rules
         expose = [rule for rule in config.expose if config.endpoint_of(rule) == at]
         imports = [rule for rule in config.imports if config.endpoint_of(rule) == at]
-        nodes = brought(expose, graph, [(flow_spec.rule, flow.ends) for flow_spec, flow in self._imported_nodes(at)])
-        yield from exposed([*expose, *nodes.expose], graph, complaints)
+        nodes = self._brought(at, expose, graph)
+        yield from exposed(expose, graph, complaints, nodes.expose)
         held = [*self.held.described(Right.READ), *self.held.described(Right.CALL)]
-        yield from imported([*imports, *nodes.imports], graph, held, complaints)
+        yield from imported(imports, graph, held, complaints, nodes.imports)
+
+    def _brought(self, at: int, expose: Sequence[Rule], graph: Graph) -> Brought:
+        far = [(flow_spec.rule, flow.ends) for flow_spec, flow in self._imported_nodes(at)]
+        return brought(expose, graph, far)
 
     def _imported_nodes(self, at: int) -> Iterator[tuple[FlowSpec, ImportedNode]]:
         for key, (flow_spec, flow) in self._flows.items():
@@ -562,7 +578,7 @@ class Bridge:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
         flow_spec, _ = self._flows[key]
         rules = (*self.rules.expose, *self.rules.imports)
-        return flow_spec.rule.stated in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
+        return stated(flow_spec.rule) in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
 
     def _finish(self, key: _Key) -> None:
         """End a flow; the last messages of an exposed one stay until readers have confirmed them."""

@@ -19,13 +19,13 @@ Fault: TypeAlias = "tuple[tuple[str | int, ...], str]"  # the wrong key, and its
 def choose(rules: Sequence[Rule], kind: Kind, local_name: str, type_name: str = "") -> Rule | None:
     """Return the rule of one direction for a local name; None: it stays local.
 
-    A rule with that full name is final: if its type differs, no pattern replaces it. What a node brings comes last.
+    A rule with that full name is final: if its type differs, no pattern replaces it.
 
     Args:
         type_name: empty while unknown.
     """
     fitting = [rule for rule in rules if rule.kind == kind and rule.matches(local_name)]
-    full = [rule for rule in fitting if not rule.is_pattern and rule.stated is rule]
+    full = [rule for rule in fitting if not rule.is_pattern]
     return next((rule for rule in full or fitting if rule.fits_type(type_name)), None)
 
 

@@ -45,6 +45,8 @@ from gdp.ros_names import (
     is_pattern,
     leaves_out,
     matches,
+    prefixed,
+    unprefixed,
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
@@ -339,7 +341,6 @@ class Rule(Section):
 
     _denied: tuple[str, ...] = PrivateAttr(default=())
     _is_of_recording: bool = PrivateAttr(default=False)
-    _node_rule: Rule | None = PrivateAttr(default=None)
 
     def within(self, prefix: str | None, denied: tuple[str, ...]) -> Rule:
         """Return the rule as it applies in a file.
@@ -357,17 +358,6 @@ class Rule(Section):
         rule = self.model_copy(update=changes)
         rule._is_of_recording = True
         return rule
-
-    def of_node(self, kind: Kind, local_name: str, type_name: str) -> Rule:
-        """Return the rule of one topic, service or action of a node that this rule of kind ``node`` is about."""
-        rule = self.model_copy(update={"kind": kind, "name": local_name, "type_name": type_name, "remap": None})
-        rule._node_rule = self
-        return rule
-
-    @property
-    def stated(self) -> Rule:
-        """Return the rule as it is in the file: itself, or the rule of the node that brings it."""
-        return self._node_rule or self
 
     @property
     def extra(self) -> dict[str, str | int]:
@@ -457,10 +447,7 @@ class Rule(Section):
 
     def denied_by(self, local_name: str) -> str | None:
         """Return the pattern under ``deny`` that covers a local name or its name on the overlay; None: none does."""
-        return self.denies(local_name, self.global_name_of(local_name))
-
-    def denies(self, *names: str) -> str | None:
-        """Return the pattern under ``deny`` that covers one of these names; None: none does."""
+        names = (local_name, self.global_name_of(local_name))
         return next((pattern for pattern in self._denied if any(covers(pattern, name) for name in names)), None)
 
     @property
@@ -478,18 +465,7 @@ class Rule(Section):
 
     def global_name_of(self, local_name: str) -> str:
         """Return the name that all sides use for a local name that ``matches``."""
-        return self.prefixed(local_name if self.is_pattern else self.name)
-
-    def prefixed(self, name: str) -> str:
-        """Return a name within the rule's namespace on the overlay."""
-        return f"/{self.prefix}{name}" if self.prefix else name
-
-    def local_name_of(self, global_name: str) -> str | None:
-        """Return what this machine calls a name that all sides know; None: it lies outside the rule's namespace."""
-        if not self.prefix:
-            return global_name
-        name = global_name.removeprefix(f"/{self.prefix}")
-        return name if name.startswith("/") and name != global_name else None
+        return prefixed(self.prefix, local_name if self.is_pattern else self.name)
 
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
         """Return the metadata that the overlay name of a matching local name digests."""
@@ -512,7 +488,7 @@ class Rule(Section):
             return None
         if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
             return None
-        own = self.local_name_of(name)
+        own = unprefixed(self.prefix, name)
         if own is None:
             return None
         if self.is_pattern:

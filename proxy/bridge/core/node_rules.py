@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
-from gdp.ros_names import ACTION_INFIX, Kind, is_of_every_node
+from gdp.ros_names import ACTION_INFIX, NODE_TYPE, Interface, is_of_every_node, prefixed, unprefixed
 from proxy.bridge.core.action_interface import action_of, is_part
+from proxy.config.brought_rule import BroughtRule
 from proxy.config.matching import choose
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.wire.node import NodeEntity
 
 FarNodes: TypeAlias = Mapping[str, Graph]  # the nodes of other machines, by their names here, each with its entities
-_PLAIN: Final[dict[Role, Kind]] = {Role.PUBLISHES: "topic", Role.SUBSCRIBES: "topic", Role.SERVES: "service"}
+_PLAIN: Final[dict[Role, Interface]] = {Role.PUBLISHES: "topic", Role.SUBSCRIBES: "topic", Role.SERVES: "service"}
 
 
 class Brought(NamedTuple):
@@ -39,6 +40,11 @@ def nodes_in(rules: Sequence[Rule], graph: Graph) -> dict[str, tuple[Rule, list[
     return found
 
 
+def node_entity(end: GraphEntity) -> GraphEntity:
+    """Return the node of an entity, as if it were the server of its own name."""
+    return GraphEntity(Role.SERVES, end.node, NODE_TYPE, end.node, end.node)
+
+
 def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Graph]]) -> Brought:
     """Return the rules of what local nodes have that a rule exposes, and of what far nodes have.
 
@@ -54,13 +60,14 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
 
 
 def _add(same: list[Rule], other: list[Rule], rule: Rule, ends: Iterable[GraphEntity]) -> None:
+    by_node = BroughtRule.by(rule)
     found = {(end.role is Role.SUBSCRIBES, *thing) for end in ends if (thing := _thing(end)) is not None}
     for is_other, kind, name, type_name in sorted(found):
-        if rule.denies(name, rule.prefixed(name)) is None:
-            (other if is_other else same).append(rule.of_node(kind, name, type_name))
+        if by_node.denied_by(name) is None:
+            (other if is_other else same).append(by_node.of(kind, name, type_name))
 
 
-def _thing(end: GraphEntity) -> tuple[Kind, str, str] | None:
+def _thing(end: GraphEntity) -> tuple[Interface, str, str] | None:
     """Return kind, name and type of what crosses for this entity; None: nothing does."""
     if (action := action_of(end)) is not None and end.role is Role.SERVES:
         return "action", *action
@@ -74,19 +81,21 @@ def _thing(end: GraphEntity) -> tuple[Kind, str, str] | None:
 
 def described(rule: Rule, ends: Iterable[GraphEntity]) -> list[NodeEntity]:
     """Return a node's entities for other machines, without denied ones."""
+    by_node = BroughtRule.by(rule)
     found = {
-        NodeEntity(end.role, rule.prefixed(end.name), end.type_name, end.qos)
+        NodeEntity(end.role, prefixed(rule.prefix, end.name), end.type_name, end.qos)
         for end in ends
-        if end.type_name and rule.denies(_whole(end.name), rule.prefixed(_whole(end.name))) is None
+        if end.type_name and by_node.denied_by(_whole(end.name)) is None
     }
     return sorted(found, key=lambda each: (each.role.value, each.name, each.type_name, repr(each.qos)))
 
 
 def local_ends(rule: Rule, node: str, entities: Iterable[NodeEntity]) -> Iterator[GraphEntity]:
     """Yield a far node's entities as they appear here, without denied ones and those outside the rule's namespace."""
+    by_node = BroughtRule.by(rule)
     for role, shared, type_name, qos in entities:
-        name = rule.local_name_of(shared)
-        if name is not None and rule.denies(_whole(name), _whole(shared)) is None:
+        name = unprefixed(rule.prefix, shared)
+        if name is not None and by_node.denied_by(_whole(name)) is None:
             yield GraphEntity(role, name, type_name, node, "", qos=qos)
 
 

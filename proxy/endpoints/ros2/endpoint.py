@@ -80,13 +80,13 @@ class Ros2Endpoint:
 
     def set_nodes(self, nodes: Mapping[str, Graph]) -> None:
         """Replace the far nodes; an entity whose owner changes is created again at its new one."""
-        places = self._far_nodes.begin(nodes, {end.node for end in self.graph()})
+        places = self._far_nodes.replace_nodes(nodes, {end.node for end in self.graph()})
         for number, opened in list(self._opened.items()):
             if opened.home is not self._far_nodes.home(opened.role, opened.name):
                 self._move(number, opened)
         for place in places:
             self._show(place)
-        self._far_nodes.end(nodes)
+        self._far_nodes.remove_others(nodes)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Subscribe to a topic; raises ``LocalError`` for an unknown type or a refused name."""

@@ -38,8 +38,8 @@ class FarNodes:
         ends = self._ends.get((role, name)) if role in _OWNED else None
         return self._nodes[ends[0].node] if ends else self._session.node
 
-    def begin(self, nodes: Mapping[str, Graph], here: Collection[str]) -> set[Place]:
-        """Replace the nodes; return the places to ``show``. Nodes that are gone stay until ``end``.
+    def replace_nodes(self, nodes: Mapping[str, Graph], here: Collection[str]) -> set[Place]:
+        """Replace the nodes; return the places to ``show``. Nodes that are gone stay until ``remove_others``.
 
         Args:
             here: names of the nodes of this machine's graph; a far one of an equal name does not appear.
@@ -79,7 +79,7 @@ class FarNodes:
         if shown:
             self._shown[place] = shown
 
-    def end(self, nodes: Collection[str]) -> None:
+    def remove_others(self, nodes: Collection[str]) -> None:
         """Remove the nodes that are not among these."""
         for name in self._nodes.keys() - set(nodes):
             self._session.destroy_node(name, self._nodes.pop(name))

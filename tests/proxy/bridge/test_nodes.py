@@ -83,3 +83,95 @@ def test_its_messages_and_calls_cross_in_both_directions(sites: Sites) -> None:
     caller.call(switch(on=True))
     assert sites.run(2, lambda: bool(ear.texts and order.texts and caller.outcomes))
     assert (ear.texts, order.texts, caller.outcomes) == (["hello"], ["go"], [switched("got 1")])
+
+
+def test_it_disappears_when_it_ends(sites: Sites) -> None:
+    robot, station = pair(sites)
+    parts = talker(robot.graph)
+    assert sites.run(5, lambda: bool(shown(station)))
+    for each in parts:
+        each.close()  # type: ignore[attr-defined]
+    assert sites.run(1, lambda: not shown(station))
+    assert sites.run(2, lambda: station.carried == {("/talker", False)})
+
+
+def test_it_disappears_when_its_machine_is_silent(sites: Sites) -> None:
+    robot, station = pair(sites)
+    talker(robot.graph)
+    assert sites.run(5, lambda: bool(shown(station)))
+    sites.world.network.freeze(robot.label)
+    assert sites.run(3, lambda: not shown(station))
+    sites.world.network.thaw(robot.label)
+    assert sites.run(20, lambda: bool(shown(station)))
+
+
+@pytest.mark.parametrize("is_robot", [True, False])
+def test_it_disappears_when_it_loses_its_grant(sites: Sites, *, is_robot: bool) -> None:
+    robot, station = pair(sites)
+    talker(robot.graph)
+    assert sites.run(5, lambda: bool(shown(station)))
+    rules = ["kind: node, name: /talker"]
+    if is_robot:
+        sites.reload(robot, expose=rules, holds=HOLDS[1:])
+    else:
+        sites.reload(station, imports=rules, holds=HOLDS[1:])
+    assert sites.run(3, lambda: not shown(station))
+    assert sites.run(3, lambda: station.carried <= {("/talker", False)})
+
+
+def test_what_it_gains_and_loses_follows(sites: Sites) -> None:
+    robot, station = pair(sites)
+    chatter, *_ = talker(robot.graph)
+    assert sites.run(5, lambda: (Role.PUBLISHES, "/chatter") in shown(station))
+    chatter.close()  # type: ignore[attr-defined]
+    assert sites.run(1, lambda: (Role.PUBLISHES, "/chatter") not in shown(station))
+    robot.graph.publish("/talker", "/chatter", STRING)
+    assert sites.run(1, lambda: (Role.PUBLISHES, "/chatter") in shown(station))
+
+
+def test_a_topic_of_two_nodes_stays_while_one_has_it(sites: Sites) -> None:
+    holds = [*HOLDS, named("/other", NODE_TYPE, "node")]
+    robot = sites.add(ROBOT, expose=["kind: node, name: /*"], holds=holds)
+    station = sites.add(SERVER, imports=["kind: node, name: /*"], holds=holds)
+    parts, second = talker(robot.graph), robot.graph.publish("/other", "/chatter", STRING)
+    ear = Ear(station.graph, "/chatter")
+    assert sites.run(
+        5, lambda: all((Role.PUBLISHES, "/chatter") in shown(station, each) for each in ("/talker", "/other"))
+    )
+    for each in parts:
+        each.close()  # type: ignore[attr-defined]
+    assert sites.run(2, lambda: not shown(station))
+    second.publish(string("still here"))
+    assert sites.run(2, lambda: ear.texts == ["still here"])
+
+
+def test_another_proxy_of_the_graph_does_not_send_a_far_node_out_again(sites: Sites) -> None:
+    robot, station = pair(sites)
+    second = sites.add(
+        "nuc3/second",
+        graph=station.graph,
+        expose=["kind: node, name: /**", "name: /**", "kind: service, name: /**"],
+        holds=HOLDS,
+    )
+    talker(robot.graph)
+    assert sites.run(5, lambda: (Role.SERVES, GET) in shown(station))
+    sites.run(2)
+    assert second.carried == set()
+
+
+def test_a_prefix_holds_for_all_that_it_has(sites: Sites) -> None:
+    holds = [named(f"/arm{each['name']}", str(each["type"]), str(each["kind"])) for each in HOLDS]
+    robot = sites.add(ROBOT, expose=["kind: node, name: /talker, prefix: arm"], holds=holds)
+    station = sites.add(SERVER, imports=["kind: node, name: /arm/talker"], holds=holds)
+    plain = sites.add("nuc5/plain", imports=["kind: node, name: /talker, prefix: arm"], holds=holds)
+    talker(robot.graph)
+    assert sites.run(5, lambda: (Role.SERVES, "/arm" + GET) in shown(station, "/arm/talker"))
+    assert sites.run(5, lambda: (Role.SERVES, GET) in shown(plain))
+
+
+def test_a_rule_about_a_name_itself_precedes_that_of_its_node(sites: Sites) -> None:
+    robot = sites.add(ROBOT, expose=["kind: node, name: /talker", "name: /chat*, max_hz: 1"], holds=HOLDS)
+    talker(robot.graph)
+    assert sites.run(5, lambda: ("/chatter", True) in robot.carried)
+    rules = {spec.local: spec.rule for spec, _ in robot.bridge.flows}
+    assert (rules["/chatter"].max_hz, rules["/rosout"].max_hz) == (1, None)
