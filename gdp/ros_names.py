@@ -14,7 +14,7 @@ import re
 from typing import Final, Literal, TypeAlias
 
 Interface: TypeAlias = Literal["topic", "service", "action"]
-Kind: TypeAlias = Interface | Literal["node"]
+Kind: TypeAlias = Literal["topic", "service", "action", "node"]
 
 NODE_TYPE: Final = "gdp/Node"  # of every node: what its 256-bit name digests
 ACTION_INFIX: Final = "/_action/"  # between an action's name and its parts; ROS 2 design article on actions

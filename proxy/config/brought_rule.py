@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pydantic import PrivateAttr
 
+from gdp.config.offered_qos import OfferedQos
 from gdp.ros_names import Interface
 from proxy.config.rule import Rule
 
@@ -23,9 +24,9 @@ class BroughtRule(Rule):
         rule._stated, rule._denied = node_rule, node_rule._denied
         return rule
 
-    def of(self, kind: Interface, local_name: str, type_name: str) -> BroughtRule:
+    def of(self, kind: Interface, local_name: str, type_name: str, offered: OfferedQos | None = None) -> BroughtRule:
         """Return the rule of one name."""
-        return self.model_copy(update={"kind": kind, "name": local_name, "type_name": type_name})
+        return self.model_copy(update={"kind": kind, "name": local_name, "type_name": type_name, "offered": offered})
 
 
 def stated(rule: Rule) -> Rule:

@@ -7,14 +7,18 @@ Its clients are only described: which machine serves them is for the rule of tha
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
+from gdp.config.offered_qos import OFFERED_DEPTH_MAX, OfferedQos
 from gdp.ros_names import ACTION_INFIX, NODE_TYPE, Interface, is_of_every_node, prefixed, unprefixed
 from proxy.bridge.core.action_interface import action_of, is_part
 from proxy.config.brought_rule import BroughtRule
 from proxy.config.matching import choose
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.qos import depth_of
+from proxy.serial.channel import Qos
 from proxy.wire.node import NodeEntity
 
 FarNodes: TypeAlias = Mapping[str, Graph]  # the nodes of other machines, by their names here, each with its entities
@@ -53,18 +57,39 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
     """
     rules = Brought([], [])
     for rule, ends in nodes_in(expose, graph).values():
-        _add(rules.expose, rules.imports, rule, ends)
+        for is_other, each in _rules(rule, ends):
+            (rules.imports if is_other else rules.expose).append(each)
     for rule, far_ends in far:
-        _add(rules.imports, rules.expose, rule, far_ends)
+        profiles = {end.name: end.qos for end in sorted(far_ends, key=repr) if end.role is Role.PUBLISHES}
+        for is_other, each in _rules(rule, far_ends, profiles):
+            (rules.expose if is_other else rules.imports).append(each)
     return rules
 
 
-def _add(same: list[Rule], other: list[Rule], rule: Rule, ends: Iterable[GraphEntity]) -> None:
+def _rules(
+    rule: Rule, ends: Iterable[GraphEntity], profiles: Mapping[str, Qos | None] = MappingProxyType({})
+) -> Iterator[tuple[bool, Rule]]:
+    """Yield the rule of each thing that a node has, and whether it goes in the other direction than the node.
+
+    Args:
+        profiles: what far publishers offer, by topic.
+    """
     by_node = BroughtRule.by(rule)
     found = {(end.role is Role.SUBSCRIBES, *thing) for end in ends if (thing := _thing(end)) is not None}
     for is_other, kind, name, type_name in sorted(found):
         if by_node.denied_by(name) is None:
-            (other if is_other else same).append(by_node.of(kind, name, type_name))
+            profile = None if is_other or kind != "topic" else profiles.get(name)
+            offered = None if profile is None else _offered(profile)
+            yield is_other, by_node.of(kind, name, type_name, offered)
+
+
+def _offered(profile: Qos) -> OfferedQos:
+    """Return what a publisher offers; it holds until its first message describes it."""
+    return OfferedQos(
+        reliability="best_effort" if profile.reliability == "best_effort" else "reliable",
+        durability="transient_local" if profile.durability == "transient_local" else "volatile",
+        depth=min(max(depth_of(profile), 1), OFFERED_DEPTH_MAX),
+    )
 
 
 def _thing(end: GraphEntity) -> tuple[Interface, str, str] | None:
