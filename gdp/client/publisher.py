@@ -209,6 +209,11 @@ class Publisher:
         if self._heartbeats.describe(description):
             self.published(self)
 
+    def probe(self) -> None:
+        """Send a Heartbeat soon; each reader reports at once."""
+        self._heartbeats.wanted = True
+        self.published(self)
+
     def set_options(self, options: SendOptions) -> None:
         """Change how fresh, how much and how often messages leave, those that wait included."""
         self.options = options
