@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -23,13 +24,18 @@ GRAPH = {  # what a verb prints, by call
     "action info": "action_info(node)",
     "lifecycle nodes": "lifecycle_nodes(node)",
 }
+PAGE = Path(__file__).parents[3] / "docs/reference/ros2cli.md"
+NOT = """
+Not the same: GIDs are those of the other graph. Events of deadline, liveliness and lifespan do not cross. `component`,
+`bag` and tf2 use services and topics as above; the test does not run them.
+"""
 VERBS = {
     **GRAPH,
     "topic echo": "topic_echo(node)",
     "topic hz, bw": "topic_hz(node)",
     "topic delay": "topic_delay(node)",
     "topic pub": "topic_pub(node)",
-    "topic echo /rosout": "rosout(node)",
+    "topic echo of /rosout": "rosout(node)",
     "service call": "service_call(node)",
     "param list": "[param_list(node, '/talker'), param_list(node, '/driver')]",
     "param get": "param_get(node, 'rate', 'label', 'count')",
@@ -37,7 +43,7 @@ VERBS = {
     "param describe": "param_describe(node)",
     "param set": "param_set(node)",
     "param load": "param_load(node)",
-    "interface show (by get_type_description)": "type_description(node)",
+    "service get_type_description": "type_description(node)",
     "action send_goal": "action_send_goal(node)",
     "lifecycle list": "lifecycle_list(node)",
     "lifecycle get": "lifecycle_get(node)",
@@ -71,11 +77,21 @@ def test_verbs_give_the_same_output_from_afar(tmp_path: Path) -> None:
             sites.until(partial(gives, afar, call, expected[verb]), f"{verb}: {expected[verb]}")
         found = {verb: ask(sites, afar, call) for verb, call in VERBS.items()}
         assert found == expected
+        assert PAGE.read_text(encoding="utf-8").endswith(table(found) + NOT)
 
 
 def gives(peer: Peer, call: str, expected: object) -> bool:
     """Return whether an expression has a value now."""
     return peer.tell(call) == expected
+
+
+def table(verbs: Iterable[str]) -> str:
+    """Return the table of the page: a row for each command with its verbs."""
+    rows: dict[str, list[str]] = {}
+    for command, _, verb in (each.partition(" ") for each in verbs):
+        rows.setdefault(command, []).append(verb)
+    lines = [f"| `{command}` | {', '.join(each)} |" for command, each in rows.items()]
+    return "\n".join(["| command | verbs whose output is the same |", "|---|---|", *lines, ""])
 
 
 def ask(sites: Ros2Sites, peer: Peer, call: str) -> object:
