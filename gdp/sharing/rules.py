@@ -85,7 +85,7 @@ def usable(
 ) -> Iterator[tuple[Side, Offer]]:
     """Yield the accepted offers with their side, except withdrawn ones; ``unused`` gets why another cannot be used.
 
-    What an accepted node brings is used on every side on which it can be.
+    Of what an accepted node brings the rights to read and call are used; what leaves a machine is accepted by name.
     """
     nodes = {(each.sender, each.ros_name) for each in accepted_nodes(state, offers)}
     taken = set[tuple[str, str]]()
@@ -95,7 +95,7 @@ def usable(
         key = (offer.kind, offer.ros_name)
         sides = {each.side for each in state.accepted if offer.fits(each)}
         if not sides and (offer.sender, offer.node) in nodes:
-            sides = set(offer.sides)
+            sides = {side for side in offer.sides if side == "import"}
         for side in sides:
             if key in taken:
                 why = f"another owner's {offer.ros_name} is in use; state prefix: in the proxy.yaml of {offer.sender}"

@@ -1,7 +1,7 @@
 """Rules that a rule of kind ``node`` stands for: one for each topic, service and action of its nodes.
 
-Sans-I/O. What a node publishes or serves goes in the direction of its rule; what it subscribes to goes the other way.
-Its clients are only described: which machine serves them is for the rule of that service to say.
+Sans-I/O. What an exposed node publishes or serves goes out, and what it subscribes to comes in. Of an imported node
+only the former is taken: what leaves this machine is for its own rules to say. Clients are only described.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def node_entity(end: GraphEntity) -> GraphEntity:
 
 
 def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Graph]]) -> Brought:
-    """Return the rules of what local nodes have that a rule exposes, and of what far nodes have.
+    """Return the rules of what local nodes have that a rule exposes, and of what far nodes publish or serve.
 
     Args:
         far: the entities of each node that is imported, with its rule.
@@ -61,8 +61,7 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
             (rules.imports if is_other else rules.expose).append(each)
     for rule, far_ends in far:
         profiles = {end.name: end.qos for end in sorted(far_ends, key=repr) if end.role is Role.PUBLISHES}
-        for is_other, each in _rules(rule, far_ends, profiles):
-            (rules.expose if is_other else rules.imports).append(each)
+        rules.imports.extend(each for is_other, each in _rules(rule, far_ends, profiles) if not is_other)
     return rules
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 
 from gdp.ros_names import NODE_TYPE
+from gdp.sharing.state import AcceptedName
 from tests.gdp.sharing.machines import PLAN, STRING, Machine, Site, importing
 
 NODE = ("node", "/talker", NODE_TYPE)
@@ -38,7 +39,7 @@ def test_both_ends_get_the_rights_on_what_a_node_has(site: Site, robot: Machine,
         "/scan": {"publish"},
     }
     assert server.rights() == {
-        "/talker": {"call"}, "/chatter": {"read"}, "/talker/plan": {"call"}, "/cmd": {"publish"}
+        "/talker": {"call"}, "/chatter": {"read"}, "/talker/plan": {"call"}
     }  # fmt: skip
     assert (server.rules("import"), server.rules("expose")) == ([("/talker", NODE_TYPE)], [])
 
@@ -68,3 +69,11 @@ def test_it_ends_where_it_is_no_longer_exposed(site: Site, robot: Machine, serve
     for _ in range(2):
         assert site.upkeep() == []
     assert server.held == []
+
+
+def test_what_a_node_subscribes_to_is_accepted_by_name(site: Site, robot: Machine, server: Machine) -> None:
+    begin(site, robot, server)
+    assert "/cmd" not in server.rights()
+    server.sharing.accept(AcceptedName(side="expose", name="/cmd", source="robot"), site.now_s)
+    assert server.rights()["/cmd"] == {"publish"}
+    assert server.rules("expose") == [("/cmd", STRING)]

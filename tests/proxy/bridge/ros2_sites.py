@@ -60,13 +60,23 @@ class Ros2Sites:
 
     Args:
         domains: of their graphs.
+        expose: the robot's rules.
+        imports: the station's.
+        gives: what the station exposes.
     """
 
-    def __init__(self, folder: Path, domains: tuple[int, int], expose: Sequence[str], imports: Sequence[str]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        domains: tuple[int, int],
+        expose: Sequence[str],
+        imports: Sequence[str],
+        gives: Sequence[str] = (),
+    ) -> None:
         self.sites = Sites(folder)
         self.sites.run(0.1)
         self.robot = Machine(self.sites, "nuc1/robot", domains[0], expose, ())
-        self.station = Machine(self.sites, "nuc5/server", domains[1], (), imports)
+        self.station = Machine(self.sites, "nuc5/server", domains[1], gives, imports)
         self.machines = {"nuc1/robot": self.robot, "nuc5/server": self.station}
         self._begun_s = time.monotonic() - self.sites.now_s
 
@@ -91,13 +101,13 @@ class Ros2Sites:
 
 @contextmanager
 def ros2_sites(
-    folder: Path, domains: tuple[int, int], expose: Sequence[str], imports: Sequence[str]
+    folder: Path, domains: tuple[int, int], expose: Sequence[str], imports: Sequence[str], gives: Sequence[str] = ()
 ) -> Iterator[Ros2Sites]:
     """Run a robot and a station."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in CONFINED.items():
             patch.setenv(name, value)
-        sites = Ros2Sites(folder, domains, expose, imports)
+        sites = Ros2Sites(folder, domains, expose, imports, gives)
         try:
             yield sites
         finally:

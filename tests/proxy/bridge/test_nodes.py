@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -50,9 +51,9 @@ def shown(machine: Machine, node: str = "/talker") -> set[tuple[Role, str]]:
     return {(end.role, end.name) for end in machine.graph.ends() if end.node == node}
 
 
-def pair(sites: Sites, holds: list[Metadata] = HOLDS) -> tuple[Machine, Machine]:
+def pair(sites: Sites, holds: list[Metadata] = HOLDS, expose: Sequence[str] = ()) -> tuple[Machine, Machine]:
     robot = sites.add(ROBOT, expose=["kind: node, name: /talker"], holds=holds)
-    station = sites.add(SERVER, imports=["kind: node, name: /talker"], holds=holds)
+    station = sites.add(SERVER, imports=["kind: node, name: /talker"], expose=expose, holds=holds)
     return robot, station
 
 
@@ -69,8 +70,17 @@ def test_a_node_appears_with_what_it_has(sites: Sites) -> None:
     assert not [*robot.faults, *station.faults]
 
 
-def test_its_messages_and_calls_cross_in_both_directions(sites: Sites) -> None:
+def test_nothing_leaves_a_machine_because_a_far_node_subscribes_to_it(sites: Sites) -> None:
     robot, station = pair(sites)
+    talker(robot.graph)
+    station.graph.publish("/teleop", "/cmd", STRING)
+    assert sites.run(5, lambda: (Role.SUBSCRIBES, "/cmd") in shown(station))
+    sites.run(2)
+    assert not any(is_exposed for _, is_exposed in station.carried)
+
+
+def test_its_messages_and_calls_cross_in_both_directions(sites: Sites) -> None:
+    robot, station = pair(sites, expose=["name: /cmd"])
     publication, *_ = talker(robot.graph)
     ear, order = Ear(station.graph, "/chatter"), Ear(robot.graph, "/cmd", node="/base")
     teleop = station.graph.publish("/teleop", "/cmd", STRING)

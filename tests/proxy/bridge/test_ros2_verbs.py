@@ -13,6 +13,7 @@ from tests.proxy.endpoints.ros2_net import CONFINED, Peer, needs, peer_of
 
 DOMAINS = 200 + os.getpid() % 16, 216 + os.getpid() % 16
 EXPOSE = "kind: node, name: '/*', encoding: cdr"
+GIVE = "name: /cmd"  # of the station, to what the robot subscribes to
 IMPORT = ("kind: node, name: /talker", "kind: node, name: /driver")
 GRAPH = {  # what a verb prints, by call
     "node list": "node_list(node)",
@@ -68,7 +69,7 @@ def test_verbs_give_the_same_output_from_afar(tmp_path: Path) -> None:
         here.waits_for("'/driver' in node_list(node)", wanted=True)
         expected = {verb: here.tell(call) for verb, call in VERBS.items()}
         here.end()
-        sites = stack.enter_context(ros2_sites(tmp_path, DOMAINS, [EXPOSE], IMPORT))
+        sites = stack.enter_context(ros2_sites(tmp_path, DOMAINS, [EXPOSE], IMPORT, [GIVE]))
         afar = peer(stack, "_afar", station)
         afar.tell(
             "!from ros2_verbs import *\nfrom concurrent.futures import ThreadPoolExecutor\npool = ThreadPoolExecutor(1)"
