@@ -538,6 +538,10 @@ class Bridge:
         self._far_nodes[at] = far_nodes
         if isinstance(endpoint, NodeHost):
             endpoint.set_nodes(far_nodes)
+            return
+        for name in far_nodes:
+            detail = "far nodes do not appear in this graph; what they have crosses"
+            self._context.faults.report(name, Fault.REFUSED, detail)
 
     def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
         """Begin a flow, or record why this graph does not allow it."""

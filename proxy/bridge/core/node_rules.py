@@ -57,15 +57,15 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
     """
     rules = Brought([], [])
     for rule, ends in nodes_in(expose, graph).values():
-        for is_other, each in _rules(rule, ends):
+        for is_other, each in rules_of_node(rule, ends):
             (rules.imports if is_other else rules.expose).append(each)
     for rule, far_ends in far:
         profiles = {end.name: end.qos for end in sorted(far_ends, key=repr) if end.role is Role.PUBLISHES}
-        rules.imports.extend(each for is_other, each in _rules(rule, far_ends, profiles) if not is_other)
+        rules.imports.extend(each for is_other, each in rules_of_node(rule, far_ends, profiles) if not is_other)
     return rules
 
 
-def _rules(
+def rules_of_node(
     rule: Rule, ends: Iterable[GraphEntity], profiles: Mapping[str, Qos | None] = MappingProxyType({})
 ) -> Iterator[tuple[bool, Rule]]:
     """Yield the rule of each thing that a node has, and whether it goes in the other direction than the node.
