@@ -107,7 +107,10 @@ BAD = [
     ("name: /a, kind: service, reliable: true", "reliable: only topics have this"),
     ("name: /a, kind: action, latched: true", "latched: only topics have this"),
     ("name: /a, replication: {mode: all}", "replication: only services and actions have this"),
-    ("name: /a, kind: service, replication: {mode: most}", "replication.mode: expected 'all', 'some' or 'hedged'"),
+    (
+        "name: /a, kind: service, replication: {mode: most}",
+        "replication.mode: expected 'all', 'some', 'hedged' or 'nearest'",
+    ),
     ("name: /a, kind: service, replication: {copies: 0}", "replication.copies: expected greater than or equal to 1"),
     ("name: /a, kind: service, replication: {budget: 2}", "replication.budget: expected less than or equal to 1"),
     ("name: /a, kind: service, stop: halt", "stop: expected a full ROS name, such as /plan/stop"),
