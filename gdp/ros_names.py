@@ -1,4 +1,4 @@
-"""Full ROS names, patterns of them, and the types of topics, services and actions.
+"""Full ROS names, patterns of them, and the types of topics, services, actions and nodes.
 
 Sans-I/O. In a pattern ``*`` matches any characters of one segment. ``**``, which is a segment of its own, matches one
 or more segments. As in a Unix shell, neither matches the start of a hidden segment (``/fold/_action/status``): a
@@ -13,8 +13,10 @@ import functools
 import re
 from typing import Final, Literal, TypeAlias
 
-Kind: TypeAlias = Literal["topic", "service", "action"]
+Interface: TypeAlias = Literal["topic", "service", "action"]
+Kind: TypeAlias = Literal["topic", "service", "action", "node"]
 
+NODE_TYPE: Final = "gdp/Node"  # of every node: what its 256-bit name digests
 ACTION_INFIX: Final = "/_action/"  # between an action's name and its parts; ROS 2 design article on actions
 NAME_MAX_CHARS: Final = 512
 NAME_FORM: Final = r"(?:/[A-Za-z0-9_]+)+"
@@ -28,6 +30,7 @@ TYPE_FORMS: Final[dict[Kind, tuple[str, str]]] = {  # pattern in ECMAScript's sy
     "topic": (f"{_WORD}/(?:msg/{_WORD}|srv/{_WORD}_Event|action/{_WORD}_FeedbackMessage)", "sensor_msgs/msg/Image"),
     "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
     "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
+    "node": (NODE_TYPE, NODE_TYPE),
 }
 _OF_EVERY_NODE: Final[dict[Kind, frozenset[str]]] = {  # of ROS 2's nodes and ROS 1's
     "topic": frozenset({"/rosout", "/rosout_agg", "/parameter_events"}),
@@ -38,6 +41,7 @@ _OF_EVERY_NODE: Final[dict[Kind, frozenset[str]]] = {  # of ROS 2's nodes and RO
         }
     ),
     "action": frozenset(),
+    "node": frozenset(),
 }  # fmt: skip
 _ANY: Final = "[A-Za-z0-9_]+"
 _VISIBLE: Final = f"(?!_){_ANY}"
@@ -51,6 +55,18 @@ def is_name(text: str) -> bool:
 def resolved(text: str) -> str:
     """Return the full name of a name that is relative to the root namespace, as ROS resolves it; others are kept."""
     return text if text.startswith(("/", "~")) else f"/{text}"
+
+
+def prefixed(prefix: str | None, name: str) -> str:
+    """Return a name, or a pattern, within a namespace; without one it is kept."""
+    return f"/{prefix}{name}" if prefix else name
+
+
+def unprefixed(prefix: str | None, name: str) -> str | None:
+    """Return the name without its namespace; None: it lies outside of it."""
+    if not prefix:
+        return name
+    return name.removeprefix(f"/{prefix}") if name.startswith(f"/{prefix}/") else None
 
 
 def is_pattern(text: str) -> bool:

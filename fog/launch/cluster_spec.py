@@ -13,7 +13,7 @@ from fog.launch.machines import CloudMachine, filled
 from fog.plan.duration import seconds_from_text
 from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
-from gdp.ros_names import Kind
+from gdp.ros_names import Interface
 
 _NAME: Final = "[a-z0-9][a-z0-9-]{0,31}"
 
@@ -99,7 +99,7 @@ class ClusterSpec:
             defaults["replication"] = replication_rule(keywords.replication)
         if timeout_s is not None:
             defaults["timeout_s"] = _positive("timeout_s", timeout_s)
-        offered: dict[Kind, Offered | None] = {
+        offered: dict[Interface, Offered | None] = {
             "service": keywords.services,
             "action": keywords.actions,
             "topic": keywords.topics,

@@ -10,31 +10,31 @@ from typing import Final, TypeAlias
 
 from fog.cluster import ExportedInterface
 from gdp.errors import LocalError
-from gdp.ros_names import Kind, fits_kind, is_name
+from gdp.ros_names import Interface, fits_kind, is_name
 from gdp.service.replication import Mode, Replication
 
 Offered: TypeAlias = Mapping[str, str | Mapping[str, object]]
 SomeReplication: TypeAlias = Replication | str | Mapping[str, object]
 
 _BOTH_SIDES: Final = ("encoding", "max_bytes", "max_bits_s", "metadata", "priority", "weight")
-_ROBOT_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
+_ROBOT_SIDE: Final[dict[Interface, tuple[str, ...]]] = {
     "topic": (),
     "service": ("on_timeout", "replication", "sign", "state", "timeout_s"),
     "action": ("on_timeout", "replication", "sign", "timeout_s"),
 }
-_MACHINE_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
+_MACHINE_SIDE: Final[dict[Interface, tuple[str, ...]]] = {
     "topic": ("deadline_ms", "max_hz", "repair"),
     "service": ("at_once", "readiness", "sign", "state", "state_node", "stop"),
     "action": ("readiness", "sign"),
 }
-_EXAMPLES: Final[dict[Kind, str]] = {
+_EXAMPLES: Final[dict[Interface, str]] = {
     "topic": "sensor_msgs/msg/Image",
     "service": "nav_msgs/srv/GetPlan",
     "action": "test_msgs/action/Fibonacci",
 }
 
 
-def carried(kind: Kind, offered: Offered, defaults: Mapping[str, object]) -> list[ExportedInterface]:
+def carried(kind: Interface, offered: Offered, defaults: Mapping[str, object]) -> list[ExportedInterface]:
     """Return the interfaces that the proxies carry.
 
     Args:
@@ -63,7 +63,9 @@ def replication_rule(said: SomeReplication) -> dict[str, object]:
     return rule
 
 
-def _one(kind: Kind, name: str, said: str | Mapping[str, object], defaults: Mapping[str, object]) -> ExportedInterface:
+def _one(
+    kind: Interface, name: str, said: str | Mapping[str, object], defaults: Mapping[str, object]
+) -> ExportedInterface:
     keys: dict[str, object] = {"type": said} if isinstance(said, str) else dict(said)
     type_name = keys.pop("type", "")
     if not is_name(name):

@@ -52,7 +52,8 @@ OptionalName = Annotated[
 Nodes = Annotated[list[str], typer.Option("--to", metavar="NODE", help="A node or a group; may be repeated.")]
 With = Annotated[list[str], typer.Option("--with", metavar="NODE", help="A node or a group; may be repeated.")]
 Source = Annotated[str | None, typer.Option("--from", metavar="NODE", help="Only what this node offers.")]
-Kind = Annotated[str, typer.Option("--kind", help="topic, service or action")]
+Kind = Annotated[str, typer.Option("--kind", help="topic, service, action or node")]
+IsNode = Annotated[bool, typer.Option("--node", help="NAME is a node, or a pattern: all that it has crosses.")]
 Type = Annotated[str, typer.Option("--type", help="Its type, such as sensor_msgs/msg/Image; else as it is found.")]
 OwnerDir = Annotated[
     Path | None,
@@ -101,6 +102,7 @@ def expose(
     to: Nodes = [],  # noqa: B006 (the library copies it)
     source: Source = None,
     kind: Kind = "topic",
+    node: IsNode = False,
     type_: Type = "",
     owner: OwnerDir = None,
     days: options.Days = SHARE_DAYS,
@@ -126,10 +128,11 @@ def expose(
       gdp expose '/camera/**' --to server
       gdp expose /camera/image --to server --deadline-ms 200 --max-bits-s 4e6
       gdp expose /plan --kind service --type nav_msgs/srv/GetPlan --to robot
+      gdp expose --node '/arm/*' --to server
       gdp expose /goal --from server
       gdp expose '/camera/**' --remove
     """
-    directory = _machine_directory(directory)
+    directory, kind = _machine_directory(directory), "node" if node else kind
     if source is None:
         name = ProxyFiles.read(directory / _PROXY_FILE).shared_name(name)
     with _sharing(directory, exchange, owner) as sharing:

@@ -25,9 +25,10 @@ from gdp.trust.grants import daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 
-GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE, "node": Right.SERVE}
 _GIVES: Final = frozenset(GIVING.values())
-TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
+_EXPOSE: Final = "expose"
+TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL, "node": Right.CALL}
 
 
 def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:
@@ -110,6 +111,8 @@ class Grants:
             key = load_owner(store.owner).public.compressed
             rules = [each for each in state.exposed if each.owner_key == key.hex()]
             names = dict[bytes, Metadata]()
+            brought = defaultdict[bytes, set[tuple[str, str]]](set)  # by which node, on which side
+            recorded = dict[bytes, set[tuple[str, str]]]()
             for each in rules:
                 if each.type_name and "*" not in each.name:
                     metadata = described(each.kind, each.name, each.type_name, each.salt)
@@ -117,15 +120,29 @@ class Grants:
             for lacking in found:
                 for salt in {each.salt for each in rules}:
                     metadata = described(lacking.kind, lacking.shared, lacking.type_name, salt)
-                    if lacking.side == "expose" and metadata.name(key) == lacking.name:
+                    if metadata.name(key) == lacking.name and lacking.node:
+                        names[metadata.digest()] = metadata
+                        brought[metadata.digest()].add((lacking.node, lacking.side))
+                    elif metadata.name(key) == lacking.name and lacking.side == _EXPOSE:
                         names[metadata.digest()] = metadata
             for issued in store:
                 if issued.is_own and not issued.is_revoked:
                     names[issued.metadata.digest()] = issued.metadata
-            for metadata in names.values():
-                covering = [each for each in rules if _covers(each, metadata)]
-                if covering:
-                    self._grant(store, metadata, covering, restored)
+                    recorded[issued.metadata.digest()] = set(issued.brought)
+                    brought[issued.metadata.digest()] |= set(issued.brought)
+            for digest, metadata in names.items():
+                by_node = brought[digest]
+                for side in (_EXPOSE, "import"):
+                    covering = [
+                        each
+                        for each in rules
+                        if (side == _EXPOSE and _covers(each, metadata))
+                        or (each.kind == "node" and (each.name, side) in by_node)
+                    ]
+                    if covering:
+                        self._grant(store, metadata, covering, restored, is_exposed=side == _EXPOSE)
+                if by_node != recorded.get(digest, set()):
+                    self._keep_brought(store, load_owner(store.owner).subject(metadata).name, by_node)
 
     def issue(
         self,
@@ -269,18 +286,32 @@ class Grants:
             self.report.add_problem(error)
             return issued.descriptor
 
+    def _keep_brought(self, store: IssuedStore, name: Name, by_node: Collection[tuple[str, str]]) -> None:
+        """Record which nodes have a name: later recipients of these get it, too."""
+        own = store.find(name, self.own.name)
+        if own is not None:
+            store.save(own.model_copy(update={"brought": tuple(sorted(by_node))}))
+
     def _grant(
-        self, store: IssuedStore, metadata: Metadata, rules: Sequence[ExposedName], restored: Collection[str]
+        self,
+        store: IssuedStore,
+        metadata: Metadata,
+        rules: Sequence[ExposedName],
+        restored: Collection[str],
+        *,
+        is_exposed: bool,
     ) -> None:
+        """Issue what these rules need; of what a node here subscribes to, the recipients are the givers."""
         kind, days = str(metadata["kind"]), max(each.days for each in rules)
-        wanted = [(self.own.label, self.own, GIVING[kind])]
+        ours, theirs = (GIVING[kind], TAKING[kind]) if is_exposed else (TAKING[kind], GIVING[kind])
+        wanted = [(self.own.label, self.own, ours)]
         for each in dict.fromkeys(label for rule in rules for label in rule.to):
             try:
                 nodes = resolve_recipients([each], self.nodes(), self.groups)
             except GdpError as error:
                 self.report.add_problem(error)
                 continue
-            wanted += [(label, node, TAKING[kind]) for label, node in nodes.items() if node.name != self.own.name]
+            wanted += [(label, node, theirs) for label, node in nodes.items() if node.name != self.own.name]
         name = load_owner(store.owner).subject(metadata).name
         for label, node, right in wanted:
             before = store.find(name, node.name)

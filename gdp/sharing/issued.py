@@ -54,6 +54,7 @@ class IssuedDelegation(Section):
         is_revoked: whether the owner took it back.
         qos: of the topic, as last sent to the node; None: not yet.
         is_exposed: whether the name is exposed, as the node knows it; None: it never was, here or by another node.
+        brought: of an own one: names of the exposed nodes that have it, each with the side on which they bring it.
     """
 
     label: str
@@ -69,6 +70,7 @@ class IssuedDelegation(Section):
     is_revoked: bool = False
     qos: OfferedQos | None = None
     is_exposed: bool | None = None
+    brought: tuple[tuple[str, str], ...] = ()
 
     @property
     def delegation(self) -> Delegation:
@@ -159,6 +161,7 @@ class IssuedStore:
             ),
             is_own=is_own,
             is_exposed=None if before is None or before.is_revoked else before.is_exposed,
+            brought=() if before is None else before.brought,
         )
         self.save(issued)
         return issued

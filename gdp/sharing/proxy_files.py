@@ -18,7 +18,7 @@ from gdp.errors import ConfigError, LocalError
 from gdp.intervals import RELOAD_S
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
-from gdp.ros_names import is_name, matches
+from gdp.ros_names import is_name, matches, prefixed, unprefixed
 from gdp.state.control_protocol import Command
 
 Side: TypeAlias = Literal["expose", "import"]
@@ -56,6 +56,7 @@ class Undelegated:
         local: its name in the graph.
         shared: the ROS name that all sides know, with the prefix of the machine.
         name: the 256-bit name that the rule gives to it.
+        node: name or pattern of the rule of kind ``node`` that brings it; empty: a rule is about it.
     """
 
     side: str
@@ -64,6 +65,7 @@ class Undelegated:
     shared: str
     type_name: str
     name: Name
+    node: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,15 +128,12 @@ class ProxyFiles:
 
     def shared_name(self, local: str) -> str:
         """Return the ROS name that all sides know for a name, or a pattern of names, of this machine."""
-        return _prefixed(self.prefix, local)
+        return prefixed(self.prefix, local)
 
     def name_keys(self, shared: str) -> dict[str, str]:
         """Return the keys of a rule of this machine for a name that all sides know, or a pattern of such."""
-        if not self.prefix:
-            return {"name": shared}
-        if shared.startswith(f"/{self.prefix}/"):
-            return {"name": shared.removeprefix(f"/{self.prefix}")}
-        return {"name": shared, "prefix": ""}
+        local = unprefixed(self.prefix, shared)
+        return {"name": shared, "prefix": ""} if local is None else {"name": local}
 
     def find(self, side: Side, kind: str, name: str) -> StatedRule | None:
         """Return the rule that states exactly this name or pattern."""
@@ -197,18 +196,16 @@ def fits(pattern: str, name: str) -> bool:
     return pattern == name or matches(pattern, name)
 
 
-def _prefixed(prefix: str, local: str) -> str:
-    return f"/{prefix}{local}" if prefix else local
-
-
 def _undelegated(fields: object) -> Undelegated:
     match fields:
         case {
             "side": str(side), "kind": str(kind), "local": str(local), "shared": str(shared), "type": str(type_name),
-            "name": str(name),
+            "name": str(name), **more,
         }:  # fmt: skip
-            found = Name.from_text(name)
-            return Undelegated(side=side, kind=kind, local=local, shared=shared, type_name=type_name, name=found)
+            found, node = Name.from_text(name), str(more.get("node", ""))
+            return Undelegated(
+                side=side, kind=kind, local=local, shared=shared, type_name=type_name, name=found, node=node
+            )
     raise LocalError(_OTHER_FORMAT)
 
 
@@ -241,7 +238,7 @@ def _rules(source: YamlSource, prefix: str) -> Iterator[StatedRule]:
                 yield StatedRule(
                     side=side,
                     kind=str(rule.get("kind", "topic")),
-                    name=_prefixed(prefix if own is None else str(own), name),
+                    name=prefixed(prefix if own is None else str(own), name),
                     type_name=str(rule.get("type") or "") if is_name(name) else "",
                     metadata={key: value for key, value in items if isinstance(value, str | int)},
                     is_salted=rule.get("salt_file") is not None,

@@ -39,7 +39,7 @@ def kind_from_text(kind: str, type_name: str = "") -> Kind:
             if type_name and not fits_kind(type_name, known):
                 raise LocalError(f"{type_name!r}: expected the type of a {kind} as ROS 2 writes it, such as {example}")
             return known
-    raise LocalError(f"{kind!r}: expected topic, service or action")
+    raise LocalError(f"{kind!r}: expected topic, service, action or node")
 
 
 def check_exposed(files: ProxyFiles, state: ShareState, offers: Iterable[Offer], wanted: ExposedName) -> None:
@@ -79,13 +79,19 @@ def check_accepted(files: ProxyFiles, state: ShareState, offers: Sequence[Offer]
 def usable(
     files: ProxyFiles, state: ShareState, offers: Sequence[Offer], unused: dict[Name, str]
 ) -> Iterator[tuple[Side, Offer]]:
-    """Yield the accepted offers with their side, except withdrawn ones; ``unused`` gets why another cannot be used."""
+    """Yield the accepted offers with their side, except withdrawn ones; ``unused`` gets why another cannot be used.
+
+    Of what an accepted node brings the rights to read and call are used; what leaves a machine is accepted by name.
+    """
+    nodes = {(each.sender, each.ros_name) for each in accepted_nodes(state, offers)}
     taken = set[tuple[str, str]]()
     for offer in offers:
         if offer.is_withdrawn:
             continue
         key = (offer.kind, offer.ros_name)
         sides = {each.side for each in state.accepted if offer.fits(each)}
+        if not sides and (offer.sender, offer.node) in nodes:
+            sides = {side for side in offer.sides if side == "import"}
         for side in sides:
             if key in taken:
                 why = f"another owner's {offer.ros_name} is in use; state prefix: in the proxy.yaml of {offer.sender}"
@@ -101,15 +107,25 @@ def usable(
             taken.add(key)
 
 
+def accepted_nodes(state: ShareState, offers: Iterable[Offer]) -> list[Offer]:
+    """Return the offers of nodes that are accepted."""
+    return [
+        each
+        for each in offers
+        if each.kind == "node" and not each.is_withdrawn and any(each.fits(accepted) for accepted in state.accepted)
+    ]
+
+
 def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iterable[tuple[Side, Offer]]) -> str | None:
-    """Return the drop-in with all rules of the state; None without any."""
+    """Return the drop-in with all rules of the state; None without any. What a node brings has no rule of its own."""
     lines: dict[Side, list[str]] = {"expose": [], "import": []}
     for each in state.exposed:
         owner = PublicKey.from_compressed(bytes.fromhex(each.owner_key))
         more = {**each.rule_options, **_metadata(each.more_metadata)}
         lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, more))
     for side, offer in used:
-        if files.find(side, offer.kind, offer.ros_name) is None:
+        is_brought = offer.node and not any(offer.fits(each) for each in state.accepted)
+        if not is_brought and files.find(side, offer.kind, offer.ros_name) is None:
             more = _metadata(offer.more_metadata)
             if offer.qos is not None and side == "import" and offer.kind == "topic":
                 more["offered"] = offer.qos.model_dump()

@@ -23,7 +23,7 @@ from gdp.sharing.exchange import Exchange, Exposure, Mail, MailKind, load_groups
 from gdp.sharing.grants import GIVING, TAKING, Grants, ShareReport, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import LiveNames, ProxyFiles, Side, StatedRule, fits
-from gdp.sharing.rules import check_accepted, check_exposed, check_name, kind_from_text, render, usable
+from gdp.sharing.rules import accepted_nodes, check_accepted, check_exposed, check_name, kind_from_text, render, usable
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder, links_of
 from gdp.stores.keyring import CARD, load_card, load_delegation, load_root, load_salt, save_delegation
 from gdp.trust.adcert import AdCertCache, Chain
@@ -241,7 +241,7 @@ class Sharing:
             LocalError: the state cannot be read or written.
         """
         with self._change(unix_s) as at:
-            for step in (self._receive, self._apply, self._grant, self._renew):
+            for step in (self._receive, self._find_brought, self._apply, self._grant, self._renew):
                 self._attempt(at, step)
         return at.report
 
@@ -299,6 +299,16 @@ class Sharing:
         text = render(self._folder, at.files, at.state, used)
         if is_changed or text != read_drop_in(at.files.drop_in):
             at.report.is_running = at.files.replace_rules(text)
+
+    def _find_brought(self, at: _Pass) -> None:
+        """Mark the offers of what accepted nodes have: the live proxy knows it, and lacks their delegations."""
+        nodes = {(each.sender, each.ros_name) for each in accepted_nodes(at.state, at.offers)}
+        wanted = {each.name: each.node for each in at.files.live_names().undelegated} if nodes else {}
+        for offer in at.offers if wanted else ():
+            name = offer.delegation.name
+            if (offer.sender, node := wanted.get(name, "")) in nodes and node != offer.node:
+                at.state = self._folder.update_offer(at.state, name, offer.sender, node=node)
+        at.offers = list(self._folder.offers(at.state)) if wanted else at.offers
 
     def _grant(self, at: _Pass, restored: Sequence[str] | dict[str, NodeDescriptor] = ()) -> None:
         if at.state.exposed or self._owners:

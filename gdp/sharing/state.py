@@ -96,6 +96,7 @@ class OfferSource(Section):
     Args:
         qos: of a topic; None: not known.
         is_withdrawn: the sender no longer exposes the name.
+        node: name of the offered node that brings it, as the live proxy has found; empty: none.
     """
 
     sender: str
@@ -103,6 +104,7 @@ class OfferSource(Section):
     received_unix_s: float
     qos: OfferedQos | None = None
     is_withdrawn: bool = False
+    node: str = ""
 
 
 class ShareState(Section):
@@ -122,6 +124,7 @@ class Offer:
     received_unix_s: float
     qos: OfferedQos | None = None
     is_withdrawn: bool = False
+    node: str = ""
 
     @property
     def kind(self) -> str:
@@ -199,7 +202,7 @@ class StateFolder:
         for name, source in sorted(state.offers.items(), key=lambda item: item[1].number):
             file = self.folder / _OFFERS / f"{name}.delegation"
             if file.exists():
-                stated = source.model_dump(include={"sender", "received_unix_s", "is_withdrawn"})
+                stated = source.model_dump(include={"sender", "received_unix_s", "is_withdrawn", "node"})
                 yield Offer(delegation=load_delegation(file), qos=source.qos, **stated)
 
     def save_offer(self, state: ShareState, delegation: Delegation, sender: str, unix_s: float) -> ShareState:

@@ -22,9 +22,10 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, sign
+from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_node, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
 from proxy.bridge.core.exclusive_control import ExclusiveControl
+from proxy.bridge.core.node_rules import Brought, FarNodes, brought
 from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -34,12 +35,23 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.liveliness import NameLiveliness
+from proxy.bridge.node_flow import ExposedNode, ImportedNode
 from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
+from proxy.config.brought_rule import stated
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphEntity, Role, RosEndpoint, proxy_node_name
+from proxy.endpoints.core.endpoint import (
+    EndpointError,
+    Event,
+    Graph,
+    GraphEntity,
+    NodeHost,
+    Role,
+    RosEndpoint,
+    proxy_node_name,
+)
 from proxy.serial.channel import Qos
 
 log = logging.getLogger(__name__)
@@ -48,7 +60,7 @@ _ENDED_MAX: Final = 256
 _FINISH_S: Final = 10.0  # in which readers may confirm the last messages of a publisher or server that has gone
 _CHANGES_MAX: Final = 512  # of unread flow changes; a bridge of a recording never reads them
 
-Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService
+Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService | ExposedNode | ImportedNode
 
 
 class BridgeRules(Protocol):
@@ -96,13 +108,19 @@ class _View:
         self.graph = graph
         self.conflicts = BridgeElection(me, graph)
         self._ends: dict[tuple[Role, str, str], list[GraphEntity]] = {}
+        self._of_node: dict[str, list[GraphEntity]] = {}
         for end in graph:
             if not end.is_proxy:
                 self._ends.setdefault((end.role, end.name, end.type_name), []).append(end)
+                self._of_node.setdefault(end.node, []).append(end)
 
     def ends(self, role: Role, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
         """Return the entities of this role, other than those of proxies, under the flow's local name."""
         return self._ends.get((role, flow_spec.local, flow_spec.type_name), ())
+
+    def of_node(self, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
+        """Return the entities of the local node that is the flow's."""
+        return self._of_node.get(flow_spec.local, ())
 
 
 class _Signboard:
@@ -147,7 +165,8 @@ class Bridge:
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
-        self._timed: dict[ExposedService | ImportedService, str] = {}  # to its local name
+        self._timed: dict[ExposedService | ImportedService | ImportedNode, str] = {}  # to its local name
+        self._far_nodes: list[FarNodes] = [{} for _ in endpoints]  # by endpoint, as they appear
         self._timed_topics: dict[ExposedTopic | ImportedTopic, str] = {}  # to their local names
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
@@ -181,7 +200,7 @@ class Bridge:
 
     def graphs(self) -> list[Graph]:
         """Return the entities of each graph, in the order of the configuration."""
-        return [dispatcher.endpoint.graph() for dispatcher in self._dispatchers]
+        return [dispatcher.graph() for dispatcher in self._dispatchers]
 
     def flow_of(self, rule: Rule, local: str, name: Name) -> tuple[Flow, float] | None:
         """Return the flow of a local name under a rule, and when it began, monotonic seconds; None: there is none."""
@@ -194,6 +213,17 @@ class Bridge:
     def labels(self) -> list[str]:
         """Return the display names of the graphs."""
         return [dispatcher.endpoint.label for dispatcher in self._dispatchers]
+
+    @property
+    def brought(self) -> Brought:
+        """Return the rules of what the nodes have that rules are about."""
+        rules = Brought([], [])
+        for at, dispatcher in enumerate(self._dispatchers):
+            expose = [rule for rule in self.rules.expose if self.rules.endpoint_of(rule) == at]
+            here = self._brought(at, expose, dispatcher.graph())
+            rules.expose.extend(here.expose)
+            rules.imports.extend(here.imports)
+        return rules
 
     @property
     def stats(self) -> list[TopicStats]:
@@ -242,7 +272,7 @@ class Bridge:
         """Return the local names that rules are about, and that ``deny`` keeps local."""
         found = list[DeniedName]()
         for at, dispatcher in enumerate(self._dispatchers):
-            graph = dispatcher.endpoint.graph()
+            graph = dispatcher.graph()
             for rules, is_exposed in ((self.rules.expose, True), (self.rules.imports, False)):
                 here = [rule for rule in rules if self.rules.endpoint_of(rule) == at]
                 found += denied(here, graph, is_exposed=is_exposed)
@@ -296,6 +326,7 @@ class Bridge:
             due_s = flow.get_timer()
             if is_tick:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
+                self._is_stale |= isinstance(flow, ImportedNode) and flow.poll_changed()
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic, local in self._timed_topics.items():
@@ -381,7 +412,9 @@ class Bridge:
         complaints = list[ConfigProblem]()
         wished, shown = set[_Key](), set[_Key]()
         for at, dispatcher in enumerate(self._dispatchers):
-            view = _View(dispatcher.endpoint.graph(), self._me)
+            view = _View(dispatcher.graph(), self._me)
+            far_nodes = self._far(at)
+            self._show(at, {**self._far_nodes[at], **far_nodes})  # before what they own
             for flow_spec in self._flow_specs(at, view.graph, complaints):
                 key = _Key(at, flow_spec.is_exposed, flow_spec.rule.kind, flow_spec.local, flow_spec.name)
                 shown.add(key)
@@ -398,6 +431,8 @@ class Bridge:
                 self._end(key)
             else:
                 self._finish(key)
+        for at in range(len(self._dispatchers)):
+            self._show(at, self._far(at))
         for key in [key for key in self._probes if key not in wished]:
             self._probes.pop(key).close()
         self._since = {key: since for key, since in self._since.items() if key in wished}
@@ -476,13 +511,43 @@ class Bridge:
             flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
         elif isinstance(flow, ExposedService):
             flow.follow(view.ends(Role.SERVES, flow_spec), now_s)
+        elif isinstance(flow, ExposedNode):
+            flow.follow(view.of_node(flow_spec))
 
     def _flow_specs(self, at: int, graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
         config = self.rules
-        yield from exposed([rule for rule in config.expose if config.endpoint_of(rule) == at], graph, complaints)
-        rules = [rule for rule in config.imports if config.endpoint_of(rule) == at]
+        expose = [rule for rule in config.expose if config.endpoint_of(rule) == at]
+        imports = [rule for rule in config.imports if config.endpoint_of(rule) == at]
+        nodes = self._brought(at, expose, graph)
+        yield from exposed(expose, graph, complaints, nodes.expose)
         held = [*self.held.described(Right.READ), *self.held.described(Right.CALL)]
-        yield from imported(rules, graph, held, complaints)
+        yield from imported(imports, graph, held, complaints, nodes.imports)
+
+    def _brought(self, at: int, expose: Sequence[Rule], graph: Graph) -> Brought:
+        far = [(flow_spec.rule, flow.ends) for flow_spec, flow in self._imported_nodes(at)]
+        return brought(expose, graph, far)
+
+    def _imported_nodes(self, at: int) -> Iterator[tuple[FlowSpec, ImportedNode]]:
+        for key, (flow_spec, flow) in self._flows.items():
+            if key.dispatcher == at and isinstance(flow, ImportedNode):
+                yield flow_spec, flow
+
+    def _far(self, at: int) -> FarNodes:
+        """Return the far nodes that are described now."""
+        return {flow_spec.local: flow.ends for flow_spec, flow in self._imported_nodes(at) if flow.ends}
+
+    def _show(self, at: int, far_nodes: FarNodes) -> None:
+        """Have far nodes appear in a graph."""
+        endpoint = self._dispatchers[at].endpoint
+        if far_nodes == self._far_nodes[at]:
+            return
+        self._far_nodes[at] = far_nodes
+        if isinstance(endpoint, NodeHost):
+            endpoint.set_nodes(far_nodes)
+            return
+        for name in far_nodes:
+            detail = "far nodes do not appear in this graph; what they have crosses"
+            self._context.faults.report(name, Fault.REFUSED, detail)
 
     def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
         """Begin a flow, or record why this graph does not allow it."""
@@ -507,7 +572,7 @@ class Bridge:
         self._flow_begun_s[key] = self._now_s
         if not isinstance(flow, ExposedTopic):
             self._inbound[flow_spec.name] = flow
-        if isinstance(flow, ExposedService | ImportedService):
+        if isinstance(flow, ExposedService | ImportedService | ImportedNode):
             self._timed[flow] = flow_spec.local
         if isinstance(flow, ImportedTopic) and flow.control is not None:
             self._timed_topics[flow] = flow_spec.local
@@ -523,6 +588,10 @@ class Bridge:
 
     def _make(self, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
         context = self._context
+        if flow_spec.rule.kind == "node":
+            if flow_spec.is_exposed:
+                return ExposedNode(context, dispatcher, flow_spec, topic, view.of_node(flow_spec))
+            return ImportedNode(context, dispatcher, flow_spec, topic)
         if flow_spec.rule.kind != "topic":
             kind = ExposedService if flow_spec.is_exposed else ImportedService
             return kind(context, dispatcher, flow_spec, topic, secrets.randbits(63))
@@ -533,8 +602,8 @@ class Bridge:
     def _may_finish(self, key: _Key) -> bool:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
         flow_spec, _ = self._flows[key]
-        rules = self.rules.expose if flow_spec.is_exposed else self.rules.imports
-        return flow_spec.rule in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
+        rules = (*self.rules.expose, *self.rules.imports)
+        return stated(flow_spec.rule) in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
 
     def _finish(self, key: _Key) -> None:
         """End a flow; the last messages of an exposed one stay until readers have confirmed them."""
@@ -562,12 +631,14 @@ class Bridge:
     def _remove(self, key: _Key) -> tuple[FlowSpec, Flow]:
         flow_spec, flow = self._flows.pop(key)
         del self._flow_begun_s[key]
-        if isinstance(flow, ExposedService | ImportedService):
+        if isinstance(flow, ExposedService | ImportedService | ImportedNode):
             del self._timed[flow]
         if isinstance(flow, ExposedTopic | ImportedTopic):
             self._timed_topics.pop(flow, None)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
+        if isinstance(flow, ImportedNode):
+            self._is_stale = True  # what it brought ends
         self._changes.append(FlowChange(flow_spec, is_begun=False))
         return flow_spec, flow
 
@@ -611,6 +682,8 @@ class Bridge:
 
 def _shown_as(flow_spec: FlowSpec) -> str:
     """Return the local name at which other proxies see that this proxy carries the flow."""
+    if flow_spec.rule.kind == "node" and not flow_spec.is_exposed:
+        return presence_of_node(flow_spec.local)
     return presence_of(flow_spec.local) if flow_spec.is_exposed and flow_spec.rule.kind != "topic" else flow_spec.local
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
-from proxy.endpoints.core.endpoint import EndpointError, Event, GraphChanged, RosEndpoint
+from proxy.bridge.core.bridge_election import attributed
+from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphChanged, RosEndpoint
 from proxy.serial.channel import Channel, Qos, Service
 
 
@@ -23,6 +24,10 @@ class EndpointDispatcher:
         self.endpoint = endpoint
         self._owners: dict[int, tuple[str, EventHandler]] = {}  # with the local name
         self._faulted: list[EndpointError] = []
+
+    def graph(self) -> Graph:
+        """Return the graph, in which far nodes are known as such."""
+        return attributed(self.endpoint.graph())
 
     def deliver(self, context: BridgeContext, now_s: float) -> bool:
         """Deliver all events except faults, each within the error boundary; return whether the graph changed."""

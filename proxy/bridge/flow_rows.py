@@ -21,6 +21,7 @@ from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
+from proxy.bridge.node_flow import ExposedNode, ImportedNode
 
 _HIDDEN: Final = "/_gdp_proxy"  # presence topics of proxies
 _SERVERS_MAX: Final = 64
@@ -102,7 +103,7 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             publishers=len(member.subscriptions.writer_proxies_of(spec.name)),
             readers=flow.local_readers,
         )
-    if isinstance(flow, ExposedService):
+    if isinstance(flow, ExposedService | ExposedNode):
         return row(
             direction=Direction.OUT,
             messages=flow.requests,
@@ -110,7 +111,8 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             publishers=1,
             readers=len(member.services.connected_peers(spec.name)),
         )
-    assert isinstance(flow, ImportedService)
+    if isinstance(flow, ImportedNode):
+        return row(direction=Direction.IN, publishers=len(member.services.peers(spec.name)))
     return row(
         direction=Direction.IN,
         messages=flow.requests,

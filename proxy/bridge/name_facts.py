@@ -20,6 +20,7 @@ from gdp.sansio import Timestamps
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.node_rules import node_entity
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
@@ -40,6 +41,8 @@ _ROLES: Final[dict[tuple[Kind, bool], Role]] = {
     ("service", False): Role.CALLS,
     ("action", True): Role.SERVES,
     ("action", False): Role.CALLS,
+    ("node", True): Role.SERVES,
+    ("node", False): Role.CALLS,
 }
 _RIGHTS: Final[dict[tuple[bool, bool], Right]] = {  # is it a topic, is it exposed
     (True, True): Right.PUBLISH,
@@ -48,7 +51,7 @@ _RIGHTS: Final[dict[tuple[bool, bool], Right]] = {  # is it a topic, is it expos
     (False, False): Right.CALL,
 }
 _RANKED_MAX: Final = 8
-_PART: Final = {"topic": "", "service": "", "action": f"{ACTION_INFIX}send_goal"}
+_PART: Final = {"topic": "", "service": "", "action": f"{ACTION_INFIX}send_goal", "node": ""}
 
 
 class _Meant(NamedTuple):
@@ -110,7 +113,11 @@ def _known(bridge: Bridge, graph: Sequence[GraphEntity]) -> list[str]:
 def _meant(bridge: Bridge, asked: str, graph: Sequence[GraphEntity]) -> list[_Meant]:
     """Return the rules that the asked name is about, each once for each type under which it is known."""
     found: dict[tuple[bool, str, str, str], _Meant] = {}
-    for is_exposed, rules in ((True, bridge.rules.expose), (False, bridge.rules.imports)):
+    brought = bridge.brought
+    for is_exposed, rules in (
+        (True, (*bridge.rules.expose, *brought.expose)),
+        (False, (*bridge.rules.imports, *brought.imports)),
+    ):
         for rule in rules:
             for each in _of_rule(bridge, rule, asked, graph, is_exposed=is_exposed):
                 found.setdefault((is_exposed, rule.kind, each.local, str(each.name)), each)
@@ -159,7 +166,8 @@ def _flow_fact(
     rule, local, name = meant.rule, meant.local, meant.name
     right = _RIGHTS[rule.kind == "topic", meant.is_exposed]
     role = _ROLES[rule.kind, meant.is_exposed]
-    under = [end for end in graph if (end.name, end.role) == (local + _PART[rule.kind], role) and not end.is_proxy]
+    ends_here = {node_entity(end) for end in graph} if rule.kind == "node" else graph
+    under = [end for end in ends_here if (end.name, end.role) == (local + _PART[rule.kind], role) and not end.is_proxy]
     ends = [end for end in under if rule.kind == "action" or end.type_name in ("", meant.type_name)]
     faults = context.faults.of(local)
     problem = next((each for each in bridge.problems if each.local == local), None)

@@ -33,7 +33,7 @@ _PATHS: Final = ("owner", "salt_file")
 Side = Annotated[str, typer.Argument(metavar="expose|import|deny", help="The list of proxy.yaml.")]
 RuleName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**.")]
 ConfigFile = Annotated[Path, typer.Option("--config", metavar="FILE", help="The configuration of the proxy.")]
-RuleKind = Annotated[str, typer.Option("--kind", help="topic, service or action")]
+RuleKind = Annotated[str, typer.Option("--kind", help="topic, service, action or node")]
 RuleType = Annotated[str, typer.Option("--type", help="Its type, such as sensor_msgs/msg/Image; else as it is found.")]
 OwnerKey = Annotated[
     Path | None,

@@ -45,6 +45,8 @@ from gdp.ros_names import (
     is_pattern,
     leaves_out,
     matches,
+    prefixed,
+    unprefixed,
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
@@ -207,12 +209,12 @@ class Spread(Section):
 
 
 class Rule(Section):
-    """What crosses: one topic, service or action, or all of a pattern.
+    """What crosses: one topic, service, action or node, or all of a pattern. A node brings what it has.
 
     The 256-bit names follow from kind, name, type, metadata and owner.
     """
 
-    model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind("topic"), _by_kind("service"), _by_kind("action")]})
+    model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind(kind) for kind in TYPE_FORMS]})
 
     kind: Kind = Field(default="topic", description="What it is about.")
     name: NamePattern = Field(description="Full ROS name that all sides know, or a pattern.")
@@ -466,8 +468,7 @@ class Rule(Section):
 
     def global_name_of(self, local_name: str) -> str:
         """Return the name that all sides use for a local name that ``matches``."""
-        name = local_name if self.is_pattern else self.name
-        return f"/{self.prefix}{name}" if self.prefix else name
+        return prefixed(self.prefix, local_name if self.is_pattern else self.name)
 
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
         """Return the metadata that the overlay name of a matching local name digests."""
@@ -490,14 +491,13 @@ class Rule(Section):
             return None
         if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
             return None
-        if self.prefix:
-            if not name.startswith(f"/{self.prefix}/"):
-                return None
-            name = name.removeprefix(f"/{self.prefix}")
+        own = unprefixed(self.prefix, name)
+        if own is None:
+            return None
         if self.is_pattern:
-            local = name if matches(self.name, name) else None
+            local = own if matches(self.name, own) else None
         else:
-            local = self.local if name == self.name else None
+            local = self.local if own == self.name else None
         return None if local is None or self.denied_by(local) is not None else local
 
     @field_validator("type_name")

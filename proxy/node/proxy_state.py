@@ -19,6 +19,7 @@ from gdp.message.loss import by_label
 from gdp.names import Name
 from gdp.nodes.node import common_handlers
 from gdp.ports.plane import Plane
+from gdp.ros_names import prefixed
 from gdp.runtime.runtime import now
 from gdp.sansio import Timestamps
 from gdp.state.diagnostic_control import Row
@@ -34,6 +35,7 @@ from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.flow_rows import control_row, flow_fields, flow_rows, topic_counts
+from proxy.config.brought_rule import stated
 from proxy.serial.channel import Qos
 
 BEST_EFFORT_MAX: Final = 32  # topics in one status; each has less than 1 KiB
@@ -167,6 +169,12 @@ def described(flow_spec: FlowSpec) -> dict[str, str]:
     }
 
 
+def _node_of(flow_spec: FlowSpec) -> dict[str, str]:
+    """Return the name of the rule of kind ``node`` that brings a flow, if one does."""
+    rule = stated(flow_spec.rule)
+    return {} if rule is flow_spec.rule else {"node": prefixed(rule.prefix, rule.name)}
+
+
 def _attachment(state: ProxyState) -> dict[str, object]:
     calls = {
         service: {"ended": ended, "total_ms": round(total_ms, 3)}
@@ -186,7 +194,7 @@ def _carried(bridge: Bridge | None) -> dict[str, object]:
     ]
     unready = [{"local": local, "reason": reason} for local, reason in bridge.unready]
     return {
-        "undelegated": [described(each) for each in bridge.undelegated[:UNDELEGATED_MAX]],
+        "undelegated": [described(each) | _node_of(each) for each in bridge.undelegated[:UNDELEGATED_MAX]],
         "qos": [_qos_fields(*each) for each in bridge.offered_qos[:QOS_MAX]],
         "names": len(names),
         "liveliness": _bounded(names),

@@ -54,7 +54,7 @@ TEXT: Final = text(1_024)
 _WHOLE: Final = uint(1 << 63)
 _DURATION: Final[Form[tuple[int, int]]] = row(_values, _WHOLE, _WHOLE)
 _PROFILE: Final = (TEXT, _WHOLE, TEXT, TEXT, _DURATION, _DURATION, TEXT, _DURATION, FLAG)
-_QOS: Final = mapped(row(_values, *_PROFILE), _qos, astuple)
+QOS: Final = mapped(row(_values, *_PROFILE), _qos, astuple)
 _ROS: Final[Form[RosVersion]] = literal(1, 2)
 _FORMAT: Final[Form[DefinitionFormat]] = literal("msg", "idl", "")
 _DEFINITION: Final = mapped(text(DEFINITION_MAX_BYTES), _bounded, str)
@@ -82,7 +82,7 @@ class Channel(FieldSet):
     hash: Annotated[str, Keyed("h", TEXT)] = ""
     definition: Annotated[str, Keyed("d", _DEFINITION)] = ""
     definition_format: Annotated[DefinitionFormat, Keyed("f", _FORMAT)] = ""
-    qos: Annotated[tuple[Qos, ...], Keyed("q", many(_QOS, QOS_MAX, is_cut=False), absent=(), is_omitted=True)] = ()
+    qos: Annotated[tuple[Qos, ...], Keyed("q", many(QOS, QOS_MAX, is_cut=False), absent=(), is_omitted=True)] = ()
     latched: Annotated[bool, Keyed("l", FLAG)] = False
     callerid: Annotated[str | None, Keyed("c", TEXT, absent=None, is_omitted=True)] = None
 

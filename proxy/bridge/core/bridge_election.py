@@ -9,12 +9,14 @@ that carries a name leaves, the next one takes over.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.serial.channel import EMPTY_MD5, Channel, RosVersion
 
 SIGN: Final = "/_gdp_proxy"
+_FAR: Final = f"{SIGN}/_node"
 _STEP_S: Final = 0.4  # longer than a graph takes to show a new entity
 _EMPTY: Final = "std_msgs/msg/Empty"
 
@@ -50,6 +52,17 @@ class BridgeElection:
 def presence_of(service: str) -> str:
     """Return the topic by which a proxy shows that it carries a local server: ROS 1 masters do not know clients."""
     return SIGN + service
+
+
+def presence_of_node(node: str) -> str:
+    """Return the topic by which a proxy shows that a node of its graph is a far one, which appears there."""
+    return f"{_FAR}{node}"
+
+
+def attributed(graph: Graph) -> Graph:
+    """Return the graph with the entities of far nodes as those of the proxies by which they appear."""
+    proxies = {end.name.removeprefix(_FAR): end.node for end in graph if end.is_proxy and end.name.startswith(_FAR)}
+    return frozenset(replace(end, node=proxies.get(end.node, end.node)) for end in graph) if proxies else graph
 
 
 def sign(topic: str, ros: RosVersion) -> Channel:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.ros_names import Kind
+from gdp.ros_names import NODE_TYPE, Kind
 from proxy.bridge.core.action_interface import action_of
 from proxy.bridge.faults import Fault
 from proxy.config import matching
@@ -69,15 +69,26 @@ def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator
             yield DeniedName(is_exposed, local, pattern)
 
 
-def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
-    """Yield a flow for each local publisher or server that a rule exposes; problems are added to ``complaints``."""
-    for (kind, local), types in _shown(graph, _SHOWS).items():
-        first = choose(rules, kind, local)
+def exposed(
+    rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem], brought: Sequence[Rule] = ()
+) -> Iterator[FlowSpec]:
+    """Yield a flow for each local node, publisher or server that a rule exposes.
+
+    Args:
+        complaints: problems are added to them.
+        brought: the rules of what nodes have; they apply where no other one does.
+    """
+    by_node = _by_name(brought)
+    shown = _shown(graph, _SHOWS)
+    shown |= {("node", end.node): {NODE_TYPE} for end in graph if end.node and not end.is_proxy}
+    for (kind, local), types in shown.items():
+        fitting = rules if choose(rules, kind, local) is not None else by_node.get((kind, local), ())
+        first = choose(fitting, kind, local)
         if first is None:
             continue
         wanted: dict[int, tuple[str, Rule]] = {}  # first type of each rule: topics of a recording may have several
         for type_name in sorted(types):
-            rule = choose(rules, kind, local, type_name)
+            rule = choose(fitting, kind, local, type_name)
             if rule is not None:
                 wanted.setdefault(id(rule), (type_name, rule))
         if len(wanted) < len(types):
@@ -90,13 +101,21 @@ def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]
 
 
 def imported(
-    rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]], complaints: list[ConfigProblem]
+    rules: Sequence[Rule],
+    graph: Graph,
+    held: Iterable[tuple[Metadata, Name]],
+    complaints: list[ConfigProblem],
+    brought: Sequence[Rule] = (),
 ) -> Iterator[FlowSpec]:
-    """Yield a flow for each name to import: by concrete rules, by held delegations, by requests of local nodes."""
+    """Yield a flow for each name to import: by concrete rules, by held delegations, by requests of local nodes.
+
+    Args:
+        brought: the rules of what nodes have; they apply where no other one does.
+    """
     seen: set[Name] = set()
     wanted = _shown(graph, _WANTS)
     had: dict[tuple[Kind, str], set[str]] = {}
-    for flow_spec in _imported(rules, wanted, held):
+    for flow_spec in (*_imported(rules, wanted, held), *_named(brought)):
         had.setdefault((flow_spec.rule.kind, flow_spec.local), set()).add(flow_spec.type_name)
         if flow_spec.name not in seen:
             seen.add(flow_spec.name)
@@ -111,9 +130,7 @@ def imported(
 def _imported(
     rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
 ) -> Iterator[FlowSpec]:
-    for rule in rules:
-        if not rule.is_pattern and rule.type_name and not rule.is_denied:
-            yield FlowSpec(False, rule.local, rule.type_name, rule.overlay_name, rule)
+    yield from _named(rules)
     for metadata, name in held:
         found = matching.imported(rules, name, metadata)
         if found is not None:
@@ -123,6 +140,20 @@ def _imported(
             asked = choose(rules, kind, local, type_name)
             if asked is not None:
                 yield FlowSpec(False, local, type_name, asked.overlay_name_of(local, type_name), asked)
+
+
+def _named(rules: Iterable[Rule]) -> Iterator[FlowSpec]:
+    for rule in rules:
+        type_name = NODE_TYPE if rule.kind == "node" else rule.type_name
+        if not rule.is_pattern and type_name and not rule.is_denied:
+            yield FlowSpec(False, rule.local, type_name, rule.overlay_name_of(rule.local, type_name), rule)
+
+
+def _by_name(rules: Iterable[Rule]) -> Mapping[tuple[Kind, str], list[Rule]]:
+    found: dict[tuple[Kind, str], list[Rule]] = {}
+    for rule in rules:
+        found.setdefault((rule.kind, rule.local), []).append(rule)
+    return found
 
 
 def _shown(graph: Graph, roles: Mapping[Kind, Role]) -> dict[tuple[Kind, str], set[str]]:

@@ -15,6 +15,7 @@ from gdp.names import Name
 from gdp.ros_names import Kind
 from gdp.trust.right import Right
 from proxy.bridge.core.action_interface import action_of
+from proxy.bridge.core.node_rules import node_entity
 from proxy.check.core.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
 from proxy.config.rule import Rule
@@ -230,8 +231,11 @@ class _Look:
 
 
 def _of_kind(graph: Iterable[GraphEntity], kind: Kind) -> Iterator[GraphEntity]:
-    """Yield the entities of topics, of services, or of actions; actions appear under their own names and types."""
+    """Yield the entities of topics, of services, or of actions; actions and nodes appear under their own names."""
     for end in graph:
+        if kind == "node":
+            yield node_entity(end)
+            continue
         is_topic = end.role in (Role.PUBLISHES, Role.SUBSCRIBES)
         if kind != "action":
             if is_topic == (kind == "topic"):

@@ -13,9 +13,11 @@ from typing import NamedTuple
 from gdp.crypto.keys import PublicKey
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.ros_names import NODE_TYPE
 from gdp.trust.delegation import Delegation
 from gdp.trust.right import Right
 from proxy.bridge.core.desired_flows import FlowSpec, exposed, imported
+from proxy.bridge.core.node_rules import nodes_in, rules_of_node
 from proxy.config import matching
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
@@ -48,8 +50,9 @@ def needs(machines: Sequence[Machine], owner: PublicKey) -> list[list[RequiredDe
     """Return the needs of each machine, sorted by kind and ROS name."""
     offers = [_offered(machine, owner) for machine in machines]
     everywhere = {name: metadata for each in offers for name, metadata in each.items()}
+    brought = {name: rules for machine in machines for name, rules in _brought(machine, owner)}
     return [
-        _of_machine(machine.config, own, {**everywhere, **_asked(machine, owner)})
+        _of_machine(machine.config, own, {**everywhere, **_asked(machine, owner)}, brought)
         for machine, own in zip(machines, offers, strict=True)
     ]
 
@@ -61,7 +64,10 @@ def unmet(rules: Iterable[Rule], owner: PublicKey, found: Iterable[RequiredDeleg
 
 
 def _of_machine(
-    config: ProxyConfig, offered: Mapping[Name, Metadata], wanted: Mapping[Name, Metadata]
+    config: ProxyConfig,
+    offered: Mapping[Name, Metadata],
+    wanted: Mapping[Name, Metadata],
+    brought: Mapping[Name, Sequence[tuple[bool, Rule]]],
 ) -> list[RequiredDelegation]:
     rights: dict[Name, set[Right]] = {}
     for rules, known, is_exposed in ((config.expose, offered, True), (config.imports, wanted, False)):
@@ -69,6 +75,14 @@ def _of_machine(
             if matching.imported(rules, name, metadata) is not None:
                 rights.setdefault(name, set()).add(_right(metadata, is_exposed=is_exposed))
     both = {**wanted, **offered}
+    for node in rights.keys() & brought.keys():
+        has_node = Right.SERVE in rights[node]
+        for is_heard, rule in brought[node]:  # a machine that imports the node gives what it hears by a rule of its own
+            name, metadata = rule.overlay_name, rule.overlay_metadata
+            is_exposed = has_node is not is_heard
+            if has_node or not is_heard or matching.imported(config.expose, name, metadata) is not None:
+                rights.setdefault(name, set()).add(_right(metadata, is_exposed=is_exposed))
+                both[name] = metadata
     found = [RequiredDelegation(name, both[name], frozenset(each)) for name, each in rights.items()]
     return sorted(found, key=lambda need: (str(need.metadata["kind"]), str(need.metadata["name"])))
 
@@ -84,6 +98,14 @@ def _offered(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
     for at, graph in enumerate(machine.graphs):
         known |= _live(exposed(_rules_at(config, config.expose, at), graph, []), owner)
     return known
+
+
+def _brought(machine: Machine, owner: PublicKey) -> Iterator[tuple[Name, list[tuple[bool, Rule]]]]:
+    """Yield the nodes that a machine exposes, each with the rules of what it has, and whether it hears that."""
+    for at, graph in enumerate(machine.graphs):
+        rules = _of(_rules_at(machine.config, machine.config.expose, at), owner)
+        for node, (rule, ends) in nodes_in(list(rules), graph).items():
+            yield rule.overlay_name_of(node, NODE_TYPE), list(rules_of_node(rule, ends))
 
 
 def _asked(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:

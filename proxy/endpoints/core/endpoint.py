@@ -10,7 +10,7 @@ Handles are integers that the endpoint chooses and never reuses. After ``close(h
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -137,6 +137,17 @@ class MessageRecorder(Protocol):
 
     def record(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Record one message of a channel. Raises ``LocalError``: a recording cannot be written."""
+
+
+@runtime_checkable
+class NodeHost(Protocol):
+    """An endpoint in whose graph far nodes can appear under their own names."""
+
+    def set_nodes(self, nodes: Mapping[str, Graph]) -> None:
+        """Replace the far nodes; each owns what is advertised, subscribed to and served of its entities' names.
+
+        Of a name that several nodes have, the first one by name owns it. The others, and clients, only appear.
+        """
 
 
 class RosEndpoint(Protocol):

@@ -7,22 +7,23 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, cast
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import CallFailed, Event, Graph, Role
 from proxy.endpoints.ros2.entities import ClientEntity, PublisherEntity, ServiceEntity, SubscriptionEntity
+from proxy.endpoints.ros2.far_nodes import FarNodes, Place
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
-from proxy.endpoints.ros2.qos import conflict, filled, service_profile, to_profile
+from proxy.endpoints.ros2.qos import conflict, filled
 from proxy.endpoints.ros2.session import (
     ClientHandle,
+    Opened,
     PublisherHandle,
     ServiceHandle,
     ServiceType,
     SubscriptionHandle,
     open_session,
-    translated,
 )
 from proxy.endpoints.ros2.types import channel_of, class_of, service_of
 from proxy.endpoints.ros2.wait_thread import WaitThread
@@ -47,9 +48,10 @@ class Ros2Endpoint:
     def __init__(self, domain: int, node: str) -> None:
         self.label = f"ros2 domain {domain}"
         self._session = open_session(domain, node)
-        self._node = self._session.node
         self._waiting = WaitThread(self._session)
         self._numbers = 0
+        self._far_nodes = FarNodes(self._session)
+        self._opened: dict[int, Opened] = {}
         self._subscription_entity: dict[int, SubscriptionEntity] = {}
         self._publisher_entity: dict[int, PublisherEntity] = {}
         self._serving: dict[int, ServiceEntity] = {}
@@ -75,57 +77,40 @@ class Ros2Endpoint:
         """Return the installed description of a service type; raises ``LocalError`` if there is none."""
         return service_of(name, type_name)
 
+    def set_nodes(self, nodes: Mapping[str, Graph]) -> None:
+        """Replace the far nodes; an entity whose owner changes is created again at its new one."""
+        places = self._far_nodes.replace_nodes(nodes, {end.node for end in self.graph()})
+        for number, opened in list(self._opened.items()):
+            if opened.home is not self._far_nodes.home(opened.role, opened.name):
+                self._move(number, opened)
+        for place in places:
+            self._show(place)
+        self._far_nodes.remove_others(nodes)
+
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Subscribe to a topic; raises ``LocalError`` for an unknown type or a refused name."""
-        message = class_of(type_name)
-        requested = filled(qos)
-        channel = channel_of(topic, type_name)
-        with translated(f"{topic}: cannot be subscribed to"):
-            entity = self._node.create_subscription(
-                message,
-                topic,
-                _ignore,
-                to_profile(requested),
-                callback_group=self._session.group(),
-                raw=True,
-                event_callbacks=self._session.silence(publisher=False),
-            )
-        handle = cast("SubscriptionHandle", entity.handle)
+        requested, channel, number = filled(qos), channel_of(topic, type_name), self._number()
+        handle = cast("SubscriptionHandle", self._open(number, Role.SUBSCRIBES, topic, type_name, requested))
         subscription_entity = SubscriptionEntity(
-            number=self._number(),
-            topic=topic,
-            message=message,
-            qos=requested,
-            channel=channel,
-            entity=entity,
-            handle=handle,
+            number=number, topic=topic, message=class_of(type_name), qos=requested, channel=channel, handle=handle
         )
-        self._subscription_entity[subscription_entity.number] = subscription_entity
+        self._subscription_entity[number] = subscription_entity
         self._tell_apart(topic)
         self._waiting.add(subscription_entity)
-        return subscription_entity.number
+        return number
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher; raises ``LocalError`` for an unknown or different type or a refused name."""
-        known = self._checked(channel)
+        known, topic, number = self._checked(channel), channel.topic, self._number()
         offered = filled(channel.qos[0] if channel.qos else None, latched=channel.latched)
-        with translated(f"{channel.topic}: cannot be advertised"):
-            entity = self._node.create_publisher(
-                class_of(channel.type_name),
-                channel.topic,
-                to_profile(offered),
-                event_callbacks=self._session.silence(publisher=True),
-            )
-        handle = cast("PublisherHandle", entity.handle)
-        publisher_entity = PublisherEntity(
-            number=self._number(), topic=channel.topic, qos=offered, channel=known, entity=entity, handle=handle
-        )
+        handle = cast("PublisherHandle", self._open(number, Role.PUBLISHES, topic, channel.type_name, offered))
+        publisher_entity = PublisherEntity(number=number, topic=topic, qos=offered, channel=known, handle=handle)
         if offered.durability == "transient_local":
             publisher_entity.kept = deque(maxlen=offered.depth)
-        self._publisher_entity[publisher_entity.number] = publisher_entity
-        self._tell_apart(channel.topic)
+        self._publisher_entity[number] = publisher_entity
+        self._tell_apart(topic)
         self._waiting.add(publisher_entity)
-        return publisher_entity.number
+        return number
 
     def publish(self, handle: int, raw: bytes) -> None:
         """Publish one CDR message."""
@@ -146,15 +131,13 @@ class Ros2Endpoint:
         known = service_of(service.name, service.type_name)
         if service.hash and known.hash and service.ros == 2 and service.hash != known.hash:
             raise LocalError(f"{service.name}: this machine has another definition of {service.type_name}")
-        kind = class_of(service.type_name)
-        with translated(f"{service.name}: cannot be served"):
-            entity = self._node.create_service(
-                kind, service.name, _ignore, qos_profile=service_profile(), callback_group=self._session.group()
-            )
-        serving = ServiceEntity(self._number(), cast("ServiceType", kind), entity, cast("ServiceHandle", entity.handle))
-        self._serving[serving.number] = serving
+        number = self._number()
+        handle = self._open(number, Role.SERVES, service.name, service.type_name, filled(None))
+        kind = cast("ServiceType", class_of(service.type_name))
+        serving = ServiceEntity(number, kind, cast("ServiceHandle", handle))
+        self._serving[number] = serving
         self._waiting.add(serving)
-        return serving.number
+        return number
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request; a response that cannot be read is replaced by a refusal."""
@@ -180,16 +163,12 @@ class Ros2Endpoint:
     def create_client(self, name: str, type_name: str) -> int:
         """Create a client; raises ``LocalError`` for an unknown type or a refused name."""
         service_of(name, type_name)
-        kind = class_of(type_name)
-        with translated(f"{name}: cannot be dialled"):
-            entity = self._node.create_client(
-                kind, name, qos_profile=service_profile(), callback_group=self._session.group()
-            )
-        handle = cast("ClientHandle", entity.handle)
-        client_entity = ClientEntity(self._number(), name, cast("ServiceType", kind), entity, handle)
-        self._client_entity[client_entity.number] = client_entity
+        number = self._number()
+        handle = cast("ClientHandle", self._open(number, Role.CALLS, name, type_name, filled(None)))
+        client_entity = ClientEntity(number, name, cast("ServiceType", class_of(type_name)), handle)
+        self._client_entity[number] = client_entity
         self._waiting.add(client_entity)
-        return client_entity.number
+        return number
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request, or hold it until a server that the graph shows matches."""
@@ -215,15 +194,15 @@ class Ros2Endpoint:
     def close(self, handle: int) -> None:
         """Close a subscription, publisher, server or client."""
         self._waiting.remove(handle)
-        if subscription_entity := self._subscription_entity.pop(handle, None):
-            self._node.destroy_subscription(subscription_entity.entity)
+        opened = self._opened.pop(handle)
+        self._session.destroy(opened)
+        subscription_entity = self._subscription_entity.pop(handle, None)
+        if subscription_entity is not None:
             self._tell_apart(subscription_entity.topic)
-        elif publisher_entity := self._publisher_entity.pop(handle, None):
-            self._node.destroy_publisher(publisher_entity.entity)
-        elif serving := self._serving.pop(handle, None):
-            self._node.destroy_service(serving.entity)
-        elif client_entity := self._client_entity.pop(handle, None):
-            self._node.destroy_client(client_entity.entity)
+        self._publisher_entity.pop(handle, None)
+        self._serving.pop(handle, None)
+        self._client_entity.pop(handle, None)
+        self._show((opened.role, opened.name))
 
     def shut_down(self) -> None:
         """Leave the graph and free everything."""
@@ -233,6 +212,34 @@ class Ros2Endpoint:
     def _number(self) -> int:
         self._numbers += 1
         return self._numbers
+
+    def _open(self, number: int, role: Role, name: str, type_name: str, qos: Qos) -> object:
+        """Create an entity at the node that owns it; return its handle."""
+        home = self._far_nodes.home(role, name)
+        opened = self._opened[number] = self._session.create(role, home, name, type_name, qos)
+        self._show((role, name))
+        return opened.entity.handle
+
+    def _move(self, number: int, opened: Opened) -> None:
+        """Create an entity again at another node; what it has not delivered yet is lost."""
+        self._waiting.remove(number)
+        self._session.destroy(opened)
+        handle = self._open(number, opened.role, opened.name, opened.type_name, opened.qos)
+        if (publisher := self._publisher_entity.get(number)) is not None:
+            publisher.handle = cast("PublisherHandle", handle)
+            for raw in publisher.kept:
+                publisher.handle.publish_raw(raw)
+            self._waiting.add(publisher)
+        elif (subscription := self._subscription_entity.get(number)) is not None:
+            subscription.handle = cast("SubscriptionHandle", handle)
+            self._waiting.add(subscription)
+        elif (serving := self._serving.get(number)) is not None:
+            serving.handle = cast("ServiceHandle", handle)
+            self._waiting.add(serving)
+
+    def _show(self, place: Place) -> None:
+        is_real = any((opened.role, opened.name) == place for opened in self._opened.values())
+        self._far_nodes.show(place, is_real=is_real)
 
     def _checked(self, channel: Channel) -> Channel:
         """Return this machine's description of the channel's type, after verifying that it is equivalent."""
@@ -259,10 +266,6 @@ class Ros2Endpoint:
         echoes = tuple(ear.own for ear in subscription_entity if ear.own is not None)
         for end in publisher_entity:
             end.echoes = echoes
-
-
-def _ignore(*_: object) -> None:
-    """Ignore a callback that rclpy requires; the wait-set thread reads data before any callback could run."""
 
 
 def _refusal(response: type, reason: str) -> object | None:

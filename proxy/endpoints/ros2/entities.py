@@ -26,7 +26,6 @@ from proxy.endpoints.core.endpoint import (
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.session import (
     ClientHandle,
-    Entity,
     Handle,
     PublisherHandle,
     RequestId,
@@ -77,7 +76,6 @@ class SubscriptionEntity:
     message: type
     qos: Qos
     channel: Channel  # as far as the graph shows it
-    entity: Entity
     handle: SubscriptionHandle
     own: LoopbackFilter | None = None  # set where this endpoint publishes the topic too
     described: Channel | None = None
@@ -119,7 +117,6 @@ class PublisherEntity:
     topic: str
     qos: Qos
     channel: Channel
-    entity: Entity
     handle: PublisherHandle
     kept: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
     echoes: tuple[LoopbackFilter, ...] = ()  # of the endpoint's own subscriptions to the topic
@@ -137,9 +134,8 @@ class ServiceEntity:
 
     kind: Final[Kind] = "service"
 
-    def __init__(self, number: int, service: ServiceType, entity: Entity, handle: ServiceHandle) -> None:
+    def __init__(self, number: int, service: ServiceType, handle: ServiceHandle) -> None:
         self.number = number
-        self.entity = entity
         self.handle = handle
         self._request = service.Request
         self.response = service.Response
@@ -198,10 +194,9 @@ class ClientEntity:
 
     kind: Final[Kind] = "client"
 
-    def __init__(self, number: int, name: str, service: ServiceType, entity: Entity, handle: ClientHandle) -> None:
+    def __init__(self, number: int, name: str, service: ServiceType, handle: ClientHandle) -> None:
         self.number = number
         self.name = name
-        self.entity = entity
         self.handle = handle
         self.request = service.Request
         self._response = service.Response

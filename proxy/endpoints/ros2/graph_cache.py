@@ -19,11 +19,12 @@ _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"  # its discovery is incomplete
 
 
 class GraphCache:
-    """The last known graph, without the endpoint's own node."""
+    """The last known graph, without the endpoint's own nodes."""
 
     def __init__(self, session: ContextNode) -> None:
         self._node = session.node
-        self._own = session.node.get_name()
+        self._own = session.own
+        self._past = frozenset(session.own)  # those at the beginning of a refresh: some may leave during it
         self._missing = session.rcl.NodeNameNonExistentError
         self._turn = 0
         self._counts: dict[str, tuple[list[str], int, int]] = {}
@@ -40,6 +41,7 @@ class GraphCache:
     def refresh(self) -> bool:
         """Refresh the cache; return whether ``graph`` changed."""
         self._turn = (self._turn + 1) % _TURNS
+        self._past = frozenset(self._own)
         changed = self._look_at_topics()
         changed |= self._look_at_nodes()
         if changed:
@@ -84,7 +86,7 @@ class GraphCache:
 
     def _reported(self, role: Role, topic: str, ends: list[TopicEnd]) -> Iterator[GraphEntity]:
         for end in ends:
-            if end.node_name == self._own:
+            if self._is_own((end.node_name, end.node_namespace)):
                 continue
             node = "" if end.node_name == _UNKNOWN else _full_name(end.node_name, end.node_namespace)
             digest = str(getattr(end, "topic_type_hash", ""))  # Iron and later
@@ -97,7 +99,8 @@ class GraphCache:
             (name, types, *(count(name) for count in self._count_services))
             for name, types in sorted(self._node.get_service_names_and_types())
         ]
-        nodes = {node for node in self._node.get_node_names_and_namespaces() if node[0] not in (self._own, _UNKNOWN)}
+        found = self._node.get_node_names_and_namespaces()
+        nodes = {node for node in found if node[0] != _UNKNOWN and not self._is_own(node)}
         before = self._by_node
         self._by_node = {node: before[node] for node in nodes if node in before}
         for node in nodes:
@@ -105,6 +108,9 @@ class GraphCache:
                 self._by_node[node] = self._ends_of_node(*node)
         self._services = services
         return self._by_node != before
+
+    def _is_own(self, node: tuple[str, str]) -> bool:
+        return node in self._own or node in self._past
 
     def _ends_of_node(self, name: str, space: str) -> Graph:
         try:

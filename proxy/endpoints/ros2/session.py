@@ -12,15 +12,27 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, cast
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Role
+from proxy.endpoints.ros2.qos import service_profile, to_profile
+from proxy.endpoints.ros2.types import class_of
+from proxy.serial.channel import Qos
 
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
+
+
+_REFUSED: Final = {
+    Role.PUBLISHES: "cannot be advertised",
+    Role.SUBSCRIBES: "cannot be subscribed to",
+    Role.SERVES: "cannot be served",
+    Role.CALLS: "cannot be dialled",
+}
 
 
 class Handle(Protocol):
@@ -160,8 +172,15 @@ class Node(Protocol):
 
     handle: NodeHandle
 
+    @property
+    def publishers(self) -> Iterator[Entity]:
+        """Return the node's publishers."""
+
     def get_name(self) -> str:
         """Return the name without its namespace."""
+
+    def get_namespace(self) -> str:
+        """Return the namespace."""
 
     def get_topic_names_and_types(self, no_demangle: bool = ...) -> list[tuple[str, list[str]]]:
         """Return the graph's topics, each with its types."""
@@ -217,6 +236,17 @@ class Node(Protocol):
         """Leave the graph and free the node."""
 
 
+class Opened(NamedTuple):
+    """An entity of the endpoint, and the node that owns it."""
+
+    role: Role
+    home: Node
+    name: str
+    type_name: str
+    qos: Qos
+    entity: Entity
+
+
 class _Context(Protocol):
     handle: Handle
 
@@ -226,11 +256,16 @@ class _Context(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ContextNode:
-    """A node in a separate context."""
+    """A node in a separate context; further nodes may join it.
+
+    Attributes:
+        own: name and namespace of each node here.
+    """
 
     node: Node
     context: _Context
     rcl: ModuleType
+    own: set[tuple[str, str]] = field(default_factory=set)
 
     def guard(self) -> GuardCondition:
         """Return a new guard condition."""
@@ -242,20 +277,65 @@ class ContextNode:
         with self.context.handle:
             return cast("WaitSet", self.rcl.WaitSet(subscriptions, 1, 0, clients, services, 0, self.context.handle))
 
-    def group(self) -> object:
-        """Return a callback group for one entity: a node's default group would keep every entity for ever."""
-        from rclpy.callback_groups import ReentrantCallbackGroup
+    def create(self, role: Role, home: Node, name: str, type_name: str, qos: Qos) -> Opened:
+        """Create an entity of a node; services have the default profile of services.
 
-        return ReentrantCallbackGroup()
+        Raises:
+            LocalError: the type is not installed, or the name is refused.
+        """
+        kind = class_of(type_name)
+        with translated(f"{name}: {_REFUSED[role]}"):
+            if role is Role.PUBLISHES:
+                entity = home.create_publisher(kind, name, to_profile(qos), event_callbacks=_silence(role))
+            elif role is Role.SUBSCRIBES:
+                entity = home.create_subscription(
+                    kind,
+                    name,
+                    _ignore,
+                    to_profile(qos),
+                    callback_group=_group(),
+                    raw=True,
+                    event_callbacks=_silence(role),
+                )
+            elif role is Role.SERVES:
+                entity = home.create_service(
+                    kind, name, _ignore, qos_profile=service_profile(), callback_group=_group()
+                )
+            else:
+                entity = home.create_client(kind, name, qos_profile=service_profile(), callback_group=_group())
+        return Opened(role, home, name, type_name, qos, entity)
 
-    def silence(self, *, publisher: bool) -> object:
-        """Return event callbacks that do nothing; incompatible QoS is detected in the graph instead."""
-        try:
-            from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-        except ImportError:  # before Iron
-            from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
-        kind = PublisherEventCallbacks if publisher else SubscriptionEventCallbacks
-        return cast("object", kind(use_default_callbacks=False))
+    def destroy(self, opened: Opened) -> None:
+        """Free an entity."""
+        home, entity = opened.home, opened.entity
+        if opened.role is Role.PUBLISHES:
+            home.destroy_publisher(entity)
+        elif opened.role is Role.SUBSCRIBES:
+            home.destroy_subscription(entity)
+        elif opened.role is Role.SERVES:
+            home.destroy_service(entity)
+        else:
+            home.destroy_client(entity)
+
+    def create_node(self, full_name: str) -> Node:
+        """Create a further node, without anything.
+
+        Raises:
+            LocalError: the name is refused.
+        """
+        space, _, name = full_name.rpartition("/")
+        self.own.add((name, space or "/"))
+        with translated(f"{full_name}: cannot be a node"):
+            node = _bare_node(name, space, self.context)
+        for publisher in list(node.publishers):  # of parameters' events
+            node.destroy_publisher(publisher)
+        return node
+
+    def destroy_node(self, full_name: str, node: Node) -> None:
+        """Free a further node."""
+        space, _, name = full_name.rpartition("/")
+        node.destroy_node()
+        self.own.discard((name, space or "/"))
 
     def close(self) -> None:
         """Leave the graph."""
@@ -271,7 +351,6 @@ def open_session(domain: int, name: str) -> ContextNode:
         import rclpy
         from rclpy.context import Context
         from rclpy.impl.implementation_singleton import rclpy_implementation
-        from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise LocalError(
@@ -281,20 +360,51 @@ def open_session(domain: int, name: str) -> ContextNode:
     try:
         context = Context()
         rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node(
-            name,
-            context=context,
-            enable_rosout=False,
-            start_parameter_services=False,
-            use_global_arguments=False,
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
+        node = _bare_node(name, "", cast("_Context", context))
     except (RuntimeError, OSError, ImportError) as error:  # rclpy's own errors are RuntimeErrors
         raise LocalError(
             f"ROS 2 does not start in domain {domain}: {_first_line(error)}; is the RMW library installed that "
             "RMW_IMPLEMENTATION names? (pip install 'gdp-ros[ros2]' brings rmw_fastrtps_cpp)"
         ) from error
-    return ContextNode(cast("Node", node), cast("_Context", context), cast("ModuleType", rclpy_implementation))
+    own = {(node.get_name(), node.get_namespace())}
+    return ContextNode(node, cast("_Context", context), cast("ModuleType", rclpy_implementation), own)
+
+
+def _bare_node(name: str, space: str, context: _Context) -> Node:
+    import rclpy
+    from rclpy.parameter import Parameter
+
+    node = rclpy.create_node(
+        name,
+        namespace=space,
+        context=context,
+        enable_rosout=False,
+        start_parameter_services=False,
+        use_global_arguments=False,
+        parameter_overrides=[Parameter("start_type_description_service", value=False)],
+    )
+    return cast("Node", node)
+
+
+def _group() -> object:
+    """Return a callback group for one entity: a node's default group would keep every entity for ever."""
+    from rclpy.callback_groups import ReentrantCallbackGroup
+
+    return ReentrantCallbackGroup()
+
+
+def _silence(role: Role) -> object:
+    """Return event callbacks that do nothing; incompatible QoS is detected in the graph instead."""
+    try:
+        from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+    except ImportError:  # before Iron
+        from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
+    kind = PublisherEventCallbacks if role is Role.PUBLISHES else SubscriptionEventCallbacks
+    return cast("object", kind(use_default_callbacks=False))
+
+
+def _ignore(*_: object) -> None:
+    """Ignore a callback that rclpy requires; the wait-set thread reads data before any callback could run."""
 
 
 def _check_rmw() -> None:

@@ -15,6 +15,7 @@ from gdp.crypto.certificates import Role
 from gdp.errors import LocalError, StoreError
 from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.names import Name
+from gdp.ros_names import Interface
 from gdp.sharing.exchange import Mail
 from gdp.sharing.sharing import Sharing
 from gdp.sharing.state import AcceptedName, ExposedName
@@ -22,6 +23,7 @@ from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
+from proxy.config.brought_rule import BroughtRule
 from proxy.config.config import ProxyConfig
 from proxy.config.matching import choose
 
@@ -83,6 +85,7 @@ class Machine:
 
     Attributes:
         graph: what its local nodes publish or serve: kind, name and type.
+        brought: what nodes have: node, side on which it goes, kind, name and type.
         qos: of local topics, by name.
         reloads: how often the proxy has reloaded.
         refusal: why the proxy refuses to reload, empty: it validates the files.
@@ -92,6 +95,7 @@ class Machine:
     folder: Path
     directory: Directory
     graph: list[tuple[str, str, str]] = field(default_factory=list)
+    brought: list[tuple[str, str, Interface, str, str]] = field(default_factory=list)
     qos: dict[str, OfferedQos] = field(default_factory=dict)
     reloads: int = 0
     refusal: str = ""
@@ -159,6 +163,19 @@ class Machine:
                 shared = local if rule is None else rule.global_name_of(local)
                 fields = {"side": "expose", "kind": kind, "local": local, "shared": shared, "type": type_name}
                 listed.append({**fields, "name": name.to_text()})
+        rules = () if self.config is None else (*self.config.expose, *self.config.imports)
+        for node, side, kind, local, type_name in self.brought:
+            if (rule := choose(rules, "node", node)) is not None:
+                name = BroughtRule.by(rule).of(kind, local, type_name).overlay_name_of(local, type_name)
+                fields = {
+                    "side": side,
+                    "kind": kind,
+                    "local": local,
+                    "shared": local,
+                    "type": type_name,
+                    "node": rule.name,
+                }
+                listed += [] if name in held else [{**fields, "name": name.to_text()}]
         return {"undelegated": listed, "qos": qos}
 
 

@@ -53,6 +53,8 @@ _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
     ("service", False): Right.CALL,
     ("action", True): Right.SERVE,
     ("action", False): Right.CALL,
+    ("node", True): Right.SERVE,
+    ("node", False): Right.CALL,
 }
 
 
@@ -235,7 +237,10 @@ class Sites:
             for rule in listed:
                 for metadata in _named(rule) if holds is None else _meant(rule, holds):
                     _, rights = given.setdefault(metadata.name(OWNER.public.compressed), (metadata, set()))
-                    rights.add(_RIGHTS[rule.kind, is_exposed])
+                    kind = cast(Kind, metadata["kind"])
+                    rights.add(_RIGHTS[kind, is_exposed])
+                    if rule.kind == "node" and kind == "topic":  # what a node hears crosses the other way
+                        rights.add(_RIGHTS[kind, not is_exposed])
         return Granted(self._folder, [self._topic(member, *each) for each in given.values()])
 
     def reload(
@@ -294,4 +299,4 @@ def _named(rule: Rule) -> list[Metadata]:
 
 
 def _meant(rule: Rule, holds: Sequence[Metadata]) -> list[Metadata]:
-    return [metadata for metadata in holds if rule.local_of(metadata) is not None]
+    return [each for each in holds if rule.kind == "node" or rule.local_of(each) is not None]

@@ -207,6 +207,8 @@ class FakeEndpoint:
     def __init__(self, graph: FakeGraph, node: str) -> None:
         self._graph = graph
         self._node = node
+        self._nodes: Mapping[str, Graph] = {}  # far ones
+        self._shown: list[Publication | Subscription] = []
         self._events = deque[Event]()
         self._open: dict[int, _Open] = {}
         self._numbers = count(1)
@@ -260,7 +262,25 @@ class FakeEndpoint:
 
     def graph(self) -> Graph:
         """Return the entities of other nodes."""
-        return frozenset(end for end in self._graph.ends() if end.node != self._node)
+        return frozenset(end for end in self._graph.ends() if end.node not in (self._node, *self._nodes))
+
+    def set_nodes(self, nodes: Mapping[str, Graph]) -> None:
+        """Replace the far nodes; what they own is not moved."""
+        self._nodes = nodes
+        for each in self._shown:
+            each.close()
+        self._shown = [
+            self._graph.publish(node, end.name, end.type_name, end.qos)
+            if end.role is Role.PUBLISHES
+            else self._graph.subscribe(node, end.name, end.type_name, lambda _: None, end.qos)
+            for node, ends in sorted(nodes.items())
+            for end in ends
+            if end.role in (Role.PUBLISHES, Role.SUBSCRIBES)
+        ]
+
+    def _owner(self, role: Role, name: str) -> str:
+        has = (node for node, ends in self._nodes.items() if any((end.role, end.name) == (role, name) for end in ends))
+        return min(has, default=self._node)
 
     def channel(self, topic: str, type_name: str) -> Channel:
         """Return this machine's description of a type."""
@@ -315,7 +335,9 @@ class FakeEndpoint:
             opened.tickets[ticket] = done
             self.tell(RequestReceived(handle, ticket, raw))
 
-        opened.close = self._graph.serve(self._node, service.name, service.type_name, ask).close
+        opened.close = self._graph.serve(
+            self._owner(Role.SERVES, service.name), service.name, service.type_name, ask
+        ).close
         return handle
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:

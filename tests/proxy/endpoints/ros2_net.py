@@ -54,7 +54,7 @@ class Peer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, **environment, "ROS_DOMAIN_ID": str(DOMAIN)},
+            env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), **environment},
         )
 
     def tell(self, line: str) -> object:

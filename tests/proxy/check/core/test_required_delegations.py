@@ -61,6 +61,19 @@ def test_an_action_gets_its_type_from_what_is_live(folder: Path) -> None:
     assert _of(arm, desk) == [[("serve", *fold)], [("call", *fold)]]
 
 
+def test_a_node_needs_what_it_has_on_both_sides(folder: Path) -> None:
+    has = ((Role.PUBLISHES, "/scan"), (Role.SUBSCRIBES, "/goal"), (Role.SUBSCRIBES, "/stop"))
+    live = frozenset(GraphEntity(role, name, IMAGE, "/base", name) for role, name in has)
+    robot = Machine(_config(folder, "name: /base, kind: node"), graphs=[live])
+    desk = Machine(_config(folder, "name: /goal", "name: /base, kind: node"))
+    base = ("/base", "gdp/Node")
+    heard = [("read", "/goal", IMAGE), ("publish", "/scan", IMAGE), ("read", "/stop", IMAGE)]
+    assert _of(robot, desk) == [
+        [("serve", *base), *heard],
+        [("call", *base), ("publish", "/goal", IMAGE), ("read", "/scan", IMAGE)],
+    ]
+
+
 def test_no_machine_may_publish_a_topic_that_only_another_machine_has(folder: Path) -> None:
     one = Machine(_config(folder, f"name: /camera/left, type: {IMAGE}"))
     other = Machine(_config(folder, "name: /camera/**"))
