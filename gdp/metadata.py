@@ -14,7 +14,9 @@ import cbor2
 from gdp.errors import LocalError
 from gdp.names import Name, name_of
 
-KINDS: Final = frozenset({"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "enrolment"})
+KINDS: Final = frozenset(
+    {"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "enrolment", "capsule"}
+)
 SALT: Final = "salt"  # key of the unguessable part
 _VALUE_MAX_CHARS: Final = 4_096
 
