@@ -26,7 +26,7 @@ class Damage(str, Enum):
     DUPLICATED = "duplicated"
     FORKED = "forked"  # two records of one number, or another checkpoint than one that is known
     ROLLED_BACK = "rolled-back"  # a checkpoint that is known is beyond the end
-    UNPROVEN = "unproven"  # the checkpoint over them is damaged
+    UNPROVEN = "unproven"  # the checkpoint over them is damaged, or not here
 
 
 class Finding(NamedTuple):
@@ -171,8 +171,9 @@ class Audit:
     def _find_unproven(self, end: int) -> None:
         for number in [each for each in self._missing if each < end]:
             self._find(self._missing.pop(number), number, number)
-        if self.proven + 1 < end:
-            self._find(Damage.UNPROVEN, self.proven + 1, end - 1, f"checkpoint {end} is damaged")
+        unproven = [number for number in self._leaves if self.proven < number < end]
+        if unproven:
+            self._find(Damage.UNPROVEN, min(unproven), max(unproven), "the checkpoint over them is not here")
 
     def _find(self, damage: Damage, first: int, last: int, detail: str = "") -> None:
         self._found.setdefault((damage, first), Finding(damage, first, last, detail))

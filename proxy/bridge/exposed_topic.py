@@ -205,7 +205,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if not publisher.is_wanted and not publisher.queue.kept:
+        if not publisher.is_wanted and not publisher.queue.kept and not publisher.is_recorded:
             traffic.unread += 1
             publisher.skip(LossReason.NO_READER, now_s)
             self._count(event)
@@ -215,15 +215,20 @@ class ExposedTopic:
         if not adaptation.may_send(publisher.losses, acknowledged, path.bytes_s, now_s):
             traffic.thinned += 1
             return
-        if not publisher.has_space():
+        has_space = publisher.has_space()
+        if not has_space:
             adaptation.handle_refused(now_s)
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
-            publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
-            return
+            if not publisher.is_recorded:
+                publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
+                return
         body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)
         head = RosMessage(event.channel, event.stamp_ns, body, steps).head
+        if not has_space:
+            publisher.skip(LossReason.WINDOW_OVERFLOW, now_s, head + body)
+            return
         size = len(head) + len(body)
         try:
             count = publisher.publish(body, now_s, head)

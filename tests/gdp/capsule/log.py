@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from gdp.capsule.chain import Chain, ChainWriter
 from gdp.capsule.record import RecordType
-from gdp.crypto.keys import SoftwareKey
+from gdp.crypto.keys import SigningKey
 from gdp.names import Name
 from tests.gdp.message.sealed import WRITER, seal
 
@@ -18,12 +18,13 @@ SECOND_NS = 1_000_000_000
 class Log:
     """Records of a capsule, as its writer made them."""
 
-    key: SoftwareKey = WRITER
+    key: SigningKey = WRITER
+    name: Name = NAME
     wires: list[bytes] = field(default_factory=list)
     writer: ChainWriter = field(init=False)
 
     def __post_init__(self) -> None:
-        self.writer = ChainWriter(Chain(NAME, self.key.public), self.key)
+        self.writer = ChainWriter(Chain(self.name, self.key.public), self.key)
         self.wires.append(self.writer.checkpoint(0))
 
     def add(self, count: int, size: int = 20) -> Log:
