@@ -60,6 +60,7 @@ HELLO_IDLE: Final = 16  # hello intervals between two hellos, once keepalives of
 KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
 SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
 DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
+OWING: Final = SoftState(KEEPALIVE_MS / 1e3, periods=DETECT_MULTIPLIER)  # reports of a server that owes a response
 LEASE_MIN_S: Final = 1.0
 LEASE_MAX_S: Final = 3_600.0
 NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it

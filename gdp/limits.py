@@ -73,6 +73,7 @@ CLOCK_SKEW_S: Final = 3_600.0  # a certificate is accepted this long before it b
 # Neighbours and link state
 COST_DEFAULT: Final = 10  # of a link
 COST_AUTO: Final = 0  # of a port: the cost of its links is measured
+COST_UNREACHABLE: Final = (1 << 32) - 1  # of a path that does not exist; LSInfinity of RFC 2328
 LINK_STATE_AGE_MAX_S: Final = 2 * CLOCK_SKEW_S + LINK_STATE.lease_s  # by two clocks
 JOINS_AGAIN_MAX: Final = 16  # whole joins that one reply about unknown ones causes
 # Refreshes are sent more often over a link that loses frames: they find the joins that were lost.

@@ -32,7 +32,7 @@ class ClusterKeywords:
         replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
         services, actions, topics: full name to type of what the nodes offer; without any, services and actions are
             discovered.
-        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: ``"all"``.
+        replication: ``"all"``, ``"some"``, ``"hedged"`` or ``"nearest"``, or the rule's map; None: ``"all"``.
         timeout_s: time limit of a response; None: the proxy's 5 s.
         idle: time without a call (seconds, or ``"30min"``) after which the machines are released; None: the site's.
         budget_usd: cost at which the machines are released; None: the site's.

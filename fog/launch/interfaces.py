@@ -52,7 +52,7 @@ def replication_rule(said: SomeReplication) -> dict[str, object]:
     """
     if isinstance(said, Replication):
         said = {"mode": said.mode.value, "copies": said.copies, "budget": said.budget}
-        used = {"all": (), "some": ("copies",), "hedged": ("budget",)}[str(said["mode"])]
+        used = {"all": (), "some": ("copies",), "hedged": ("budget",), "nearest": ()}[str(said["mode"])]
         return {"mode": said["mode"], **{key: said[key] for key in used}}
     rule: dict[str, object] = {"mode": said} if isinstance(said, str) else dict(said)
     modes = [mode.value for mode in Mode]

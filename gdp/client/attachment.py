@@ -70,6 +70,7 @@ class PendingAdvertisement:
     is_global: bool
     paths: int = 1
     is_session: bool = False
+    wants_costs: bool = False
     is_taken: bool = False
     refused: DropReason | None = None
     sent_sequence: int = 0  # of the newest advertisement that was sent
@@ -205,6 +206,13 @@ class Attachment:
             if its == name:
                 each.chain, each.refused = chain, None
                 self._requests.hasten(each.key, 0.0)
+
+    def request_costs(self, name: Name, right: Right) -> None:
+        """Have the switch state the costs of the paths to those that this node hears on a name, from now on."""
+        each = self._advertisements.get((name, right))
+        if each is not None and not each.wants_costs:
+            each.wants_costs = True
+            self._requests.hasten(each.key, 0.0)
 
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
@@ -412,6 +420,7 @@ class Attachment:
             exchange=self._exchange if each.right in HEARS.values() else b"",
             paths=each.paths,
             is_session=each.is_session,
+            wants_costs=each.wants_costs,
         )
         return advertisement.signed(self._identity)
 

@@ -134,7 +134,12 @@ class Participant:
         self.publications = Publications(source, self.subscriptions.party_of)
         self._scheduler = self.publications.scheduler
         self._clock = StallClock()
-        self.services = Services(self.publications, self.subscriptions, self._clock)
+        self.services = Services(
+            self.publications,
+            self.subscriptions,
+            self._clock,
+            lambda name: self._control.touch().request_costs(name, Right.CALL),
+        )
         self._sent_by: object = None  # the switch that carried the latest frames
         self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
@@ -308,9 +313,10 @@ class Participant:
         if now_s != self._clock.now_s:
             self._clock.advance(now_s)
         if switch is None:
+            self._clock.deaf_s = now_s
             return
         if switch is not self._sent_by:
-            self._sent_by = switch
+            self._sent_by, self._clock.deaf_s = switch, now_s
             self.publications.attachment_changed(now_s)
         if self._reception.reporting:
             self._reception.report(now_s)
@@ -438,7 +444,9 @@ class Participant:
             if revocation is not None:
                 self._close(self.subscriptions.recheck(revocation.fingerprint, now.unix_s))
         elif statement.type is StatementType.ANSWER:
-            change = self.subscriptions.receive_response(Response.from_fields(statement.fields), now)
+            response = Response.from_fields(statement.fields)
+            change = self.subscriptions.receive_response(response, now)
+            self.subscriptions.note_cost(response)
             self._reception.messages += change.rest
             self._close(change.ended, goodbye=False)  # they may return to what waits for them
             self._reception.reporting.update(dict.fromkeys(change.opened))

@@ -194,7 +194,7 @@ class Publisher:
         Raises:
             LocalError: there is no secret.
         """
-        if self.is_recorded:
+        if self.queue.recorder is not None:
             self.seal_recorded()  # under the epoch in which it was published
         if self._keys.renew(secrets, now_s):
             self._heartbeats.wanted = True
@@ -214,11 +214,6 @@ class Publisher:
             self._record_description()
             self.published(self)
 
-    @property
-    def is_recorded(self) -> bool:
-        """Return whether a message counts that no reader gets."""
-        return self.queue.recorder is not None
-
     def record(self, on_sealed: OnSealed, on_described: OnSealed) -> None:
         """Hand on each message as it is sealed, and each description before its messages; see ``MessageRecorder``."""
         self.queue.recorder = MessageRecorder(self.queue, self._keys, on_sealed, on_described)
@@ -235,6 +230,11 @@ class Publisher:
         if self.queue.recorder is not None:
             self.seal_recorded()
             self.queue.recorder.record_description(*self.acknowledgements.describe_heartbeat())
+
+    def probe(self) -> None:
+        """Send a Heartbeat soon; each reader reports at once."""
+        self._heartbeats.wanted = True
+        self.published(self)
 
     def set_options(self, options: SendOptions) -> None:
         """Change how fresh, how much and how often messages leave, those that wait included."""

@@ -46,11 +46,13 @@ class ReaderPath:
         may_probe: one frame may leave whatever the window: what a report of it shows as lost makes space.
         is_silent: nothing was confirmed for a timeout, though something is under way.
         is_behind: frames wait in the reader's own socket, because its program is slow; the path is not the reason.
+        heard_s: monotonic second of the last report.
     """
 
     def __init__(self, mtu: int, now_s: float) -> None:
         self.mtu = mtu
         self.sent_bytes = 0
+        self.heard_s = -NEVER_S
         self.controller = PathController(mtu)
         self.restart(now_s)
 
@@ -131,8 +133,9 @@ class ReaderPath:
         self._late_reports = self._late_reports + 1 if held_s > _BEHIND_S else 0
         self.is_behind = self._late_reports >= _BEHIND_REPORTS
 
-    def handle_heard(self) -> None:
+    def handle_heard(self, now_s: float) -> None:
         """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
+        self.heard_s = now_s
         if self.is_silent:
             self.is_silent = False
             self.controller.rate.forget_before()

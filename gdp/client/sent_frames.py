@@ -201,7 +201,7 @@ class SentFrames:
             if reader is not None and acknack.received:
                 is_unproven = self._confirm(reader, path, acknack, now_s, waited_s)
                 self._forget_places()
-            path.handle_heard()
+            path.handle_heard(now_s)
         return is_unproven
 
     def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> bool:

@@ -6,6 +6,7 @@ Sans-I/O. A server's responses to one client, and a client's requests to one ser
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 
 from gdp.client.publications import Publications
 from gdp.client.reader_proxies import ReaderProxies
@@ -13,16 +14,22 @@ from gdp.client.request_streams import RequestStreams
 from gdp.client.subscription import Subscriptions
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import LocalError
-from gdp.intervals import NEIGHBOUR
+from gdp.intervals import NEIGHBOUR, NEVER_S
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
+from gdp.service.nearest import ServerPath
 from gdp.trust.right import Right
 
 
 class StallClock:
-    """Time of a participant's latest event, and since when it has been scheduled without a stall; monotonic seconds."""
+    """Time of a participant's latest event, and since when it has been scheduled without a stall; monotonic seconds.
+
+    Attributes:
+        deaf_s: when it last began to use a switch, or had none.
+    """
 
     def __init__(self) -> None:
-        self.now_s = self.awake_s = 0.0
+        self.now_s = self.awake_s = self.deaf_s = 0.0
 
     def advance(self, now_s: float) -> None:
         """Set the time; after a stall, frames that the peers sent meanwhile are still to be processed.
@@ -34,10 +41,43 @@ class StallClock:
         self.now_s = now_s
 
 
-class Services:
-    """The names that one participant serves or calls."""
+class ServicePaths:
+    """Paths to the servers of one name that is called."""
 
-    def __init__(self, publications: Publications, subscriptions: Subscriptions, clock: StallClock) -> None:
+    def __init__(self, name: Name, publications: Publications, subscriptions: Subscriptions, clock: StallClock) -> None:
+        self._name = name
+        self._publications = publications
+        self._subscriptions = subscriptions
+        self._clock = clock
+
+    def path(self, server: Name) -> ServerPath:
+        """Return the present state of the path to a server."""
+        subscription = self._subscriptions.get(self._name)
+        writer_proxy = None if subscription is None else subscription.writer_proxies.get(server)
+        path = self._publications.reader_paths.get(server)
+        return ServerPath(
+            COST_UNREACHABLE if writer_proxy is None else writer_proxy.cost,
+            0.0 if path is None else path.trip_s,
+            -NEVER_S if path is None else path.heard_s,
+            self._clock.deaf_s,
+        )
+
+
+class Services:
+    """The names that one participant serves or calls.
+
+    Args:
+        request_costs: has the switch state the costs of the paths to the servers of a name.
+    """
+
+    def __init__(
+        self,
+        publications: Publications,
+        subscriptions: Subscriptions,
+        clock: StallClock,
+        request_costs: Callable[[Name], None],
+    ) -> None:
+        self._request_costs = request_costs
         self._publications = publications
         self._subscriptions = subscriptions
         self._clock = clock
@@ -73,6 +113,16 @@ class Services:
             LocalError: the message is above the limits.
         """
         self._requests_of(service).send_to_all(call, message, self._clock.now_s)
+
+    def probe(self, service: Name, server: Name) -> None:
+        """Have one server of a name that is called here report soon; one that is not connected does not."""
+        with suppress(LocalError):
+            self._publications.stream_to(service, server, self._clock.now_s).probe()
+
+    def paths_of(self, service: Name) -> ServicePaths:
+        """Return the paths to the servers of a name that is called here; the switch states their costs from now on."""
+        self._request_costs(service)
+        return ServicePaths(service, self._publications, self._subscriptions, self._clock)
 
     def end_call(self, service: Name, call: Hashable) -> None:
         """Cancel what has not left of a call's requests, and their repairs; those of a withdrawn name have ended."""

@@ -271,6 +271,13 @@ class Subscriptions:
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 
+    def note_cost(self, response: Response) -> None:
+        """Note the cost of the path to a party, if an accepted response states it."""
+        subscription = self._by_name.get(response.name)
+        writer_proxy = None if subscription is None else subscription.writer_proxies.get(response.advertiser)
+        if writer_proxy is not None and response.cost is not None:
+            writer_proxy.cost = response.cost
+
     def has_issuer(self, key: bytes) -> bool:
         """Return whether an accepted advertisement depends on a certificate that this key, 33 bytes, issued."""
         advertisements = (each.advertisement for subscription in self for each in subscription.writer_proxies.values())

@@ -34,6 +34,7 @@ from gdp.frame.codec import HOPS_AT, SECOND_PATH, Header, decode, second_path_co
 from gdp.frame.kinds import Flag, Kind
 from gdp.intervals import NEVER_S, READER
 from gdp.limits import (
+    COST_UNREACHABLE,
     NACKS_PER_REPORT,
     NUMBER_MAX,
     PACE_MAX,
@@ -87,6 +88,7 @@ class WriterProxy:
         schedule: when reports are due.
         second_path_s: when a frame of the publisher last came by a second path.
         pace: that the publisher gave this reader, to be stated to its switch.
+        cost: of the path to the publisher's switch, as ours states it if asked.
 
     Raises:
         StatementError: MALFORMED, the publisher's ``exchange`` is no key.
@@ -137,6 +139,7 @@ class WriterProxy:
         self.advertisement_sequence = 0
         self.second_path_s = float("-inf")
         self.pace = PACE_MAX
+        self.cost = COST_UNREACHABLE
         self._paced_by = 0  # number of the Heartbeat that brought it
         if not introduces:
             self.state = WriterProxyState.LIVE

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 from gdp.crypto.schema import NAME, STATEMENT, Body, Keyed, many, number, octets, or_empty, uint
 from gdp.crypto.statements import StatementType
 from gdp.intervals import LEASE_MAX_S
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.trust.revocations import ID_BYTES
 
@@ -44,6 +45,7 @@ class Response(Body):
         transit: domains through which that domain lets its traffic pass.
         lease_s: of the location, or of a negative response; 0: the advertisement ended, or the RIB does not know.
         sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
+        cost: of the path to the advertiser's switch, from that of a reader that wants costs.
     """
 
     TYPE = StatementType.ANSWER
@@ -54,6 +56,7 @@ class Response(Body):
     transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
     lease_s: Annotated[float, Keyed("l", number(0, LEASE_MAX_S))]
     sequence: Annotated[int, Keyed("s", uint())] = 0
+    cost: Annotated[int | None, Keyed("k", uint(COST_UNREACHABLE), absent=None, is_omitted=True)] = None
 
     @property
     def is_negative(self) -> bool:

@@ -10,7 +10,8 @@ once::
     its timeout passes                              ->  failed (or answered with the best response that declined)
     no server owes one, and no server is left       ->  likewise
 
-When a server that owes a response refuses, declines or goes, the next untried server is asked at once.
+When a server that owes a response refuses, declines or goes, the next untried server is asked at once. With
+``Mode.NEAREST`` also when it falls silent (``nearest.py``), and only while no other one owes a response.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from gdp.names import Name
 from gdp.service.budget import HedgeBudget
 from gdp.service.calls import Calls
 from gdp.service.latency import Latencies
+from gdp.service.nearest import NearestServers, ServerPaths
 from gdp.service.replication import ALL, Mode, Replication
 
 A = TypeVar("A")
@@ -58,6 +60,12 @@ class Ask(NamedTuple):
     servers: tuple[Name, ...] | None
 
 
+class Probe(NamedTuple):
+    """Have a server report: it owes a response."""
+
+    server: Name
+
+
 class Stop(NamedTuple):
     """Tell servers to stop ended calls; None: all servers, by the tree."""
 
@@ -71,7 +79,7 @@ class End(NamedTuple):
     call: int
 
 
-Effect: TypeAlias = "Ask | Stop | End"
+Effect: TypeAlias = "Ask | Probe | Stop | End"
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -80,6 +88,7 @@ class _Call(Generic[A]):
     failed: Callable[[Failure, str], None]
     begun_s: float
     request: bytes = b""
+    is_watched: bool = False  # the next server is asked when those that owe a response are silent
     owing: dict[Name, float] = field(default_factory=dict)  # and since when
     tried: set[Name] = field(default_factory=set)  # every server that was asked, still there or not
     refused: set[Name] = field(default_factory=set)
@@ -98,6 +107,7 @@ class Dispatch(Generic[A]):
         start: the first call's number, random in 64 bits.
         stops: whether servers that still owe a response receive a stop when a call has ended.
         unicasts: a request to all servers goes to a server by its own stream while it is the only one.
+        paths: to the servers; for ``Mode.NEAREST`` alone, which needs them.
 
     Attributes:
         late: responses that came for a call that had ended.
@@ -112,6 +122,7 @@ class Dispatch(Generic[A]):
         start: int,
         stops: bool = True,
         unicasts: bool = False,
+        paths: ServerPaths | None = None,
         calls_max: int = CALLS_MAX,
         held_max_bytes: int = HELD_MAX_BYTES,
     ) -> None:
@@ -123,6 +134,9 @@ class Dispatch(Generic[A]):
         self.held_bytes = 0
         self._servers: dict[Name, bool] = {}  # whether it is leaving
         self._latencies = Latencies()
+        self._nearest: NearestServers | None = None
+        if paths is not None and replication.mode is Mode.NEAREST:
+            self._nearest = NearestServers(paths)
         self._budget = HedgeBudget(replication.budget)
         self._hedges = DueQueue[int]()
         self._late: dict[int, None] = {}  # calls whose second copy waits for the budget, the oldest first
@@ -169,7 +183,8 @@ class Dispatch(Generic[A]):
             raise LocalError("no server is there")
         if self.held_bytes >= self._held_max_bytes:
             raise LocalError(f"requests of {self.held_bytes} bytes are under way: no more at once")
-        call = _Call(answered=answered, failed=failed, begun_s=now_s)
+        is_watched = self._nearest is not None and not chosen
+        call = _Call(answered=answered, failed=failed, begun_s=now_s, is_watched=is_watched)
         number = self._calls.add_call(now_s, timeout_s, call)
         call.request = write(number)
         self.held_bytes += len(call.request)
@@ -208,6 +223,8 @@ class Dispatch(Generic[A]):
         if self._servers.pop(server, None) is None:
             return
         self._latencies.forget(server)
+        if self._nearest is not None:
+            self._nearest.forget(server)
         for ended in self._ended.values():
             ended.owing.pop(server, None)
         for number, call in self._calls:
@@ -248,12 +265,14 @@ class Dispatch(Generic[A]):
             self._fail(number, call, Failure.TIMED_OUT, "")
         self._late |= dict.fromkeys(self._hedges.poll_due(now_s))
         self._hedge(now_s)
+        self._look_at_owing(now_s)
         self._tell_stops(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         stop_at_s = next(iter(self._ended.values())).stop_at_s if self._ended else None
-        return earliest(self._calls.get_timer(), self._hedges.next_due(), stop_at_s)
+        look_at_s = None if self._nearest is None else self._nearest.get_timer()
+        return earliest(self._calls.get_timer(), self._hedges.next_due(), stop_at_s, look_at_s)
 
     def fail_all(self, reason: str) -> None:
         """End every call, because no server is asked any more."""
@@ -292,7 +311,8 @@ class Dispatch(Generic[A]):
         """Ask the next server instead of one without a response; fail where no server is left."""
         if number not in self._calls:
             return  # a callback ended it
-        self._ask(number, call, self._untried(call, now_s)[:1], now_s)
+        if self._is_silent(call):
+            self._ask(number, call, self._untried(call, now_s)[:1], now_s)
         if not call.owing:
             self._calls.end(number)
             self._fail(number, call, failure, reason)
@@ -300,13 +320,37 @@ class Dispatch(Generic[A]):
     def _untried(self, call: _Call[A], now_s: float) -> list[Name]:
         """Return the servers to ask next, the best first; leaving ones come last."""
         free = [server for server in self._servers if server not in call.owing and server not in call.refused]
-        return sorted(self._latencies.ranked(free, now_s), key=self._servers.__getitem__)
+        ranked, nearest = self._latencies.ranked(free, now_s), self._nearest
+        if nearest is None:
+            return sorted(ranked, key=self._servers.__getitem__)
+        return sorted(ranked, key=lambda each: (self._servers[each], nearest.is_silent(each), nearest.cost(each)))
+
+    def _is_silent(self, call: _Call[A]) -> bool:
+        """Return whether no server that owes a response is heard; servers that are not watched count as silent."""
+        return self._nearest is None or all(map(self._nearest.is_silent, call.owing))
+
+    def _look_at_owing(self, now_s: float) -> None:
+        """Probe the servers that owe a response; where they are silent, ask the next one that is not."""
+        if (nearest := self._nearest) is None:
+            return
+        for server in nearest.poll_due(now_s):
+            owed = [(number, call) for number, call in self._calls if call.is_watched and server in call.owing]
+            for number, call in owed:
+                if self._is_silent(call):
+                    others = [each for each in self._untried(call, now_s)[:1] if not nearest.is_silent(each)]
+                    self.hedged += len(others)
+                    self._ask(number, call, others, now_s)
+            if owed:
+                self._effects.append(Probe(server))
+                nearest.probed(server, now_s)
 
     def _ask(self, number: int, call: _Call[A], servers: Sequence[Name], now_s: float) -> None:
         for server in servers:
             call.owing[server] = now_s
             call.tried.add(server)
             self._latencies.asked(server, now_s)
+            if self._nearest is not None and call.is_watched:
+                self._nearest.asked(server, now_s)
         if servers:
             self._effects.append(Ask(number, call.request, tuple(servers)))
 

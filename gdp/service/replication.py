@@ -17,6 +17,7 @@ class Mode(Enum):
     ALL = "all"  # every replica, by the tree: one copy on the client's link
     SOME = "some"  # ``copies`` of them, those that responded fastest recently
     HEDGED = "hedged"  # one; a second one after the 95th percentile of recent responses, within the budget
+    NEAREST = "nearest"  # one, over the path of the least cost; the next one where it falls silent
 
 
 @dataclass(frozen=True, slots=True)

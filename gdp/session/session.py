@@ -213,7 +213,8 @@ class Session(BaseSession[Driver, Publisher, Subscription, Server, Handler]):
             name: as for ``publisher``.
             timeout_s: longest wait for a server and its response; None: no limit.
             replication: ``"all"``: every server gets the request; ``"hedged"``: one server, and a second one if the
-                first is slow; a number: that many servers, the fastest ones; or a ``Replication``.
+                first is slow; ``"nearest"``: the nearest server, and the next one if that falls silent; a number:
+                that many servers, the fastest ones; or a ``Replication``.
             paths: 2: over two disjoint paths, to servers with 2 as well. The first call on a name decides.
             sign: as for ``serve``. The first call on a name decides.
 

@@ -5,8 +5,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 from gdp.errors import DropReason, StatementError
 from gdp.limits import READERS_MAX
@@ -18,10 +18,15 @@ from gdp.trust.advertisement import Advertisement
 
 @dataclass(slots=True)
 class AttachedReader:
-    """A node attached here that reads a topic, serves or calls."""
+    """A node attached here that reads a topic, serves or calls.
+
+    Attributes:
+        costs: of the paths to those that it hears, as it knows them.
+    """
 
     advertisement: Advertisement
     expires_s: float
+    costs: dict[Name, int] = field(default_factory=dict)
 
 
 class AttachedReaders:
@@ -35,6 +40,13 @@ class AttachedReaders:
     def of(self, topic: Name) -> Mapping[Downstream, AttachedReader]:
         """Return the readers of a topic, by where they are attached."""
         return self._by_topic.get(topic, {})
+
+    def wanting_costs(self) -> Iterator[tuple[Downstream, AttachedReader]]:
+        """Yield the readers that want the costs of paths, with their places."""
+        for readers in self._by_topic.values():
+            for at, reader in readers.items():
+                if reader.advertisement.wants_costs:
+                    yield at, reader
 
     def topics_at(self, at: Downstream) -> list[Name]:
         """Return the topics of the readers that are attached at a place."""

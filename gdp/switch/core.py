@@ -117,6 +117,7 @@ class SwitchCore:
             multicast=self.multicast,
             unicast=self.unicast,
             rib_client=self.rib_client,
+            locations=self._locations,
         )
         self._handlers = self._statement_handlers()
         self.diagnostics = Diagnostics(

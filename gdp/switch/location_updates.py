@@ -18,6 +18,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
+from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.dependents import KnownLocation
@@ -193,9 +194,30 @@ class LocationUpdates:
             self._multicast.publisher_gone(location.name, location.advertiser)
 
     def send_to_reader(self, at: Downstream, right: Right, location: Location, now_s: float) -> None:
-        """Send an advertiser's advertisement to an attached node that reads it by ``right``; the node verifies it."""
-        if HEARS[right] is location.right:
-            self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s))
+        """Send an advertiser's advertisement to an attached node that reads it by ``right``; the node verifies it.
+
+        One that wants costs also receives that of the path to the advertiser.
+        """
+        if HEARS[right] is not location.right:
+            return
+        cost, reader = None, self._state.readers.of(location.name).get(at)
+        if reader is not None and reader.advertisement.wants_costs:
+            cost = reader.costs[location.advertiser] = self._cost_of(location)
+        self._state.outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s, cost))
+
+    def paths_changed(self, now_s: float) -> None:
+        """Send readers that want costs the locations whose costs have changed."""
+        for at, reader in self._state.readers.wanting_costs():
+            right = reader.advertisement.right
+            for location in self._state.resolver.cache.of(reader.advertisement.name, now_s):
+                if reader.costs.get(location.advertiser) != self._cost_of(location):
+                    self.send_to_reader(at, right, location, now_s)
+
+    def _cost_of(self, location: Location) -> int:
+        if location.switch == self._state.me:
+            return 0
+        path = self._unicast.path_to(location, self._state.policy.transit)
+        return COST_UNREACHABLE if path is None else min(path.distance, COST_UNREACHABLE)
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
         """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""
@@ -216,7 +238,7 @@ class LocationUpdates:
         locations = cache.of(name, now_s) + ([] if node is None else [node])
         return [self._as_answer(location, now_s) for location in locations[:PROOFS_MAX]]
 
-    def _as_answer(self, location: Location, now_s: float) -> bytes:
+    def _as_answer(self, location: Location, now_s: float, cost: int | None = None) -> bytes:
         lease_s = max(location.expires_s - now_s, 0.0)
         response = Response(
             name=location.name,
@@ -225,6 +247,7 @@ class LocationUpdates:
             domain=location.domain,
             transit=tuple(sorted(location.transit)),
             lease_s=lease_s,
+            cost=cost,
         )
         return self._state.identity.signed(response)
 

@@ -14,6 +14,7 @@ from gdp.due_queue import earliest
 from gdp.intervals import UPKEEP_S
 from gdp.switch.flooding import Flooding
 from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.rib_client import RibClient
 from gdp.switch.spf_delay import SpfDelay
@@ -34,6 +35,7 @@ class PathUpdates:
         multicast: MulticastTrees,
         unicast: Unicast,
         rib_client: RibClient,
+        locations: LocationUpdates,
     ) -> None:
         self._state = state
         self._flooding = flooding
@@ -41,6 +43,7 @@ class PathUpdates:
         self._multicast = multicast
         self._unicast = unicast
         self._rib_client = rib_client
+        self._locations = locations
         self._spf_delay = SpfDelay()
         self._seen_version = -1
         self._seen_losses = 0
@@ -72,6 +75,7 @@ class PathUpdates:
         self._unicast.refresh(now_s)
         self._multicast.reroute(now_s)
         self._rib_client.links_changed(now_s)
+        self._locations.paths_changed(now_s)
         self._find_conflicts(now_s)
 
     def handle_timer(self, now_s: float, *, has_lost: bool) -> None:

@@ -225,6 +225,10 @@ class Unicast:
             self._install_way(destination, source, best[0], source, best[1], now_s)
         return None
 
+    def path_to(self, place: Location, allowed: frozenset[Name]) -> Path | None:
+        """Return the path to a location on another switch through allowed domains, or None."""
+        return self._state.paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain})
+
     def _why(self, switch: Name, domain: Name) -> DropReason:
         """Return the reason to report where there is no path to a switch."""
         return DropReason.THROUGH_LEAF if self._state.paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
@@ -237,12 +241,7 @@ class Unicast:
 
     def _nearest(self, takers: list[Location], allowed: frozenset[Name], now_s: float) -> tuple[Path, float] | None:
         """Return the path to the nearest location, and how long its entry stands; a stale one is checked again soon."""
-        paths = self._state.paths
-        ways = [
-            (place, way)
-            for place in takers
-            if (way := paths.to_switch(place.switch, place.domain, allowed & place.transit | {place.domain}))
-        ]
+        ways = [(place, way) for place in takers if (way := self.path_to(place, allowed))]
         if not ways:
             return None
         best, way = min(ways, key=lambda each: (each[1].distance, each[0].advertiser))

@@ -47,6 +47,7 @@ class _Advertised(Body):
             ``SPREAD``: striped over two.
         is_session: a session secret may authenticate the unicast streams of this name that the node sends or receives,
             with nodes that say the same.
+        wants_costs: its switch is to state the costs of the paths to those that it hears on this name.
     """
 
     TYPE = StatementType.ADVERTISE
@@ -60,6 +61,7 @@ class _Advertised(Body):
     exchange: Annotated[bytes, Keyed("x", or_empty(octets(EXCHANGE_KEY_BYTES), b""))] = b""
     paths: Annotated[int, Keyed("paths", uint(SPREAD, 1), absent=1, is_omitted=True)] = 1
     is_session: Annotated[bool, Keyed("session", FLAG, absent=False, is_omitted=True)] = False
+    wants_costs: Annotated[bool, Keyed("costs", FLAG, absent=False, is_omitted=True)] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -364,7 +364,9 @@ class Bridge:
 
     def _receive(self, message: Message, now_s: float) -> None:
         flow = self._inbound.get(message.topic)
-        if flow is not None and not isinstance(flow, ExposedTopic):  # else its flow ended a moment ago
+        if flow is None or isinstance(flow, ExposedTopic):
+            self._context.traffic.unread += 1  # its flow ended a moment ago
+        else:
             flow.receive(message, now_s)
 
     def _refresh(self, now_s: float) -> None:

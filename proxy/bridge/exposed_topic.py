@@ -205,7 +205,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if not publisher.is_wanted and not publisher.queue.kept and not publisher.is_recorded:
+        if not publisher.is_wanted and not publisher.queue.kept and publisher.queue.recorder is None:
             traffic.unread += 1
             publisher.skip(LossReason.NO_READER, now_s)
             self._count(event)
@@ -221,7 +221,7 @@ class ExposedTopic:
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
-            if not publisher.is_recorded:
+            if publisher.queue.recorder is None:
                 publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
                 return
         body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)

@@ -88,6 +88,9 @@ class ImportedService(ServiceFlow):
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, with the reported reason
         if flow_spec.rule.is_ordered:
             self._sequencer = Sequencer(incarnation_id=lambda: secrets.randbits(INCARNATION_BITS))
+        self._publisher = context.member.call(topic, self._description(), **self.options())
+        is_nearest = flow_spec.rule.spread.mode is Mode.NEAREST
+        paths = context.member.services.paths_of(topic.name) if is_nearest else None
         self._calls: tuple[ServerCalls, ...] = tuple(
             self._sequencer
             if self._sequencer is not None
@@ -96,6 +99,7 @@ class ImportedService(ServiceFlow):
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # every server has the goal, until one has its result
                 unicasts=session_value(flow_spec.rule.sign),
+                paths=paths,
             )
             for part in range(len(self.parts.services))
         )
@@ -106,7 +110,6 @@ class ImportedService(ServiceFlow):
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
-        self._publisher = context.member.call(topic, self._description(), **self.options())
         self._virtual_server = VirtualServer(self)
         self._sender = RequestSender(self, self._calls, self._goals, self._publisher)
         self._discovery = ServerDiscovery(self, self._calls, self._goals, opened=self._open, closed=self._shut)

@@ -12,7 +12,7 @@ from typing import TypeAlias
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.dispatch import Ask, Dispatch, End
+from gdp.service.dispatch import Ask, Dispatch, End, Probe
 from gdp.service.dispatch import Stop as DispatchStop
 from gdp.service.frames import Stop
 from gdp.service.replication_messages import ReplicaCommand
@@ -107,6 +107,9 @@ class RequestSender:
                 for effect in effects:
                     if isinstance(effect, End):
                         self._flow.context.member.services.end_call(self._flow.name, (part, effect.call))
+                        continue
+                    if isinstance(effect, Probe):
+                        self._flow.context.member.services.probe(self._flow.name, effect.server)
                         continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):

@@ -195,7 +195,7 @@ def _by_kind(kind: Kind) -> JsonValue:
 class Spread(Section):
     """How requests are spread over a service's servers."""
 
-    mode: Literal["all", "some", "hedged"] = Field(
+    mode: Literal["all", "some", "hedged", "nearest"] = Field(
         default="all", description="Imported calls: which servers get a request."
     )
     copies: int = Field(default=2, ge=1, le=COPIES_MAX, description="With `some`: how many servers.")

@@ -23,7 +23,7 @@ class Traffic:
     Args:
         total: number of expected messages and calls.
         lost: messages that a reader reports as permanently missing.
-        behind: published or requested, and not yet delivered.
+        behind: published or requested by the report before, and not yet delivered.
         silent: flows that stand still although they are behind, with seconds.
         latency_ms: one way, of the latest message; None before the first.
     """

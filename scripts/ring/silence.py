@@ -14,6 +14,7 @@ REPORTED_FROM_S: Final = 1.5  # both ends report twice a second
 @dataclass(slots=True)
 class _Flow:
     sent: int = 0
+    sent_before: int = 0  # by the report before; what was sent since then may be under way
     received: int = 0
     since_s: float = 0.0  # nothing was received since, although something was sent
 
@@ -31,15 +32,15 @@ class Silence:
 
     @property
     def behind(self) -> int:
-        """Return the number of sent and not received messages, over all flows."""
-        return sum(max(flow.sent - flow.received, 0) for flow in self._flows.values())
+        """Return the number of messages, over all flows, that were sent by the report before and not received."""
+        return sum(max(flow.sent_before - flow.received, 0) for flow in self._flows.values())
 
     def sent(self, name: str, count: int, now_s: float) -> None:
         """Set the total of sent messages of a flow."""
         flow = self._flows.setdefault(name, _Flow())
         if not flow.is_behind:
             flow.since_s = now_s
-        flow.sent = count
+        flow.sent_before, flow.sent = flow.sent, count
 
     def received(self, name: str, count: int, now_s: float) -> None:
         """Set the total of received messages of a flow."""

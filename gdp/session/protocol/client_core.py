@@ -16,9 +16,9 @@ from gdp.due_queue import earliest
 from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.names import Name
-from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
+from gdp.service.dispatch import Ask, Dispatch, End, Failure, Probe, Stop
 from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
-from gdp.service.replication import Replication
+from gdp.service.replication import Mode, Replication
 from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.protocol.messages import Response
 from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, stop_to_wire
@@ -220,7 +220,11 @@ class ClientCore:
             return known
         # so that no two dispatches use the same numbers
         start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)
-        dispatch = self._dispatches[replication] = Dispatch(replication, start=start, unicasts=self._is_session)
+        is_nearest = replication.mode is Mode.NEAREST
+        paths = self._member.services.paths_of(self._name) if is_nearest else None
+        dispatch = self._dispatches[replication] = Dispatch(
+            replication, start=start, unicasts=self._is_session, paths=paths
+        )
         for name in self._servers:
             dispatch.replica_joined(name, now_s)
             if name in self._leaving:
@@ -234,6 +238,9 @@ class ClientCore:
                 for effect in effects:
                     if isinstance(effect, End):
                         self._member.services.end_call(self._name, effect.call)
+                        continue
+                    if isinstance(effect, Probe):
+                        self._member.services.probe(self._name, effect.server)
                         continue
                     servers = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if servers is None:

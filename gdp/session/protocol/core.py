@@ -253,7 +253,7 @@ def replication_of(value: str | int | Replication) -> Replication:
     """Return how a request is replicated.
 
     Args:
-        value: ``"all"``, ``"hedged"``, the number of servers that get a copy, or a ``Replication``.
+        value: ``"all"``, ``"hedged"``, ``"nearest"``, the number of servers that get a copy, or a ``Replication``.
 
     Raises:
         LocalError: none of these.
@@ -262,9 +262,9 @@ def replication_of(value: str | int | Replication) -> Replication:
         return value
     if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
         return Replication(Mode.SOME, copies=value)
-    if value in ("all", "hedged"):
+    if value in ("all", "hedged", "nearest"):
         return Replication(Mode(value))
-    raise LocalError(f"replication is 'all', 'hedged' or a number of servers from 1, not {value!r}")
+    raise LocalError(f"replication is 'all', 'hedged', 'nearest' or a number of servers from 1, not {value!r}")
 
 
 def _is_meant(topic: Topic, name: NameLike) -> bool:

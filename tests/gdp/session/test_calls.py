@@ -206,12 +206,13 @@ def test_closing_the_session_ends_calls_under_way(replicas: Simulated) -> None:
 def test_replication_is_given_as_a_word_or_a_number() -> None:
     assert replication_of("all") == ALL
     assert replication_of("hedged").mode is Mode.HEDGED
+    assert replication_of("nearest").mode is Mode.NEAREST
     assert (replication_of(2).mode, replication_of(2).copies) == (Mode.SOME, 2)
 
 
 @pytest.mark.parametrize("wrong", ["some", 0, True, ""])
 def test_an_unknown_replication_is_refused(wrong: object) -> None:
-    with pytest.raises(LocalError, match="'all', 'hedged' or a number"):
+    with pytest.raises(LocalError, match="'all', 'hedged', 'nearest' or a number"):
         replication_of(wrong)  # type: ignore[arg-type]
 
 

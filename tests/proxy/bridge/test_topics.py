@@ -142,6 +142,19 @@ def test_a_rule_that_ends_ends_its_flow_at_once(sites: Sites) -> None:
     assert not list(robot.member.publications)
 
 
+def test_a_message_that_arrives_when_its_flow_has_ended_is_counted(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, server, talker, ear = flowing(sites)
+    with monkeypatch.context() as busy:
+        busy.setattr(server.member, "poll_messages", list)  # what comes is not read yet
+        talker.publish(string("too late"))
+        sites.run(0.2)
+        sites.reload(server)
+    sites.run(0.2)
+    assert (server.context.traffic.unread, ear.texts) == (1, [])
+
+
 def test_two_talkers_of_one_topic_are_both_heard_and_one_may_leave(sites: Sites) -> None:
     robot, _, talker, ear = flowing(sites)
     other = talk(robot, node="/other")

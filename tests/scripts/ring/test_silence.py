@@ -20,6 +20,8 @@ def test_a_flow_that_is_owed_something_is_silent_from_when_it_was_sent() -> None
     silence.sent("/a", 9, 21.0)
     assert silence.silent(20.0 + REPORTED_FROM_S - 0.1) == []
     assert silence.silent(24.0) == [("/a", 4.0)]
+    assert silence.behind == 1  # of the report before; three more may be under way
+    silence.sent("/a", 9, 21.5)
     assert silence.behind == 4
 
 
