@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gdp.capsule.checkpoint import HINT_BYTES, Checkpoint, root_of
 from gdp.capsule.opening import verify_frames
-from gdp.capsule.record import Record, RecordType, find, leaf_of
+from gdp.capsule.record import Record, RecordType, find, leaf_of, size_of
 from gdp.crypto.keys import PublicKey
 from gdp.errors import RemoteError
 from gdp.names import Name
@@ -78,14 +78,19 @@ class Audit:
 
     def add(self, data: bytes) -> None:
         """Read the next segment, or the next bytes that begin and end with a record."""
-        at: int | None = 0
-        while at is not None and at < len(data):
+        at = 0
+        while at < len(data):
             begin = find(data, at)
-            self._is_broken |= begin != at
+            if begin != at:
+                self.skip()
             if begin is None:
                 return
-            at = begin + 4 + int.from_bytes(data[begin : begin + 4], "big")
-            self._handle(data[begin:at])
+            at = begin + size_of(data, begin)
+            self.handle_record(data[begin:at])
+
+    def skip(self) -> None:
+        """Note that bytes here are no record."""
+        self._is_broken = True
 
     def finish(self) -> list[Finding]:
         """Return all findings, once everything was added."""
@@ -99,7 +104,8 @@ class Audit:
             self._find(Damage.ROLLED_BACK, self._next, known.number, detail)
         return self.findings
 
-    def _handle(self, wire: bytes) -> None:
+    def handle_record(self, wire: bytes) -> None:
+        """Check the next record whose checksum is right. Raises ``RemoteError``: it is none."""
         record, leaf = Record.from_wire(wire), leaf_of(wire)
         number = record.number
         if not self._has_begun:

@@ -114,6 +114,11 @@ def split(data: bytes, at: int = 0) -> Iterator[bytes]:
         at = end
 
 
+def size_of(data: bytes, at: int) -> int:
+    """Return the bytes of the record that begins at ``at``."""
+    return _LENGTH.size + int(_LENGTH.unpack_from(data, at)[0])
+
+
 def find(data: bytes, at: int) -> int | None:
     """Return where the next undamaged record begins, at ``at`` or later; None: there is none."""
     while at + RECORD_MIN_BYTES <= len(data):

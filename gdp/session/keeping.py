@@ -24,7 +24,7 @@ from gdp.crypto.envelope import Sealed
 from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
 from gdp.errors import GdpError
-from gdp.intervals import PACE_S, TICK_S
+from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
 from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
 from gdp.sansio import Timestamps
@@ -122,12 +122,21 @@ class KeptTopic:
             if self._reading.done():
                 self.upload(client, now_s)
 
-    def close(self, time_ns: int) -> None:
-        """Put everything on the disk, with a checkpoint over it."""
+    @property
+    def is_reading(self) -> bool:
+        """Return whether the disk is read for the next request."""
+        return self._reading is not None
+
+    @property
+    def is_uploaded(self) -> bool:
+        """Return whether the holder has confirmed all that is here."""
+        return not self.is_busy and self.uploader.confirmed == self.ring.end
+
+    def finish(self, time_ns: int) -> None:
+        """Append what was published so far, with a checkpoint over it; the publisher ends."""
         self.flush(time_ns)
         if self._writer.has_new and self.ring.is_ready:
             self._append([self._writer.checkpoint(time_ns)], begins_file=False)
-        self.ring.close()
 
     def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
         self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
@@ -155,6 +164,7 @@ class CapsuleKeeper:
 
     Attributes:
         topics: what is kept, by topic.
+        ended: what is kept no more and not yet uploaded, by topic.
     """
 
     def __init__(
@@ -167,6 +177,7 @@ class CapsuleKeeper:
         self._pool = ThreadPoolExecutor(1, "capsules") if pool is None else pool
         self._clients: dict[Name, ClientCore] = {}
         self.topics: dict[Name, KeptTopic] = {}
+        self.ended: dict[Name, KeptTopic] = {}
         self._due_s = 0.0
 
     def keep(self, topic: Topic, publisher: Publisher, holder: Topic, most_bytes: int, unix_s: float) -> KeptTopic:
@@ -180,6 +191,8 @@ class CapsuleKeeper:
             GdpError: no delegation, or the folder cannot be read or written.
         """
         delegation = topic.delegation
+        if (before := self.ended.pop(topic.name, None)) is not None:
+            before.ring.close()
         descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
         ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
         if holder.name not in self._clients:
@@ -190,10 +203,11 @@ class CapsuleKeeper:
         return kept
 
     def release(self, topic: Name, unix_s: float) -> None:
-        """Keep a topic no more; its capsule stays in the ring and is continued later."""
+        """Keep a topic no more; what waits is uploaded. Its capsule is continued when it is kept again."""
         kept = self.topics.pop(topic, None)
         if kept is not None:
-            kept.close(int(unix_s * 1e9))
+            kept.finish(int(unix_s * 1e9))
+            self.ended[topic] = kept
 
     def is_asked(self, name: Name) -> bool:
         """Return whether a name is the service of a holder."""
@@ -208,18 +222,32 @@ class CapsuleKeeper:
         if now.mono_s >= self._due_s:
             for kept in self.topics.values():
                 kept.flush(int(now.unix_s * 1e9))
-            is_busy = any(each.is_busy for each in self.topics.values())
+            is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
             self._due_s = now.mono_s + (PACE_S if is_busy else TICK_S)
         for client in self._clients.values():
             due_s = client.get_timer()
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
-        for kept in self.topics.values():
+        for kept in (*self.topics.values(), *self.ended.values()):
             kept.upload(self._clients[kept.holder], now.mono_s)
+            if kept.is_reading:
+                self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
+        for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
+            self.ended.pop(name).ring.close()
+
+    @property
+    def is_uploaded(self) -> bool:
+        """Return whether the holders have confirmed all that was published."""
+        return all(each.is_uploaded for each in (*self.topics.values(), *self.ended.values()))
+
+    @property
+    def confirmed(self) -> int:
+        """Return how many bytes the holders have confirmed."""
+        return sum(each.uploader.confirmed for each in (*self.topics.values(), *self.ended.values()))
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if not self.topics:
+        if not self.topics and not self.ended:
             return None
         return earliest(self._due_s, *[each.get_timer() for each in self._clients.values()])
 
@@ -227,4 +255,6 @@ class CapsuleKeeper:
         """Put everything on the disk."""
         for topic in list(self.topics):
             self.release(topic, unix_s)
+        for kept in self.ended.values():
+            kept.ring.close()
         self._pool.shutdown()

@@ -5,6 +5,7 @@ I/O through endpoint and participant. The publishers are live nodes, or those of
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 
@@ -135,6 +136,8 @@ class ExposedTopic:
         """Close the subscription and the publisher; unconfirmed messages are lost."""
         self.finish(now_s)
         if self.publisher is not None:
+            if self._context.keeper is not None:
+                self._context.keeper.release(self._topic.name, time.time())
             self._context.member.withdraw(self._topic.name)
 
     def parties(self, now_s: float) -> list[Party]:
@@ -182,6 +185,11 @@ class ExposedTopic:
             paths=paths_value(rule.paths),
             options=self.qos.options,
         )
+        keeper = self._context.keeper
+        if rule.keep is None or keeper is None:
+            return
+        if obstacle := keeper.keep(self._topic, self.publisher, rule.keep, time.time()):
+            self._context.faults.report(self._flow_spec.local, Fault.REFUSED, obstacle)
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
         rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._context.traffic

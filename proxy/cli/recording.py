@@ -12,7 +12,9 @@ from typing import Annotated
 import typer
 
 from gdp.cli.node import Json, failing_clearly
+from gdp.cli.program import ungrouped
 from gdp.errors import LocalError
+from proxy.cli.history import export, replay
 from proxy.cli.tool_options import print_json, print_text
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import PARTIAL, BagWriter
@@ -54,6 +56,12 @@ def finish(file: File, output: Output = None, json: Json = False) -> None:
         print_json({"file": str(whole), "messages": count, "unread": unread or None})
     else:
         print_text(f"{count} messages are in {whole}" + (f"; {unread}" if unread else ""))
+
+
+app.command(epilog="Example: gdp store export /camera/image --node investigator -o incident.mcap")(export)
+app.command(epilog="Example: gdp store replay /scan --node investigator --config proxy.yaml --rate 2")(
+    ungrouped(replay)
+)
 
 
 def _refuse_used(file: Path, descriptor: int) -> None:

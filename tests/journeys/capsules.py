@@ -143,7 +143,7 @@ class Keeping:
 
     def is_uploaded(self) -> bool:
         """Return whether the holder has confirmed all that is on the disk here."""
-        return not self.kept.is_busy and self.kept.uploader.confirmed == self.kept.ring.end > 0
+        return self.kept.is_uploaded and self.kept.ring.end > 0
 
     def publish_at(self, times_s: list[float], message: Callable[[int], bytes]) -> list[bytes]:
         """Publish numbered messages at these seconds from now on; return them."""
