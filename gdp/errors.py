@@ -37,7 +37,7 @@ class DropReason(IntEnum):
     BAD_TAG = 13  # AES-GCM refused the fragment
     BAD_SIGNATURE = 14
     REPLAYED = 15
-    LATE = 16  # a fragment of a finished or abandoned message
+    LATE = 16  # a fragment of a finished or abandoned message; a message too old to steer by
     DUPLICATE = 17
     WRONG_INCARNATION = 18
     UNKNOWN_EPOCH = 19
@@ -74,6 +74,7 @@ class DropReason(IntEnum):
     UNUSED_PARITY = 49  # a parity frame whose block lost nothing, or was filled before
     UNPROVEN = 50  # a reader's count of frames that its receipts do not prove; more count as lost
     THINNED = 51  # a copy of a message that is for faster branches than this one
+    NOT_IN_CONTROL = 52  # a message of a publisher that does not hold the exclusive control of its topic
 
     @property
     def label(self) -> str:

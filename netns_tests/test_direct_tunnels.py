@@ -50,15 +50,13 @@ class Sites:
 @pytest.fixture
 def make_sites(laboratory: Laboratory) -> Callable[[Access, Access], Sites]:
     def make(*accesses: Access) -> Sites:
-        overlay = Overlay(laboratory)
         border = laboratory.add_host("border", laboratory.add_site("of-border", Access.PUBLIC))
-        overlay.add_switch(border, is_border=True, links={"backend": "wireguard-go"})
-        hosts = []
-        for label, access in zip(("one", "other"), accesses, strict=True):
-            hosts.append(laboratory.add_host(label, laboratory.add_site(f"of-{label}", access)))
-            overlay.add_switch(hosts[-1], borders=[border], links={"backend": "wireguard-go"})
-        overlay.start(border, *hosts)
-        overlay.start_rib(border)
+        overlay = Overlay(laboratory, border, {"backend": "wireguard-go"})
+        hosts = [
+            laboratory.add_host(label, laboratory.add_site(f"of-{label}", access))
+            for label, access in zip(("one", "other"), accesses, strict=True)
+        ]
+        overlay.stand_up(*hosts)
         return Sites(overlay, *hosts)
 
     return make

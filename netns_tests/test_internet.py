@@ -335,7 +335,7 @@ def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(net: Inter
 
 @pytest.mark.nightly
 def test_a_delay_line_delays_both_directions_and_loses_nothing(net: Internet) -> None:
-    robot = net.attach(Access.PORT_RESTRICTED, delay_ms=30.0, jitter_ms=5.0)
+    robot = net.attach(Access.PORT_RESTRICTED, delay_ms=30.0)
     with UdpProbe(robot) as probe, UdpProbe(net.borders[0]) as border:
         public = observe(probe, border)
         started_s = time.monotonic()

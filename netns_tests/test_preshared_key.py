@@ -42,7 +42,7 @@ class Pair:
 
     def key(self, host: Host) -> str:
         """Return the preshared key that WireGuard has at a host."""
-        name = load_card(self.overlay.switch_folder(host.label) / CARD).name
+        name = load_card(self.overlay.directory(host) / "switch" / CARD).name
         with socket.socket(socket.AF_UNIX) as control:
             control.connect(str(socket_path(underlay_ifname(name, 0))))
             control.sendall(b"get=1\n\n")
@@ -70,11 +70,8 @@ class Pair:
 def pair(laboratory: Laboratory) -> Pair:
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
-    overlay = Overlay(laboratory)
-    more = {"backend": "wireguard-go"}
-    overlay.add_switch(border, is_border=True, links=more)
-    overlay.add_switch(robot, borders=[border], links=more)
-    overlay.start(border, robot)
+    overlay = Overlay(laboratory, border, {"backend": "wireguard-go"})
+    overlay.stand_up(robot)
     made = Pair(overlay, border, robot)
     until(made.has_key, "no key at both ends", PATIENCE_S)
     return made
@@ -84,7 +81,7 @@ def pair(laboratory: Laboratory) -> Pair:
 def test_a_tunnel_with_a_killed_end_works_again_with_a_new_key(pair: Pair, label: str) -> None:
     before = pair.key(pair.border)
     host = pair.border if label == "border" else pair.robot
-    pair.overlay.kill_border(host)
+    pair.overlay.kill(host)
     begun_s = time.monotonic()
     pair.overlay.start(host)
     until(lambda: pair.has_key() and pair.key(host) != before, "no new key at both ends", PATIENCE_S)

@@ -136,7 +136,7 @@ def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: 
     roamer.release.set()
     roamer.wait_for_tunnels("border", "server")
     roamer.caller.call(SERVICE, b"finds the server", timeout_s=PATIENCE_S)
-    roamer.overlay.kill_border(roamer.border)
+    roamer.overlay.kill(roamer.border)
     requests, end_s = [b"finds the server"], time.monotonic() + OUTAGE_S
     while time.monotonic() < end_s:
         requests.append(b"%d" % len(requests))
@@ -145,7 +145,6 @@ def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: 
         assert roamer.has_tunnels("server")
     assert not roamer.has_tunnels("border")
     roamer.overlay.start(roamer.border)
-    roamer.overlay.start_rib(roamer.border)
     roamer.wait_for_tunnels("border", "server")
     _check_end(roamer)
     assert roamer.requests == requests
@@ -155,7 +154,7 @@ def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: 
 @pytest.mark.parametrize("roamer", [LEASE_S], indirect=True)
 def test_a_direct_tunnel_that_an_uplink_cut_ends_comes_back_without_the_border(roamer: Field) -> None:
     roamer.wait_for_tunnels("border", "server")
-    roamer.overlay.kill_border(roamer.border)
+    roamer.overlay.kill(roamer.border)
     home = roamer.robot.site()
     while roamer.has_tunnels("border"):
         roamer.read_one_more()

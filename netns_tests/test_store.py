@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ TOPICS = {
     "/scan": "sensor_msgs/msg/LaserScan",
     "/camera/image": "sensor_msgs/msg/Image",
 }
-RIGHTS = {
+RIGHTS: dict[str, dict[str, Collection[Right]]] = {
     "robot": {**dict.fromkeys(TOPICS, (Right.PUBLISH,)), "store": [Right.CALL]},
     "holder": {"store": [Right.SERVE]},
     "investigator": {**dict.fromkeys(TOPICS, (Right.READ,)), "store": [Right.CALL]},

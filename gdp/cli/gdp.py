@@ -51,6 +51,7 @@ _KNOWN: Final = {
     "rule": _elsewhere("Add, remove and list rules of a proxy while it runs."),
     "service": _elsewhere("Call a service through the overlay, as a member."),
     "watch": _elsewhere("Print events when publishers, readers and servers of a name appear or go."),
+    "control": _own("topic_control:app", "Show, take or give the control of a topic that one publisher may steer."),
     "ping": _own("ping:ping", "Measure the round-trip time to the members that publish or serve a name."),
     "trace": _own("trace:trace", "Show each switch between here and those members, and the trees below."),
     "show": _own("show_tables:show_table", "Show a table of every node that runs on this machine, or of one."),

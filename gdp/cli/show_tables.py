@@ -35,10 +35,12 @@ class Table(str, Enum):
     TUNNELS = "tunnels"
     DROPS = "drops"
     PEERS = "peers"
+    CONTROL = "control"
 
 
 What = Annotated[
-    Table, typer.Argument(metavar="TABLE", help="neighbors, links, routes, trees, names, tunnels, drops or peers.")
+    Table,
+    typer.Argument(metavar="TABLE", help="neighbors, links, routes, trees, names, tunnels, drops, peers or control."),
 ]
 OneNode = Annotated[
     str | None,
@@ -58,7 +60,8 @@ def show_table(
 
     neighbors: the nodes at the other ends of our links. links: our devices. routes: the forwarding table of a switch.
     trees: its multicast trees. names: what is advertised. tunnels: its tunnels. drops: dropped frames by reason.
-    peers: other switches and RIBs; of a proxy, the writers and readers of its names.
+    peers: other switches and RIBs; of a proxy, the writers and readers of its names. control: of a proxy, the topics
+    under exclusive control, and their holders.
 
     On a terminal, names are short and lines end at its width. In a pipe and in a file everything is whole.
 

@@ -171,7 +171,7 @@ class Subscriptions:
         self._by_name: dict[Name, Subscription] = {}
         self._routes: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as in frame headers
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
-        self.drops: Counter[DropReason] = Counter()  # of closed writer proxies, and of advertisements
+        self.drops: Counter[DropReason] = Counter()  # of closed writer proxies, of advertisements, and by who reads
         self._past_losses: Counter[LossReason] = Counter()  # on names that are no longer read
 
     def __iter__(self) -> Iterator[Subscription]:

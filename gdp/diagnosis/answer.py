@@ -69,6 +69,7 @@ class Cause(Enum):
     KEYS_DIFFER = "keys-differ"
     QOS_IMPOSSIBLE = "qos-impossible"
     TOO_LARGE = "too-large"
+    NOT_IN_CONTROL = "not-in-control"
     RATE_LIMIT = "rate-limit"
     BIT_RATE_LIMIT = "bit-rate-limit"
     DEADLINE = "deadline"

@@ -128,6 +128,14 @@ def too_large(view: View) -> Iterator[Found]:
             yield f"Messages do not cross {end.place}: {end.flow.details.get('too-large', 'too large')}.", _CHECK
 
 
+def not_in_control(view: View) -> Iterator[Found]:
+    """Messages come, and none of the publisher that holds the control of the topic."""
+    for end in view.importers:
+        if end.flow.faults.get("not-in-control") and not end.flow.received:
+            text = f"Messages do not pass {end.place}: {end.flow.details.get('not-in-control', 'not in control')}."
+            yield text, f"gdp control show {shlex.quote(end.flow.local)}"
+
+
 def rate_limit(view: View) -> Iterator[Found]:
     """Most messages are left out for ``max_hz``."""
     for end in view.ends:
@@ -280,6 +288,7 @@ RULES: Final[dict[Cause, Rule]] = {
     Cause.KEYS_DIFFER: keys_differ,
     Cause.QOS_IMPOSSIBLE: qos_impossible,
     Cause.TOO_LARGE: too_large,
+    Cause.NOT_IN_CONTROL: not_in_control,
     Cause.RATE_LIMIT: rate_limit,
     Cause.BIT_RATE_LIMIT: bit_rate_limit,
     Cause.DEADLINE: deadline,

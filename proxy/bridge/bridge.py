@@ -26,6 +26,7 @@ from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -149,7 +150,7 @@ class Bridge:
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
         self._timed: dict[ExposedService | ImportedService, str] = {}  # to its local name
-        self._probed: dict[ExposedTopic, str] = {}  # whose depth is to be found, to its local name
+        self._timed_topics: dict[ExposedTopic | ImportedTopic, str] = {}  # to their local names
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
         self._flow_begun_s: dict[_Key, float] = {}
@@ -214,6 +215,11 @@ class Bridge:
         """Return the server whose response ended the latest call of a service; None: there was no response."""
         flow = self._inbound.get(name)
         return flow.answered_by if isinstance(flow, ImportedService) else None
+
+    def controlled(self, name: Name) -> tuple[ImportedTopic, ExclusiveControl] | None:
+        """Return the flow of a topic that is under exclusive control here, and its control, or None."""
+        flow = self._inbound.get(name)
+        return (flow, flow.control) if isinstance(flow, ImportedTopic) and flow.control is not None else None
 
     def publishers_of(self, name: Name) -> list[Name]:
         """Return the remote publishers of a topic that is read here, as far as they have introduced themselves."""
@@ -296,13 +302,13 @@ class Bridge:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
-        for probed, local in self._probed.items():
-            due_s = probed.get_timer()
+        for topic, local in self._timed_topics.items():
+            due_s = topic.get_timer()
             if due_s is not None and due_s <= now_s:
-                self._context.contain(local, b"", now_s, probed.handle_timer, now_s)
-        for topic in self._status_topics:
-            if topic.is_due(now_s):
-                topic.update(self.liveliness(now_s), now_s)
+                self._context.contain(local, b"", now_s, topic.handle_timer, now_s)
+        for status_topic in self._status_topics:
+            if status_topic.is_due(now_s):
+                status_topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + LOOK_S
             self._context.traffic.dropped = sum(dispatcher.endpoint.dropped for dispatcher in self._dispatchers)
@@ -318,7 +324,7 @@ class Bridge:
         if self._is_stale:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
-        times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._probed)]
+        times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._timed_topics)]
         if self._context.keeper is not None:
             times.append(self._context.keeper.get_timer())
         return earliest(*times, self._tick_at_s if has_ticks else None)
@@ -473,9 +479,9 @@ class Bridge:
         if isinstance(flow, ExposedTopic):
             flow.follow(view.ends(Role.PUBLISHES, flow_spec))
             if flow.qos.asks_depth:  # it may have a timer while its local publishers stay
-                self._probed[flow] = flow_spec.local
+                self._timed_topics[flow] = flow_spec.local
             else:
-                self._probed.pop(flow, None)
+                self._timed_topics.pop(flow, None)
         elif isinstance(flow, ImportedTopic):
             flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
         elif isinstance(flow, ExposedService):
@@ -509,6 +515,8 @@ class Bridge:
             self._inbound[flow_spec.name] = flow
         if isinstance(flow, ExposedService | ImportedService):
             self._timed[flow] = flow_spec.local
+        if isinstance(flow, ImportedTopic) and flow.control is not None:
+            self._timed_topics[flow] = flow_spec.local
         self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
@@ -555,8 +563,8 @@ class Bridge:
         del self._flow_begun_s[key]
         if isinstance(flow, ExposedService | ImportedService):
             del self._timed[flow]
-        if isinstance(flow, ExposedTopic):
-            self._probed.pop(flow, None)
+        if isinstance(flow, ExposedTopic | ImportedTopic):
+            self._timed_topics.pop(flow, None)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
         self._changes.append(FlowChange(flow_spec, is_begun=False))

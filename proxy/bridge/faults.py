@@ -38,6 +38,7 @@ class Fault(str, Enum):
     REFUSED = "refused"  # a service or the overlay refused
     NO_LIBRARY = "no-library"  # a reduction needs one that this machine lacks
     OTHER_BRIDGE = "other-bridge"  # another proxy of this graph carries it already
+    NOT_IN_CONTROL = "not-in-control"  # messages of a publisher that does not hold the control of its topic
     CLOCK = "clock"  # another machine's clock differs so much that transforms are extrapolated
     INTERNAL = "internal"  # a far party's input provoked an error of this program's own
     QUARANTINED = "quarantined"  # input of a party that did so repeatedly

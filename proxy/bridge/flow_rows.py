@@ -16,6 +16,7 @@ from gdp.state.topic_rows import Direction, TopicRow, held_row
 from gdp.telemetry.sources import TopicCounts
 from proxy.bridge.bridge import Flow
 from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
@@ -120,8 +121,21 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
     )
 
 
+def control_row(flow: ImportedTopic, control: ExclusiveControl, now_s: float) -> dict[str, object]:
+    """Return who holds the control of a topic."""
+    holder = control.holder
+    return {
+        "state": control.state(now_s).value,
+        "holder": "" if holder is None else flow.publishers.get(holder) or holder.short,
+        "peer": b"" if holder is None else holder,
+        "refused": control.refused,
+    }
+
+
 def flow_fields(spec: FlowSpec, flow: object) -> dict[str, object]:
-    """Return name, type and direction; of an imported service also its servers with their first answers.
+    """Return name, type and direction; of an imported service its servers with their first answers, too.
+
+    A topic under exclusive control has its ``holder``.
 
     A server that left keeps its answers and has ``is_there`` false.
     """
@@ -132,6 +146,8 @@ def flow_fields(spec: FlowSpec, flow: object) -> dict[str, object]:
         "kind": spec.rule.kind,
         "is_exposed": spec.is_exposed,
     }
+    if isinstance(flow, ImportedTopic) and flow.control is not None:
+        fields["holder"] = "" if flow.control.holder is None else short_id(flow.control.holder)
     if isinstance(flow, ImportedService):
         there = set(flow.servers)
         every = sorted(there | flow.first_answers.keys())[:_SERVERS_MAX]

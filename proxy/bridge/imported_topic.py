@@ -1,24 +1,29 @@
 """Imported topic: joined while a local node reads it, then decoded, converted and published here.
 
 I/O through endpoint and participant. The local publisher (``local_output``) exists as long as the rule does, so that
-local tools see the topic. The overlay's tree exists while a local reader does. A recording reads always.
+local tools see the topic. The overlay's tree exists while a local reader does. A recording reads always. Under
+exclusive control the messages of its holder pass, and its silence is answered here.
 """
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections import deque
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from typing import NamedTuple
 
 from gdp.client.participant import Message, Topic
-from gdp.errors import LocalError
+from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.extras import MissingExtraError
+from gdp.message.clock_offset import ClockEstimate
 from gdp.message.loss import Losses
+from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.core.reduction import MessageExpander, expander_of
 from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.bridge.decoder_cache import DecoderCache
@@ -55,9 +60,10 @@ class ImportedTopic:
         thinned: messages that the rule's rate left out.
         last_s: monotonic second of the newest message that arrived; None: there was none.
         is_joined: whether it is subscribed: a local node reads it.
+        control: who is heard; None: every publisher.
 
     Raises:
-        LocalError: this graph does not accept a publisher of it.
+        LocalError: this graph does not accept a publisher of it, or the rule's message of stop does not fit its type.
     """
 
     def __init__(
@@ -78,6 +84,16 @@ class ImportedTopic:
         self.stats = TopicStats(
             topic=flow_spec.local, type_name=flow_spec.type_name, latencies_ms=deque(maxlen=samples)
         )
+        self.control: ExclusiveControl | None = None
+        self._stop: Callable[[], bytes] | None = None  # returns the message of stop, once the type is known
+        if flow_spec.rule.control is not None and dispatcher.endpoint.is_live:
+            self.control = ExclusiveControl(flow_spec.rule.control.silence_s, secrets.randbits(32))
+            try:
+                known = dispatcher.endpoint.channel(flow_spec.local, flow_spec.type_name)
+            except LocalError:
+                known = None  # the far side's definition may serve
+            if known is not None:
+                self._prepare_stop(known)
         kind = MergedPublisher if dispatcher.endpoint.is_live else ChannelPublishers
         self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
         self._output: LocalOutput = kind(dispatcher, self, flow_spec)
@@ -120,16 +136,40 @@ class ImportedTopic:
         if isinstance(event, EndpointError):
             self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
+    @property
+    def publishers(self) -> dict[Name, str]:
+        """Return the labels of the publishers that have a route and the right to publish, by name."""
+        proxies = self._context.member.subscriptions.writer_proxies_of(self._topic.name)
+        return {
+            each.publisher: "" if each.advertisement is None else each.advertisement.member.label for each in proxies
+        }
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        return None if self.control is None else self.control.get_timer()
+
+    def handle_timer(self, now_s: float) -> None:
+        """Publish the message of stop when the holder of control is silent or gone."""
+        if self.control is None or not self.control.poll_stop(self.publishers, now_s) or self._stop is None:
+            return
+        try:
+            self._output.publish(0, self._stop(), Origin(time.time_ns(), 0))
+        except LocalError as error:
+            self._refuse(Fault.REFUSED, str(error))
+
     def parties(self, now_s: float) -> list[Party]:
         """Return the publishers that are known now."""
-        names = [each.publisher for each in self._context.member.subscriptions.writer_proxies_of(self._topic.name)]
+        names = list(self.publishers)
         self._heard_s = {name: self._heard_s[name] for name in names if name in self._heard_s}
         ago_s = {name: now_s - heard_s for name, heard_s in self._heard_s.items()}
-        return [Party("publisher", name.to_text(), ago_s.get(name)) for name in names]
+        control = {} if self.control is None else {name: name == self.control.holder for name in names}
+        return [Party("publisher", name.to_text(), ago_s.get(name), has_control=control.get(name)) for name in names]
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
-        del now_s
+        if self.control is not None:
+            self.control.give(None, now_s)
+            self.handle_timer(now_s)
         if self.is_joined:
             self._leave()
         self.count_losses()
@@ -183,18 +223,20 @@ class ImportedTopic:
         if channels is None or not self._output.is_open:
             self.stats.refused += 1
             return
+        ros_message = RosMessage.from_wire(delivered.message, delivered.head)
+        clock = self._context.clock_of(publisher, now_s)
+        if self.control is not None and not self._has_control(self.control, publisher, ros_message, clock, now_s):
+            return
         self.last_s = now_s
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             self.thinned += 1
             return
-        ros_message = RosMessage.from_wire(delivered.message, delivered.head)
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
         expander, incoming, headers, handle = channels[ros_message.channel]
         raw = incoming.decode(*expander.expand(ros_message))
-        clock = self._context.clock_of(publisher, now_s)
         ahead_ns = 0 if clock is None else round(1e9 * clock.offset_s)
         if headers is not None:
             by_ns = -ahead_ns if rule.stamps == "local" else 0
@@ -211,6 +253,39 @@ class ImportedTopic:
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.head) + len(delivered.message))
 
+    def _has_control(
+        self,
+        control: ExclusiveControl,
+        publisher: bytes,
+        message: RosMessage,
+        clock: ClockEstimate | None,
+        now_s: float,
+    ) -> bool:
+        """Return whether a message may steer: its publisher holds control, and sent it a short time ago."""
+        least_s = 0.0
+        if clock is not None:
+            least_s = (time.time_ns() - message.stamp_ns) / 1e9 + clock.offset_s - clock.bound_s
+        reason = control.refusal(publisher, message.stamp_ns, least_s, now_s)
+        if reason is None:
+            return True
+        self._context.member.subscriptions.drops[reason] += 1
+        if reason is DropReason.NOT_IN_CONTROL:
+            detail = f"{Name(publisher).short} publishes without the control of this topic"
+            self._context.faults.report(self._flow_spec.local, Fault.NOT_IN_CONTROL, detail)
+        return False
+
+    def _prepare_stop(self, channel: Channel) -> None:
+        """Find the form of the message of stop. Raises ``LocalError``: the rule's fields do not fit the type."""
+        from proxy.serial.rosbridge_json import RosbridgeCodec  # most topics are under no control
+
+        codec, settings = RosbridgeCodec(channel), self._flow_spec.rule.control
+        stop = {} if settings is None else settings.stop
+        try:
+            codec.to_raw(stop)
+        except RemoteError as error:
+            raise LocalError(f"control: stop does not fit {self._flow_spec.type_name}: {error.detail}") from error
+        self._stop = lambda: codec.to_raw(stop, time.time_ns())
+
     def _describe(self, publisher: bytes, description: TopicDescription) -> tuple[_Decoded, ...] | None:
         """Prepare the decoders of a publisher's channels; None if this graph cannot have them."""
         what, sources = self._flow_spec.local, description.channels
@@ -222,6 +297,8 @@ class ImportedTopic:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
             expanders = [expander_of(description, source, self._flow_spec.rule.max_bytes) for source in sources]
             rewriters = [self._rewriter(each.target) for each in incoming]
+            if self.control is not None and self._stop is None:
+                self._prepare_stop(incoming[0].target)
         except DefinitionError as error:
             self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None

@@ -26,12 +26,19 @@ class Party:
         node: its name, 64 hex digits.
         heard_ago_s: seconds since its last message; None: none came yet, or its role sends none.
         is_silent: it has stopped reporting, and may return.
+        has_control: whether it holds the control of a topic under exclusive control; None: another name.
     """
 
     role: PartyRole
     node: str
     heard_ago_s: float | None = None
     is_silent: bool = False
+    has_control: bool | None = None
+
+    @property
+    def control(self) -> dict[str, object]:
+        """Return the JSON field of control, for a topic under exclusive control."""
+        return {} if self.has_control is None else {"control": self.has_control}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class NameLiveliness:
                 "node": each.node,
                 "heard_ago_s": None if each.heard_ago_s is None else round(each.heard_ago_s, 3),
                 "silent": each.is_silent,
+                **each.control,
             }
             for each in self.parties[:PARTIES_MAX]
         ]
@@ -157,7 +165,9 @@ def _party(fields: Mapping[str, object]) -> Party:
     ago_s = fields.get("heard_ago_s")
     if role is None or (ago_s is not None and not isinstance(ago_s, int | float)):
         raise LocalError("the proxy reports liveliness in another form; restart it with this version")
-    return Party(role, str(fields.get("node")), ago_s, fields.get("silent") is True)
+    control = fields.get("control")
+    has_control = control if isinstance(control, bool) else None
+    return Party(role, str(fields.get("node")), ago_s, fields.get("silent") is True, has_control)
 
 
 def _event(change: Change, kind: str, name: str, role: PartyRole, node: str) -> LivelinessEvent:

@@ -70,7 +70,7 @@ class StatusTopic:
     def _fields(self, name: NameLiveliness) -> dict[str, object]:
         """Return the JSON form without times, which change with every message."""
         parties = [
-            {"role": each.role, "node": each.node, "silent": self._tracker.is_silent(name, each)}
+            {"role": each.role, "node": each.node, "silent": self._tracker.is_silent(name, each), **each.control}
             for each in sorted(name.parties, key=lambda each: (each.role, each.node))
         ]
         return {**name.to_fields(), "parties": parties}

@@ -48,6 +48,7 @@ from gdp.ros_names import (
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
+from proxy.config.control import SomeControl
 from proxy.config.frames import Frames
 from proxy.config.history import SomeHistory
 from proxy.config.keep import Keep
@@ -79,6 +80,7 @@ _OF_KINDS: Final = {  # keys that only the rules of these kinds have
         "readers",
         "frames",
         "stamps",
+        "control",
         *REDUCTIONS,
     ),
     "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
@@ -292,6 +294,7 @@ class Rule(Section):
     stamps: Literal["as-sent", "local"] = Field(
         default="as-sent", description="Imported topics: stamps of headers, by the sender's clock or by that of here."
     )
+    control: SomeControl = Field(default=None, description="Imported topics: one far publisher at a time is heard.")
     compress: SomeCompress = Field(default=None, description="Exposed topics: compressed bodies.")
     image: PictureFormat | None = Field(
         default=None, description="Exposed sensor_msgs/msg/Image: travels so; needs the extra `images`."

@@ -27,6 +27,7 @@ from proxy.bridge.core.topic_stats import percentile
 from proxy.config.config import ProxyConfig, Traces
 from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
+from proxy.node.control_answer import answer_control
 from proxy.node.node import ProxyNode, run_node
 from proxy.node.proxy_state import described
 from proxy.node.state_answer import answer_for_proxy
@@ -61,6 +62,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             state.ros_domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
             state.has_topic_names = settings.metrics is not None and settings.metrics.topic_names
             answer_for_proxy(state, bridge)
+            answer_control(state, bridge)
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
             for endpoint in endpoints:

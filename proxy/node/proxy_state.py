@@ -21,6 +21,7 @@ from gdp.nodes.node import common_handlers
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import now
 from gdp.sansio import Timestamps
+from gdp.state.diagnostic_control import Row
 from gdp.state.member_tables import participant_tables
 from gdp.state.node_state import MemberState
 from gdp.state.snapshot import member_snapshot
@@ -32,7 +33,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
-from proxy.bridge.flow_rows import flow_fields, flow_rows, topic_counts
+from proxy.bridge.flow_rows import control_row, flow_fields, flow_rows, topic_counts
 from proxy.serial.channel import Qos
 
 BEST_EFFORT_MAX: Final = 32  # topics in one status; each has less than 1 KiB
@@ -131,11 +132,22 @@ def proxy_handlers(state: ProxyState, sources: Sources) -> ControlHandlers:
         rows = () if bridge is None else flow_rows(bridge.flows, held, state.member)
         return rows_to_fields(rows, now().mono_s)
 
+    def control(now: Timestamps) -> list[Row]:
+        specs = (
+            []
+            if state.bridge is None
+            else [(spec, state.bridge.controlled(spec.name)) for spec, _ in state.bridge.flows]
+        )
+        rows = [
+            {"local": spec.local, **control_row(*each, now.mono_s), "name": spec.name} for spec, each in specs if each
+        ]
+        return sorted(rows, key=lambda row: str(row["local"]))
+
     return replace(
         common_handlers(
             state,
             sources,
-            participant_tables(state),
+            {**participant_tables(state), "control": control},
             lambda: _attachment(state) | _carried(state.bridge),
             lambda: member_snapshot(state.member, flows()),
         ),

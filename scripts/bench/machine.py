@@ -1,22 +1,14 @@
 """State of the machine that a bench ran on, and preconditions of a page: its data are there, it can be trusted.
 
-I/O. Reads /proc and queries devices, by the old one-word ethtool requests, because the ``ethtool`` command and its
-netlink family are often absent. Functions on devices apply to the namespace of the calling thread
-(``gdp.host.netns_files.inside`` enters another).
-Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
+I/O. Reads /proc.
 
     state = machine_state()                            call it first: it also takes the load before the bench
-    clear_offloads("s2")
 """
 
 from __future__ import annotations
 
-import ctypes
-import fcntl
 import os
 import platform
-import socket
-import struct
 import subprocess
 import tempfile
 import time
@@ -28,9 +20,7 @@ from typing import Final
 from gdp.crypto.keys import SigningKey
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-_SIOCETHTOOL: Final = 0x8946
 _LOOPS, _PAIRS = 10_000_000, 1_000
-_OFFLOADS: Final = (0x1F, 0x24, 0x2C, 0x17)  # to set tso, gso, gro, tx-checksum: segmentation needs checksums
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,18 +117,6 @@ def _processor() -> str:
         if key.strip() in ("model name", "Model"):
             return value.strip()
     return platform.machine()
-
-
-def clear_offloads(ifname: str) -> None:
-    """Switch segmentation, reception and checksum offloads off, so that a frame on the wire is a frame of a program.
-
-    Raises ``OSError``: no such device, or not allowed.
-    """
-    for command in _OFFLOADS:
-        request = ctypes.create_string_buffer(struct.pack("=II", command, 0), 8)
-        argument = struct.pack("16sP16x", ifname.encode(), ctypes.addressof(request))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-            fcntl.ioctl(asked, _SIOCETHTOOL, argument)
 
 
 def processor_s(pid: int) -> float:

@@ -23,7 +23,6 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
-from machine import clear_offloads
 from report import Rounds, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link.conditions import FRAME_BYTES, Conditions
@@ -35,6 +34,7 @@ from thin_link.traffic import CAMERA_BYTES, OWN_PACE, TOGETHER, streams, wire_by
 from gdp.host.run_registry import Run
 from gdp.trust.right import Right
 from lab.machines import BenchNodes, Lab
+from lab.namespaces import clear_offloads
 from lab.process import new_run
 from lab.topology import flat_topology
 

@@ -27,7 +27,7 @@ from bench_path import ROOT
 from gdp.host.run_registry import Run
 from lab.credentials import Carried, Side
 from lab.dds import ros_environment
-from lab.machines import BenchNodes, Lab
+from lab.machines import DELAY_LINE, BenchNodes, Lab
 from lab.process import LabProcess, UndoneOnExit
 from lab.topology import Topology, flat_topology
 
@@ -151,9 +151,9 @@ class Field(UndoneOnExit):
         self._lab = Lab(run, self._topology())
         with ExitStack() as undo:
             for machine, seconds in (delays or {}).items():
-                relay = ["-m", "internet.line", _GATE, machine, str(1e3 * seconds), "0"]
+                relay = [*DELAY_LINE, _GATE, machine, str(1e3 * seconds)]
                 line = undo.enter_context(self._lab.start(self._relays[machine], "relay", relay, has_orders=True))
-                line.read_line(READY_S)
+                line.answer("go").read_line(READY_S)
             self._nodes = undo.enter_context(BenchNodes(self._lab, (_NEAR, _GATE), plane="auto", ready_s=READY_S))
             self.data_plane = ", ".join(sorted(self._nodes.planes))
             argv = ["-m", "proxy.cli.proxy", "--config", self._admit(ROBOT, served)]

@@ -43,17 +43,12 @@ def open_sessions(
     to each other. ``uplinks``: of the robot; none: the usual one. ``lease_s``: of the sessions' names.
     """
     laboratory = robot.laboratory
-    overlay = Overlay(laboratory)
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
-    overlay.add_switch(border, is_border=True)
-    for host, own in ((robot, uplinks), (server, ())):
-        overlay.add_switch(host, borders=[border], uplinks=own, links={"direct": has_direct})
-    overlay.start(border)
-    overlay.start_rib(border)
-    overlay.start(robot, server)
-    nodes = [(host, overlay.add_node(host, given)) for host, given in zip((robot, server), rights, strict=True)]
-    return overlay, server, [stack.enter_context(overlay.open_session(*each, lease_s)) for each in nodes]
+    overlay = Overlay(laboratory, border, {"direct": has_direct})
+    overlay.stand_up(robot, server, options={robot.label: [f"--uplink={each}" for each in uplinks]})
+    overlay.grant(dict(zip((robot.label, server.label), rights, strict=True)))
+    return overlay, server, [stack.enter_context(overlay.open_session(host, lease_s)) for host in (robot, server)]
 
 
 class NumberedFlow:

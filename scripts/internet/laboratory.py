@@ -52,13 +52,13 @@ class Laboratory(ClosedOnExit):
         for each in self.sites.values():
             each.close()
 
-    def add_site(self, label: str, access: Access, *, delay_ms: float = 0.0, jitter_ms: float = 0.0) -> Site:
+    def add_site(self, label: str, access: Access, *, delay_ms: float = 0.0) -> Site:
         """Attach a site.
 
         ``label``: at most 10 letters, unique among sites and hosts. ``delay_ms``: of packets in each direction, whose
-        order stays, and up to ``jitter_ms`` more; a delay costs a process.
+        order stays; it costs a process.
         """
-        site = self.sites[label] = Site(self, label, access, delay_ms, jitter_ms)
+        site = self.sites[label] = Site(self, label, access, delay_ms)
         return site
 
     def add_host(self, label: str, site: Site, device: str = ETHERNET) -> Host:

@@ -64,32 +64,25 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     hosts = {side: [_add(laboratory, access, side) for access in chosen] for side in _SIDES}
     everyone = [*hosts["a"], *hosts["b"]]
-    overlay = Overlay(laboratory)
+    overlay = Overlay(laboratory, border)
     with ExitStack() as stack:
-        overlay.add_switch(border, is_border=True, has_relay=Access.UDP_BLOCKED in chosen)
-        for host in everyone:
-            is_blocked = host.site(host.devices[0]).access is Access.UDP_BLOCKED
-            overlay.add_switch(host, borders=[border], has_relay=is_blocked)
-        overlay.start(border)
-        overlay.start_rib(border)
-        overlay.start(*everyone)
+        overlay.stand_up(*everyone)
         begun_s = time.monotonic()
         services = {host.label: f"reach-{host.label}" for host in hosts["b"]}
         calls = {service: [Right.CALL] for service in services.values()}
-        rights = [*([calls] * len(chosen)), *({name: [Right.SERVE]} for name in services.values())]
-        nodes = [overlay.add_node(host, each) for host, each in zip(everyone, rights, strict=True)]
+        overlay.grant({host.label: calls for host in hosts["a"]})
+        overlay.grant({label: {name: [Right.SERVE]} for label, name in services.items()})
         with ThreadPoolExecutor(len(everyone)) as pool:
-            opened = pool.map(partial(overlay.open_session, lease_s=_LEASE_S), everyone, nodes)
+            opened = pool.map(partial(overlay.open_session, lease_s=_LEASE_S), everyone)
             sessions = [stack.enter_context(session) for session in opened]
             for session, host in zip(sessions[len(chosen) :], hosts["b"], strict=True):
                 session.serve(services[host.label], lambda request: request.payload)
         deadline_s = time.monotonic() + timeout_s
         reached = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, deadline_s)
         direct = _wait_for_direct(overlay, hosts, pairs, begun_s, deadline_s)
-        overlay.kill_border(border)
+        overlay.kill(border)
         outlived = _outlive(list(product(sessions[: len(chosen)], services.values())), direct)
         overlay.start(border)
-        overlay.start_rib(border)
         begun_s = time.monotonic()
         back = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, begun_s + timeout_s)
     return {pair: Outcome(reached[at], direct.get(at), at in outlived, back[at]) for at, pair in enumerate(pairs)}

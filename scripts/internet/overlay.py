@@ -1,158 +1,196 @@
-"""Overlay of a laboratory: a switch on each host, joined by tunnels to borders, and nodes that open sessions there.
+"""Overlay of a laboratory: a domain that one host creates and others join by tokens, with the commands of a person.
 
-I/O. The run's directory holds a folder for each node, with its keys, its configuration and its log. Tunnels need
-``/dev/net/tun`` and wireguard-go, or WireGuard in the kernel.
+I/O; creates keys, files and processes of one run. Commands and programs are those that a person or systemd starts on
+real machines. The ROS proxy of a machine without an environment of ROS is left out: sessions of this process take its
+place, with its keys. Tunnels need ``/dev/net/tun`` and wireguard-go, or WireGuard in the kernel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import yaml
+
 import gdp
 from gdp.control.endpoints import Endpoint
-from gdp.crypto.certificates import Role
-from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
-from gdp.stores.files import public, write_all
-from gdp.stores.issue import make_domain, make_node, make_owner
-from gdp.stores.keyring import ROOT_CERTIFICATE
-from gdp.trust.right import Right
+from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.member_setup import LISTEN_PORT
+from gdp.enrolment.programs import programs_of
+from gdp.errors import GdpError
+from gdp.stores.issue import make_owner
+from gdp.stores.keyring import CARD, load_card
 from internet.host import Host
 from internet.laboratory import Laboratory
-from lab.credentials import grant
+from lab.credentials import NameRights, grant
+from lab.process import until
 
-LISTEN: Final = 51_820
-_ATTACH_S: Final = 60.0
-_TLS_PORT: Final = 443
-_NODE: Final = "node"
-_RIB: Final = "rib"
-Yaml = Mapping[str, object]
+_DOMAIN: Final = "lab"
+_PATIENCE_S: Final = 60.0
+_SHOWN: Final = 40  # characters of a word
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A tunnel that is up: the machine at its far end, its device, whether it is direct, and where the peer is."""
+
+    peer: str
+    device: str
+    is_direct: bool
+    endpoint: str
 
 
 class Overlay:
-    """A domain, whose nodes run on the hosts of a laboratory. ``folder``: of all keys and configuration files."""
+    """A domain, and its machines with their programs.
 
-    def __init__(self, laboratory: Laboratory) -> None:
-        self.folder = laboratory.run.directory
-        self._domain, self._owner = self.folder / "domain", self.folder / "owner"
-        self._labels: dict[str, str] = {}  # of switches, by name
-        make_domain(self._domain, "field")
+    Args:
+        border: creates the domain; the others dial its public addresses.
+        links: more keys of ``links:`` of every switch.
+
+    Attributes:
+        machines: those that belong to the domain, by label.
+        typed: the commands that a person types, each after its machine.
+    """
+
+    def __init__(self, laboratory: Laboratory, border: Host, links: Mapping[str, object] | None = None) -> None:
+        self._folder = laboratory.run.directory
+        self._links = links or {}
+        self.border = border
+        self.machines: dict[str, Host] = {}
+        self.typed: list[str] = []
+        self._owner = self._folder / "owner"
         make_owner(self._owner)
 
-    def add_switch(
-        self,
-        host: Host,
-        *,
-        is_border: bool = False,
-        borders: Sequence[Host] = (),
-        has_relay: bool = False,
-        uplinks: Sequence[str] = (),
-        links: Yaml | None = None,
-    ) -> None:
-        """Make the keys and the configuration of a host's switch, which ``start`` starts.
+    def create_domain(self) -> str:
+        """Create the domain on the border; return the token for the first machine."""
+        lease = self.border.lease()
+        addresses = [each.partition("/")[0] for each in (lease.address, lease.address6)]
+        public = [f"--public={Endpoint(each, LISTEN_PORT).to_text()}" for each in addresses]
+        return self._command(self.border, "domain", "create", _DOMAIN, *public).strip()
 
-        Args:
-            is_border: others dial its public addresses.
-            borders: to which it opens a tunnel. Each gets a record of this switch.
-            has_relay: whether a relay runs next to it: the server of a border, or on standby towards the borders.
-            uplinks: devices with a tunnel each to every border; none: one tunnel, over the best route.
-            links: more keys of ``links:``.
+    def make_token(self) -> str:
+        """Return a token for one more machine."""
+        return self.type_at(self.border, "domain", "token", _DOMAIN).strip()
+
+    def type_at(self, host: Host, *words: str) -> str:
+        """Run a command of ``gdp`` about a machine on it; return its output."""
+        self._typed(host, words)
+        return host.gdp(*words, f"--directory={self.directory(host)}")
+
+    def join(self, host: Host, token: str, *options: str) -> None:
+        """Let a machine join by a token."""
+        self._command(host, "join", f"--label={host.label}", *options, answer=token)
+
+    def stand_up(self, *hosts: Host, options: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Create the domain, let hosts join at once, and start all programs.
+
+        ``options``: more words of ``gdp join``, by label.
         """
-        label = host.label
-        identity = self.switch_folder(label)
-        made = make_node(identity, Role.SWITCH, label, self._domain)
-        self._labels[made.name.to_text()] = label
-        peers = self.peers_folder(label)
-        peers.mkdir()
-        lease = host.lease(host.devices[0])
-        own = [Endpoint(address.partition("/")[0], LISTEN) for address in (lease.address, lease.address6) if address]
-        endpoints = own if is_border else []
-        record = own_record(made, max(len(uplinks), 1), public_candidates(endpoints))
-        write_all(self.folder / "records", {f"{label}{RECORD_SUFFIX}": public(record.wire)}, force=True)
-        for one, other in ((label, border.label) for border in borders):
-            self._copy_record(one, other)
-            self._copy_record(other, one)
-        tunnels = {
-            "listen": LISTEN,
-            "public": [each.to_text() for each in endpoints],
-            "peers": str(peers),
-            **({"uplinks": list(uplinks)} if uplinks else {}),
-            **(links or {}),
-        }
-        attach = [f"{_NODE}0", *([f"{_RIB}0"] if is_border else [])]
-        host.write(label, identity, attach=attach, links=tunnels, relay=has_relay)
-        if has_relay:
-            host.write(_relay(host), identity, **self._relay_ends(is_border=is_border, borders=borders))
+        first = self.create_domain()
+        self.start(self.border)
+        tokens = [first, *(self.make_token() for _ in hosts[1:])]
+        more = [(options or {}).get(host.label, ()) for host in hosts]
+        with ThreadPoolExecutor(len(hosts)) as pool:
+            list(pool.map(lambda host, token, words: self.join(host, token, *words), hosts, tokens, more))
+        self.start(*hosts)
+
+    def remove(self, label: str) -> None:
+        """Remove a machine from the domain."""
+        self.border.gdp("domain", "remove", _DOMAIN, label, f"--directory={self.directory(self.border)}")
 
     def start(self, *hosts: Host) -> None:
-        """Start the switches and relays of these hosts; return when all are ready.
+        """Start the programs of machines, as the last step of their commands does; return when each switch answers."""
+        for host in hosts:
+            for program in programs_of(MemberFiles.load(self.directory(host))):
+                if program.name != "proxy" or host.environment:
+                    host.launch(program.argv, host.label, heard=False)
+        for host in hosts:
+            until(partial(self._answers, host), partial(self._log_and, host.label, "a switch"), _PATIENCE_S)
 
-        Raises ``FailedError``: one does not start.
-        """
-        switches = [(each, each.launch_node("switch", each.label)) for each in hosts]
-        for host, switch in switches:
-            host.ready(switch)
-        with_relay = [each for each in hosts if (each.folder / f"{_relay(each)}.yaml").exists()]
-        relays = [(each, each.launch_node("relay", _relay(each))) for each in with_relay]
-        for host, relay in relays:
-            host.ready(relay)
+    def kill(self, host: Host) -> None:
+        """Kill all programs of a machine; ``start`` brings them back."""
+        for process in list(host.running):
+            host.kill(process)
 
-    def start_rib(self, host: Host) -> None:
-        """Start the domain's RIB on a border; return when it is ready."""
-        identity = self.folder / _RIB
-        if not identity.exists():
-            make_node(identity, Role.RIB, _RIB, self._domain)
-        host.write(_RIB, identity, iface=f"{_RIB}0")
-        host.start("rib", _RIB)
-
-    def kill_border(self, border: Host) -> None:
-        """Kill a border's switch, its RIB and its relay; ``start`` and ``start_rib`` bring them back."""
-        for process in list(border.running):
-            border.kill(process)
-
-    def add_node(self, host: Host, rights: Mapping[str, Collection[Right]]) -> Path:
-        """Make the keys of the host's node, with rights on names; return its directory."""
-        node = self.folder / f"{host.label}-{_NODE}"
-        make_node(node, Role.PROXY, node.name, self._domain)
-        grant(self._owner, node, rights)
-        return node
-
-    def open_session(self, host: Host, node: Path, lease_s: float | None = None) -> gdp.Session:
-        """Open a session of this process at the host's switch, which may still have to find a way to the RIB."""
-        root, iface = self._domain / ROOT_CERTIFICATE, f"{_NODE}0"
-        return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S, lease_s=lease_s))
-
-    def tunnels(self, host: Host) -> dict[str, dict[str, Any]]:
-        """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
-        return {self._labels[row["peer"]]: row for row in self.status(host)["links"]}
+    def wait_until_joined(self) -> None:
+        """Return when each machine has a tunnel to the border. Raises ``FailedError``: one has none in time."""
+        for label, host in self.machines.items():
+            until(partial(self.links, host), partial(self._log_and, label, "a tunnel"), _PATIENCE_S)
 
     def status(self, host: Host) -> dict[str, Any]:
-        """Return the status of a host's switch."""
-        return host.status(str(self.switch_folder(host.label)))
+        """Return the status of a machine's switch. Raises ``GdpError``: it does not answer."""
+        return host.status(str(self.directory(host) / "switch"))
 
-    def switch_folder(self, label: str) -> Path:
-        """Return the directory of a switch's keys."""
-        return self.folder / f"{label}-switch"
+    def tunnels(self, host: Host) -> dict[str, dict[str, Any]]:
+        """Return the status of the tunnels of a machine's switch, by the label of the peer."""
+        return {peer: row for peer, row in self._rows(host) if peer}
 
-    def peers_folder(self, label: str) -> Path:
-        """Return the folder with the endpoint records that a switch reads."""
-        return self.folder / f"{label}-peers"
+    def links(self, host: Host) -> list[Link]:
+        """Return the tunnels of a machine that are up; none while its switch starts."""
+        with suppress(GdpError):
+            return [
+                Link(peer, str(row["device"]), bool(row.get("direct")), str(row["endpoint"]))
+                for peer, row in self._rows(host)
+                if peer and row["up"]
+            ]
+        return []
 
-    def _relay_ends(self, *, is_border: bool, borders: Sequence[Host]) -> Yaml:
-        """Return the keys of a relay's configuration that say what it listens on, or what it dials."""
-        if is_border:
-            return {"server": {"port": _TLS_PORT}}
-        names = {peer: name for name, peer in self._labels.items()}
-        dialled = [(names[each.label], each.lease(each.devices[0]).address.partition("/")[0]) for each in borders]
-        ends = [{"peer": peer, "endpoints": [Endpoint(own, _TLS_PORT).to_text()]} for peer, own in dialled]
-        return {"borders": ends}
+    def grant(self, rights: Mapping[str, NameRights]) -> None:
+        """Let nodes of machines act on names: by label of the machine, then by name."""
+        for label, names in rights.items():
+            grant(self._owner, self.directory(self.machines[label]) / "proxy", names)
 
-    def _copy_record(self, whose: str, to: str) -> None:
-        name = f"{whose}{RECORD_SUFFIX}"
-        (self.peers_folder(to) / name).write_bytes((self.folder / "records" / name).read_bytes())
+    def open_session(self, host: Host, lease_s: float | None = None) -> gdp.Session:
+        """Open a session of this process on a machine; ``lease_s``: of its names."""
+        node = self.directory(host) / "proxy"
+        return host.space.inside(lambda: gdp.open(node, timeout_s=_PATIENCE_S, lease_s=lease_s))
 
+    def directory(self, host: Host) -> Path:
+        """Return the directory of a machine's keys and configuration."""
+        return self._folder / host.label
 
-def _relay(host: Host) -> str:
-    """Return the name of the configuration of a host's relay."""
-    return f"{host.label}-relay"
+    def extend(self, host: Host, program: str, **keys: object) -> None:
+        """Write more keys into the configuration of a machine's program; those of a section that is there extend it."""
+        file = self.directory(host) / f"{program}.yaml"
+        content = yaml.safe_load(file.read_text())
+        for key, value in keys.items():
+            held = content.get(key)
+            content[key] = {**held, **value} if isinstance(held, dict) and isinstance(value, Mapping) else value
+        file.write_text(yaml.safe_dump(content))
+
+    def _rows(self, host: Host) -> list[tuple[str, dict[str, Any]]]:
+        """Return the tunnels of a machine's switch, each with the label of its peer; empty: of no machine here."""
+        joined = list(self.machines.values())  # others may join meanwhile
+        names = {load_card(self.directory(each) / "switch" / CARD).name.to_text(): each.label for each in joined}
+        rows = self.status(host).get("links", [])
+        return [(names.get(row["peer"], ""), row) for row in rows]
+
+    def _answers(self, host: Host) -> bool:
+        with suppress(GdpError):
+            return bool(self.status(host))
+        return False
+
+    def _log_and(self, label: str, what: str) -> str:
+        log = (self._folder / f"{label}.log").read_text(encoding="utf-8", errors="replace")
+        return f"{log[-2_000:]}\n{what} at {label}"
+
+    def _command(self, host: Host, *words: str, answer: str = "") -> str:
+        """Execute a command that makes a machine, without its last step; return its output.
+
+        ``answer``: what the command gets when it asks.
+        """
+        self._typed(host, words)
+        said = host.gdp(*words, f"--directory={self.directory(host)}", "--no-start", answer=answer)
+        if self._links:
+            self.extend(host, "switch", links=self._links)
+        self.machines[host.label] = host
+        return said
+
+    def _typed(self, host: Host, words: Sequence[str]) -> None:
+        shown = " ".join(word if len(word) < _SHOWN else f"{word[: _SHOWN - 3]}..." for word in words)
+        self.typed.append(f"{host.label}: gdp {shown}")

@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final
 
 from internet.access import FLUSH_MAPPINGS, LAN, TRAITS, WAN, Access, router_rules
-from lab.namespaces import IpNamespace
+from lab.machines import DELAY_LINE
+from lab.namespaces import IpNamespace, clear_offloads
 from lab.process import LabProcess
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Site:
     ``access``: its kind. ``routers``: from its hosts outwards.
     """
 
-    def __init__(self, laboratory: Laboratory, label: str, access: Access, delay_ms: float, jitter_ms: float) -> None:
+    def __init__(self, laboratory: Laboratory, label: str, access: Access, delay_ms: float) -> None:
         self.label, self.access = label, access
         self._laboratory = laboratory
         self._core = laboratory.core
@@ -85,7 +86,7 @@ class Site:
                 [f"link add {port} index {laboratory.next_index()} type veth peer {WAN} netns {home.path}"]
             )
             carrier.configure([f"link set {port} master {LAN} up"])
-        self._join_core(delay_ms, jitter_ms)
+        self._join_core(delay_ms)
         self._configure()
 
     @property
@@ -181,7 +182,7 @@ class Site:
     def _next_mac(self) -> str:
         return (_MAC + self._laboratory.next_index().to_bytes(2, "big")).hex(":")
 
-    def _join_core(self, delay_ms: float, jitter_ms: float) -> None:
+    def _join_core(self, delay_ms: float) -> None:
         number, outer = self._laboratory.next_index(), self._outer
         core_end, router_end = f"index {number} address {self._core_mac}", f"address {self._wan_mac} netns {outer.path}"
         if not delay_ms:
@@ -195,9 +196,11 @@ class Site:
         for device in ("core", "site"):
             line.set(f"ipv6/conf/{device}/disable_ipv6", 1)
         line.configure(["link set core up", "link set site up"])
-        argv = line.command([sys.executable, "-m", "internet.line", "core", "site", str(delay_ms), str(jitter_ms)])
+        self._core.inside(partial(clear_offloads, self.uplink))
+        outer.inside(partial(clear_offloads, WAN))
+        argv = line.command([sys.executable, *DELAY_LINE, "core", "site", str(delay_ms)])
         self._line = LabProcess(self._laboratory.run, f"line {self.label}", argv, has_orders=True)
-        self._line.read_until("ready")
+        self._line.answer("go").read_until("ready")
 
     def _configure(self) -> None:
         """Set all links up, and addresses, routes and rules; harmless where they are so."""

@@ -16,8 +16,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
-import yaml
-
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from internet.access import Access
@@ -64,8 +62,7 @@ class _Stage(Stage):
     def admit(self, host: Host, token: str) -> None:
         """Let a machine join, and write its ROS into its proxy.yaml."""
         self.join(host, token)
-        file = self._directory(host) / "proxy.yaml"
-        file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "ros": self.graphs[host.label].to_yaml()}))
+        self.extend(host, "proxy", ros=self.graphs[host.label].to_yaml())
 
     def share(self, verb: str, flow: _Flow) -> None:
         """Expose or import a topic, each on its own side."""
@@ -74,8 +71,7 @@ class _Stage(Stage):
 
     def drawing(self, when: str) -> list[str]:
         """Return the figure as text, with the path of now."""
-        drone = self.machines[self.drone.label]
-        peers = {each.peer: each for each in self.links(drone)}
+        peers = {each.peer: each for each in self.links(self.drone)}
         found = peers.get(self.cloud.label) or peers.get(self.cloud_b.label)
         path = "no tunnel" if found is None else "direct" if found.is_direct else f"through {found.peer}"
         lines = [f"{when} the flight: the path is {path}"]
@@ -83,7 +79,9 @@ class _Stage(Stage):
             graph, site = self.graphs[host.label], host.site()
             nat = f"NAT of the {site.label} network, {site.address}"
             lines.append(f"  {host.label:7} ROS {graph.ros}  {host.lease().address:15} -- {nat:44} {side}")
-        topics: Any = ask_node(find_control_socket(drone.directory / "proxy"), Command.TOPICS, _PATIENCE_S).result
+        topics: Any = ask_node(
+            find_control_socket(self.directory(self.drone) / "proxy"), Command.TOPICS, _PATIENCE_S
+        ).result
         return [*lines, *(f"  {each['topic']:9} is {each['name']}" for each in topics["topics"])]
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Final
@@ -18,8 +17,10 @@ from rich.text import Text
 
 from gdp.trust.right import Right
 from internet.access import Access
+from internet.host import Host
 from internet.laboratory import Laboratory
-from internet_demo.stage import WIFI, WWAN, Link, Machine, Stage
+from internet.overlay import Link
+from internet_demo.stage import WIFI, WWAN, Stage
 from internet_demo.traffic import CAMERA, PLAN, Traffic
 from lab.command import StepDisplay
 
@@ -33,7 +34,7 @@ class Display(StepDisplay):
     def __init__(self, console: Console) -> None:
         super().__init__(console, is_kept=False, plain_every_s=_PLAIN_EVERY_S)
 
-    def show(self, machines: Iterable[Machine], links: Mapping[str, Sequence[Link]], traffic: Traffic) -> None:
+    def show(self, machines: Iterable[Host], links: Mapping[str, Sequence[Link]], traffic: Traffic) -> None:
         """Show the present state; plain lines appear every few seconds."""
         counts = _counts(traffic)
         self._show(_page(machines, links, counts), Text(f"{counts}; {_ways(links.get('robot', ()))}"))
@@ -51,15 +52,15 @@ def _ways(tunnels: Sequence[Link]) -> str:
     return "; ".join(f"{way} {', '.join(found)}" for way, found in peers.items() if found) or "no tunnel"
 
 
-def _page(machines: Iterable[Machine], links: Mapping[str, Sequence[Link]], counts: str) -> RenderableType:
+def _page(machines: Iterable[Host], links: Mapping[str, Sequence[Link]], counts: str) -> RenderableType:
     table = Table("machine", "device", "network", "address", "public address", "tunnels")
     for machine in machines:
         tunnels = "\n".join(
             f"{each.peer} {'direct' if each.is_direct else 'border'} {each.endpoint}"
             for each in links.get(machine.label, ())
         )
-        for number, device in enumerate(machine.host.devices):
-            site, lease = machine.host.site(device), machine.host.lease(device)
+        for number, device in enumerate(machine.devices):
+            site, lease = machine.site(device), machine.lease(device)
             address = (lease.address or lease.address6).partition("/")[0]
             first = machine.label if number == 0 else ""
             public = site.address or address
@@ -113,7 +114,8 @@ def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcom
     stage = Stage(laboratory, pace.delay_ms)
     with ExitStack() as stack:
         begun_s = time.monotonic()
-        _join_all(stage)
+        hosts = (stage.robot, stage.cloud_a, stage.edge)
+        stage.stand_up(*hosts, options={"robot": (f"--uplink={WIFI}", f"--uplink={WWAN}")})
         outcome.typed = stage.typed
         for command in stage.typed:
             display.step(f"typed at {command}")
@@ -145,20 +147,6 @@ def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcom
         outcome.doubled = traffic.images.doubled
         outcome.reasons = list(traffic.calls.reasons)
     return outcome
-
-
-def _join_all(stage: Stage) -> None:
-    """Create the domain; let the other machines join at once."""
-    first = stage.create_domain()
-    stage.start(stage.cloud_b)
-    tokens = [first, stage.make_token(), stage.make_token()]
-    hosts = (stage.robot, stage.cloud_a, stage.edge)
-    options = ((f"--uplink={WIFI}", f"--uplink={WWAN}"), (), ())
-    with ThreadPoolExecutor(len(hosts)) as pool:
-        joining = [pool.submit(stage.join, *each[:2], *each[2]) for each in zip(hosts, tokens, options, strict=True)]
-        for each in joining:
-            each.result()
-    stage.start(*hosts)
 
 
 def _events(stage: Stage) -> list[tuple[str, Callable[[], None]]]:

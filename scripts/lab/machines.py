@@ -28,6 +28,7 @@ from lab.topology import Attachment, Topology
 _SIZE_BYTES: Final = 256 << 20  # a limit, not a reservation
 _ENTER: Final = 'mount --bind "$0" /dev/shm && exec "$@"'
 _BENCH: Final = ROOT / "scripts" / "bench"
+DELAY_LINE: Final = ("-m", "fog.providers.local.delay")  # a program that waits for a line; then two devices, and ms
 _END_S: Final = 3.0
 
 T = TypeVar("T")

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import select
+import socket
+import struct
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -41,6 +44,8 @@ _SETTINGS: Final = {  # no address waits for duplicate detection, and none is lo
 _FORWARDING: Final = {"ipv4/ip_forward": 1, "ipv6/conf/all/forwarding": 1}
 _NO_BRIDGE_RULES: Final = {"bridge/bridge-nf-call-iptables": 0, "bridge/bridge-nf-call-ip6tables": 0}
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
+_SIOCETHTOOL: Final = 0x8946
+_OFFLOADS: Final = (0x1F, 0x24, 0x2C, 0x17)  # to set tso, gso, gro, tx-checksum: segmentation needs checksums
 
 T = TypeVar("T")
 _SpaceT = TypeVar("_SpaceT", bound="Space")
@@ -292,3 +297,17 @@ def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
     with IPRoute() as here:
         links = {link.get("ifname"): link.get("address") for link in here.get_links()}
     return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
+
+
+def clear_offloads(ifname: str) -> None:
+    """Switch segmentation, reception and checksum offloads off, so that a frame on the wire is a frame of a program.
+
+    It applies to the namespace of the calling thread, by the old one-word requests: the command ``ethtool`` and its
+    netlink family are often absent. Raises ``OSError``: no such device, or not allowed.
+    Source: ``linux/ethtool.h``, ``linux/sockios.h``, netdevice(7).
+    """
+    for command in _OFFLOADS:
+        request = ctypes.create_string_buffer(struct.pack("=II", command, 0), 8)
+        argument = struct.pack("16sP16x", ifname.encode(), ctypes.addressof(request))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+            fcntl.ioctl(asked, _SIOCETHTOOL, argument)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Final
 
 from gdp.ports.readiness import readable
@@ -39,9 +39,10 @@ class Supervisor:
 
     def __init__(self) -> None:
         self.meanwhile: Callable[[], float] = lambda: math.inf
+        self._said: dict[LabProcess, dict[str, Event]] = {}  # the newest event of each name
+        self._notes: dict[LabProcess, Note] = {}
         self._starting: dict[LabProcess, tuple[float, Callable[[Event], object]]] = {}
         self._required: dict[LabProcess, int] = {}  # with a descriptor that is readable at its end
-        self._events: list[tuple[LabProcess, Event]] = []  # that came, and nothing has asked for
 
     def require(self, *processes: LabProcess) -> None:
         """Expect these processes not to end."""
@@ -53,52 +54,48 @@ class Supervisor:
 
     def expect(self, process: LabProcess, then: Callable[[Event], object]) -> None:
         """Require a process as soon as it says ``ready``, and call ``then`` with that event."""
+        self._said[process] = {}
         self._starting[process] = time.monotonic() + READY_S, then
 
     def ready(self, *processes: LabProcess) -> None:
         """Return when each has said ``ready``; from then on they are required."""
         for each in processes:
             self.expect(each, lambda _: None)
-        self.follow((), lambda: self._starting.keys().isdisjoint(processes))
+        self.follow(lambda: self._starting.keys().isdisjoint(processes))
 
-    def is_over(self, process: LabProcess) -> bool:
-        """Return whether a process prints nothing more, and no event of it is kept."""
-        return process.is_silent and all(each is not process for each, _ in self._events)
+    def hear(self, process: LabProcess, note: Note) -> None:
+        """Give the events of a process to ``note`` as they come, and at once the newest of each name so far."""
+        self._notes[process] = note
+        for event in list(self._said.setdefault(process, {}).values()):
+            note(process, event)
 
     def wait_for(self, process: LabProcess, name: str, patience_s: float) -> Event:
-        """Return the next event of this name of a process; others on the way are skipped."""
-        found: list[Event] = []
-
-        def note(_: LabProcess, event: Event) -> None:
-            """Keep the event that is waited for."""
-            found.extend([event] if event["event"] == name else [])
-
-        if not self.follow([process], lambda: bool(found) or self.is_over(process), note, patience_s):
+        """Return the newest event of this name of a process, when it has said one."""
+        said = self._said.setdefault(process, {})
+        if not self.follow(lambda: name in said or process.is_silent, patience_s):
             raise failed(process, f"did not say {name!r} within {patience_s:g} s")
-        if not found:
+        if name not in said:
             raise failed(process, f"ended with code {exit_code(process, patience_s)} before it said {name!r}")
-        return found[0]
+        return said[name]
 
-    def follow(
-        self,
-        sources: Collection[LabProcess],
-        is_over: Callable[[], bool],
-        note: Note = lambda *_: None,
-        patience_s: float = math.inf,
-    ) -> bool:
-        """Give the events of these processes to ``note`` until ``is_over``; return whether that came true in time."""
+    def said(self, process: LabProcess, name: str) -> Event | None:
+        """Return the newest event of this name of a process, if it has said one."""
+        return self._said[process].get(name)
+
+    def follow(self, is_over: Callable[[], bool], patience_s: float = math.inf) -> bool:
+        """Take the events of all processes until ``is_over``; return whether that came true in time."""
         end_s = time.monotonic() + patience_s
-        while True:
-            self._hand_out(sources, is_over, note)
-            if is_over():
-                return True
+        while not is_over():
             wait_s = min(end_s - time.monotonic(), self._check(), self.meanwhile())
             if time.monotonic() >= end_s or is_over():
                 return is_over()
-            heard = [each for each in {*sources, *self._starting} if not each.is_silent]
-            descriptors = [*(each.fileno() for each in heard), *self._required.values()]
+            speaking = [each for each in self._said if not each.is_silent]
+            descriptors = [*(each.fileno() for each in speaking), *self._required.values()]
             readable(descriptors, max(wait_s, 0.0) if wait_s < math.inf else None)
-            self._events += [(each, event) for each in heard for event in each.take_events()]
+            for process in speaking:
+                for event in process.take_events():
+                    self._take(process, event)
+        return True
 
     def _check(self) -> float:
         """Return the seconds until a starting process is late; raises as the class says."""
@@ -106,23 +103,17 @@ class Supervisor:
             if process.code is not None:
                 raise failed(process, f"ended with code {process.code}")
         for process, (end_s, _) in self._starting.items():
-            if self.is_over(process):
+            if process.is_silent:
                 raise failed(process, f"ended with code {exit_code(process, READY_S)} before it said 'ready'")
             if time.monotonic() >= end_s:
                 raise failed(process, f"did not say 'ready' within {READY_S:g} s")
         return min((end_s for end_s, _ in self._starting.values()), default=math.inf) - time.monotonic()
 
-    def _hand_out(self, sources: Collection[LabProcess], is_over: Callable[[], bool], note: Note) -> None:
-        """Hand out the events that came, until it is over; those of other processes are kept."""
-        kept = []
-        while self._events and not is_over():
-            process, event = self._events.pop(0)
-            if process in self._starting and event["event"] == "ready":
-                _, then = self._starting.pop(process)
-                self.require(process)
-                then(event)
-            elif process in sources:
-                note(process, event)
-            else:
-                kept.append((process, event))
-        self._events[:0] = kept
+    def _take(self, process: LabProcess, event: Event) -> None:
+        self._said[process][event["event"]] = event
+        if process in self._starting and event["event"] == "ready":
+            _, then = self._starting.pop(process)
+            self.require(process)
+            then(event)
+        if process in self._notes:
+            self._notes[process](process, event)

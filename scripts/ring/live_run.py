@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib.util
 import signal
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +16,7 @@ from gdp.host.run_registry import Run
 from lab.credentials import Side
 from lab.dds import UDP_PROFILE
 from lab.process import Event, LabProcess
-from lab.supervisor import Supervisor, failed
+from lab.supervisor import Supervisor
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.live_plan import MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
@@ -61,7 +62,8 @@ class LiveSession:
         self.silence = Silence()
         self._latency_ms: float | None = None
         self._has_moved = False
-        self._done: dict[LabProcess, Event] = {}
+        for node in (*live_nodes.talkers, live_nodes.listener, live_nodes.caller):
+            supervisor.hear(node, self._note)
 
     def meet(self) -> None:
         """Wait until the remote side receives every topic and discovers the service."""
@@ -70,48 +72,32 @@ class LiveSession:
 
     def talk(self, seconds: float) -> Heard:
         """Run the traffic for this long, wait for messages under way, and return each node's report."""
-        nodes = self._live_nodes
-        talkers, near, far = tuple(nodes.talkers), (*nodes.talkers, nodes.caller), (nodes.lamp, nodes.listener)
+        nodes, done = self._live_nodes, partial(self._supervisor.wait_for, name="done")
         self._reporter.begin_traffic(nodes.messages + nodes.calls)
         try:
-            for node in near:
+            for node in (*nodes.talkers, nodes.caller):
                 node.send(signal.SIGUSR1)
-            self._await_reports(near, seconds + ENDING_S)
-            self._answered = self._done[nodes.caller]["answered"]
+            said = [done(node, patience_s=seconds + ENDING_S) for node in nodes.talkers]
+            called = done(nodes.caller, patience_s=ENDING_S)
+            self._answered = called["answered"]
             self._await_quiet()
-            for node in far:
+            for node in (nodes.lamp, nodes.listener):
                 node.send(signal.SIGINT)
-            self._await_reports(far, ENDING_S)
+            served, heard = (done(node, patience_s=ENDING_S) for node in (nodes.lamp, nodes.listener))
         finally:
             self._reporter.close()
-        said = self._done
-        return Heard(tuple(said[each] for each in talkers), said[nodes.lamp], said[nodes.listener], said[nodes.caller])
-
-    def _await_reports(self, nodes: Collection[LabProcess], patience_s: float) -> None:
-        """Follow all nodes until these have reported."""
-        if not self._follow(lambda: self._done.keys() >= set(nodes), patience_s):
-            missing = next(each for each in nodes if each not in self._done)
-            raise failed(missing, f"did not report within {patience_s:g} s")
+        return Heard(tuple(said), served, heard, called)
 
     def _await_quiet(self) -> None:
         """Wait until everything arrived, or nothing arrived for a while."""
         while sum(self._received.values()) < self._live_nodes.messages:
             self._has_moved = False
-            if not self._follow(lambda: self._has_moved, QUIET_S):
+            if not self._supervisor.follow(lambda: self._has_moved, QUIET_S):
                 return
 
-    def _follow(self, is_over: Callable[[], bool], patience_s: float) -> bool:
-        nodes = self._live_nodes
-        every = (*nodes.talkers, nodes.lamp, nodes.listener, nodes.caller)
-        return self._supervisor.follow(every, is_over, self._take, patience_s)
-
-    def _take(self, node: LabProcess, event: Event) -> None:
-        if event["event"] == "done":
-            self._done[node] = event
-        elif event["event"] == "progress":
-            self._note(node, event)
-
     def _note(self, child: LabProcess, event: Event) -> None:
+        if event["event"] != "progress":
+            return
         now_s, silence = time.monotonic(), self.silence
         if child is self._live_nodes.listener:
             received = {each["topic"]: each["received"] for each in event["topics"]}

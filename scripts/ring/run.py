@@ -49,26 +49,31 @@ class Replay:
         self._silence = Silence()
         self._unconfirmed = ""  # names of topics
         self._has_moved = False
-        self._done: dict[LabProcess, Event] = {}
         self.topics: tuple[Event, ...] = ()
+        for each in (sender, receiver):
+            supervisor.hear(each, self._follow)
 
     def report(self, injection: Injection) -> Result:
         """Follow the traffic to its end, while faults are injected; return what both sides report, without topics."""
         self._reporter.begin_traffic(self._traffic.total)
         begun_s = time.monotonic()
         try:
-            while not self._supervisor.is_over(self._sender):
+            while not self._sender.is_silent:
                 self._has_moved = False
-                self._follow_unless_stalled()
+                if not self._supervisor.follow(lambda: self._has_moved or self._sender.is_silent, STALL_S):
+                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
             traffic_s = time.monotonic() - begun_s
             sender_code = exit_code(self._sender, ENDING_S)
-            if self._sender not in self._done:
+            sent = self._supervisor.said(self._sender, "done")
+            if sent is None:
                 raise failed(self._sender, f"ended with code {sender_code} in the middle")
-            receiver_code = self._finish()
+            self._supervisor.release(self._receiver)
+            self._receiver.send(signal.SIGINT)
+            received = self._supervisor.wait_for(self._receiver, "done", ENDING_S)
+            receiver_code = exit_code(self._receiver, ENDING_S)
         finally:
             complaints = injection.stop()
             self._reporter.close()
-        sent, received = self._done[self._sender], self._done[self._receiver]
         complaints += [_not_confirmed(topic) for topic in sent["unconfirmed"]]
         complaints += [f"the sender ended with code {sender_code}"] if sender_code else []
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
@@ -77,34 +82,9 @@ class Replay:
         longest_s = self._silence.longest_s
         return Result((), {}, unread=unread, complaints=tuple(complaints), traffic_s=traffic_s, silent_s=longest_s)
 
-    def _follow_unless_stalled(self) -> None:
-        """Follow both ends until traffic moves, or the sender ends. Raises ``FailedError``: neither, for a while."""
-        both = (self._sender, self._receiver)
-        if not self._supervisor.follow(both, self._moves_or_ends, self._take, STALL_S):
-            raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
-
-    def _moves_or_ends(self) -> bool:
-        return self._has_moved or self._supervisor.is_over(self._sender)
-
-    def _finish(self) -> int:
-        """Request the receiver to close its recording; return its exit code."""
-        receiver = self._receiver
-        self._supervisor.release(receiver)
-        receiver.send(signal.SIGINT)
-        if not self._supervisor.follow([receiver], lambda: self._supervisor.is_over(receiver), self._take, ENDING_S):
-            raise failed(receiver, f"did not finish within {ENDING_S:g} s")
-        code = exit_code(receiver, ENDING_S)
-        if receiver not in self._done:
-            raise failed(receiver, f"ended with code {code} without a report")
-        return code
-
-    def _take(self, process: LabProcess, event: Event) -> None:
-        if event["event"] == "done":
-            self._done[process] = event
-        elif event["event"] == "progress":
-            self._follow(event)
-
-    def _follow(self, event: Event) -> None:
+    def _follow(self, _: LabProcess, event: Event) -> None:
+        if event["event"] != "progress":
+            return
         before, now_s = self._traffic, time.monotonic()
         if "sent" in event:
             self._silence.sent(_ALL, event["sent"], now_s)

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
+from internet.overlay import Link
 from internet_demo import scenario as display
-from internet_demo.stage import Link
 
 
 def test_a_line_of_progress_of_the_usual_counts_fits_100_columns(

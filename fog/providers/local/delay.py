@@ -95,7 +95,7 @@ def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
         for side, frame in line.poll_frames(time.time_ns()):
             try:
                 sides[side].send(frame)
-            except BlockingIOError:
+            except OSError:  # its queue is full, or the other end of its pair is down
                 line.dropped += 1
 
 

@@ -77,7 +77,7 @@ class Link:
 
 @dataclass(slots=True, kw_only=True)
 class NameEntry:
-    """One name: who uses it, and its trees as (publisher, path, switch, from, to)."""
+    """One name: who uses it, its trees as (publisher, path, switch, from, to), and who controls it at a reader."""
 
     id: str
     label: str = ""
@@ -87,6 +87,7 @@ class NameEntry:
     readers: set[str] = field(default_factory=set)
     servers: set[str] = field(default_factory=set)
     clients: set[str] = field(default_factory=set)
+    holders: set[str] = field(default_factory=set)
     trees: list[tuple[str, int, str, str, tuple[str, ...]]] = field(default_factory=list)
     sent: float = 0.0
     received: float = 0.0
@@ -215,6 +216,8 @@ def _add_flows(graph: Graph, reading: Reading) -> None:
         entry = graph.name(text_of(each, "name"))
         entry.label = entry.label or text_of(each, "local")
         entry.type, entry.kind = text_of(each, "type"), text_of(each, "kind") or entry.kind
+        if holder := text_of(each, "holder"):
+            entry.holders.add(holder)
         for server in items_of(each, "servers"):
             there, first = flag_of(server, "is_there"), number_of(server, "first")
             graph.replicas.append(ServerSeen(entry.id, reading.id, text_of(server, "id"), there, first))

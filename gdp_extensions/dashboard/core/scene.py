@@ -218,6 +218,11 @@ class Scene:
         for name, server in known - servers:
             text = f"{_node_text(before, server)} no longer serves {_name_text(before, name)}"
             self._tell("replica", text, about=name, is_bad=True)
+        held, was_held = (
+            {(each.id, at) for each in one.names.values() for at in each.holders} for one in (graph, before)
+        )
+        for name, holder in sorted(held - was_held):
+            self._tell("control", f"{_node_text(graph, holder)} controls {_name_text(graph, name)}", about=name)
         for node_id, node in graph.nodes.items():
             then = before.nodes[node_id].waiting if node_id in before.nodes else ()
             for reason in set(node.waiting) - set(then):
@@ -261,7 +266,7 @@ def _structure_of(graph: Graph) -> dict[str, object]:
 
 
 def _name_row(entry: NameEntry, index: Mapping[str, int]) -> list[object]:
-    ends = (entry.publishers, entry.readers, entry.servers, entry.clients)
+    ends = (entry.publishers, entry.readers, entry.servers, entry.clients, *([entry.holders] if entry.holders else ()))
     return [
         entry.id, entry.label, entry.kind, entry.type,
         *(sorted(index[each] for each in end if each in index) for end in ends),

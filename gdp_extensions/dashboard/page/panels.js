@@ -113,6 +113,7 @@ export class Panels {
     if (name.readers.includes(at)) words.push("reads");
     if (name.servers.includes(at)) words.push("serves");
     if (name.clients.includes(at)) words.push("calls");
+    if (name.holders.includes(at)) words.push("controls");
     return words.join(", ");
   }
 
@@ -120,7 +121,7 @@ export class Panels {
     const { store } = this;
     const name = store.name(store.selected.id);
     if (!name) return [element("h2", {}, "Name"), element("p", {}, "It is no longer used.")];
-    const rows = [["publishers", "publishes"], ["readers", "reads"], ["servers", "serves"], ["clients", "calls"]].flatMap(([key, verb]) =>
+    const rows = [["publishers", "publishes"], ["readers", "reads"], ["servers", "serves"], ["clients", "calls"], ["holders", "controls"]].flatMap(([key, verb]) =>
       name[key].slice(0, ENDS_MAX).map((at) => [this.to("node", store.nodes[at].id, store.nodes[at].label), verb]));
     const hops = store.trees.id === name.id ? alongTree(store.trees.rows) : [];
     const parts = [

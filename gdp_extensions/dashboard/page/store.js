@@ -33,8 +33,8 @@ export class Store {
     this.links = message.links.map(([a, b, cost, mtu, ports]) => ({
       a, b, cost, mtu, ports, id: `${this.nodes[a].id} ${this.nodes[b].id}`, ab: 0, ba: 0, rtt: null, loss: 0,
     }));
-    this.names = message.names.map(([id, label, kind, type, publishers, readers, servers, clients]) => ({
-      id, kind, type, publishers, readers, servers, clients, rate: 0, lost: 0, label: label || `${id.slice(0, 6)}…`,
+    this.names = message.names.map(([id, label, kind, type, publishers, readers, servers, clients, holders = []]) => ({
+      id, kind, type, publishers, readers, servers, clients, holders, rate: 0, lost: 0, label: label || `${id.slice(0, 6)}…`,
     }));
     this.clusters = message.clusters;
     this.nodeAt = new Map(this.nodes.map((each, at) => [each.id, at]));

@@ -14,7 +14,6 @@ import struct
 import sys
 import time
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,11 +21,12 @@ from peers.jsonl import say
 
 from faults.records import Kind, RecordWriter
 from gdp.client.participant import Message
-from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.runtime.memory_tuning import tune_memory
-from gdp.service.dispatch import Ask, Dispatch, Failure
+from gdp.service.replication import ALL
+from gdp.session.protocol.client_core import Call, ClientCore
+from gdp.session.protocol.server_core import ServerCore
 from lab.end import End
 
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
@@ -76,71 +76,40 @@ class Caller:
     ) -> None:
         self._token, self._out, self._incarnation_id = token, out, incarnation_id
         self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
-        self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
-        self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
-        self._services, self._every_s = station.member.services, 1.0 / float(settings["hz"])
+        name = settings["name"]
+        self._client = ClientCore(station.member, station.topics[name], name, start=random.getrandbits(62))
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._count = 0
+        self._under_way: dict[int, Call] = {}
 
     def next_s(self) -> float:
         """Return the next deadline, in monotonic seconds."""
-        timer_s = self._dispatch.get_timer()
+        timer_s = self._client.get_timer()
         return self.due_s if timer_s is None else min(self.due_s, timer_s)
 
     def go_on(self, now_s: float) -> None:
-        """Discover servers, make the calls that are due, end those that time out."""
-        peers = set(self._services.peers(self._name) or self._services.connected_peers(self._name))
-        for server in set(self._dispatch.servers) - peers:
-            self._dispatch.replica_lost(server, now_s, "gone")
-        for server in peers:
-            self._dispatch.replica_joined(server, now_s)
-        self._dispatch.handle_timer(now_s)
+        """Make the calls that are due, and record those that have ended."""
+        timer_s = self._client.get_timer()
+        if timer_s is not None and now_s >= timer_s:
+            self._client.handle_timer(now_s)
         if now_s >= self.due_s:
             self.due_s = max(self.due_s + self._every_s, now_s - _BEHIND_S)
-            self._begin(now_s)
-        self._send(now_s)
+            self._count += 1
+            request = _REQUEST.pack(self._token, self._count)
+            call = self._under_way[self._count] = Call(payload=request, timeout_s=self._timeout_s, replication=ALL)
+            self._note(Kind.CALLED, self._count)
+            self._client.begin(call, now_s)
+        for number, call in list(self._under_way.items()):
+            if call.is_done:
+                del self._under_way[number]
+                self._note(Kind.FAILED if call.response is None else Kind.ANSWERED, number)
+                if call.response is not None and call.response.payload != call.payload:
+                    self._note(Kind.WRONG, number)
 
     def take(self, message: Message, now_s: float) -> None:
         """Handle a server's response."""
-        if not message.private:
-            return
-        token, number = _REQUEST.unpack_from(message.delivered.message)
-        if token != self._token:
-            self._note(Kind.WRONG, number)
-            return
-        self._dispatch.answered(number, Name(message.delivered.publisher), number, now_s)
-        self._send(now_s)
-
-    def _begin(self, now_s: float) -> None:
-        self._count += 1
-        call = self._count
-        self._note(Kind.CALLED, call)
-        try:
-            self._dispatch.begin(
-                now_s,
-                lambda number: _REQUEST.pack(self._token, number),
-                self._timeout_s,
-                lambda _: self._note(Kind.ANSWERED, call),
-                partial(self._failed, call),
-            )
-        except LocalError:  # no server is there: the caller is notified at once
-            self._note(Kind.FAILED, call)
-
-    def _failed(self, call: int, failure: Failure, reason: str) -> None:
-        del failure, reason
-        self._note(Kind.FAILED, call)
-
-    def _send(self, now_s: float) -> None:
-        for effect in self._dispatch.poll_effects():
-            if not isinstance(effect, Ask):
-                continue  # servers answer at once: there is nothing to stop
-            if effect.servers is None:
-                self._stream.publish(effect.request)
-            for server in effect.servers or ():
-                try:
-                    self._services.send_request(self._name, server, effect.request)
-                except LocalError as error:
-                    self._dispatch.refused(effect.call, server, str(error), now_s)
+        self._client.receive(message, now_s)
 
     def _note(self, kind: Kind, number: int) -> None:
         self._out.add(kind, self._channel, self._incarnation_id, 0, number, time.monotonic_ns())
@@ -175,21 +144,26 @@ class Reading:
             self._out.add(Kind.DELIVERED, self._channel, incarnation_id, publisher, number, at_ns)
 
 
-class Serving:
-    """Server that echoes each request."""
+class Server:
+    """Server that echoes each request of its channel."""
 
-    def __init__(self, station: End, name: Name, token: bytes) -> None:
-        self._station, self._name, self._token = station, name, token
+    def __init__(self, station: End, name: str, token: bytes) -> None:
+        self._core = ServerCore(station.member, station.topics[name], start=random.getrandbits(62), at_once=None)
+        self._token = token
+
+    def go_on(self, now_s: float) -> None:
+        """Drop requests that no client waits for."""
+        timer_s = self._core.get_timer()
+        if timer_s is not None and now_s >= timer_s:
+            self._core.handle_timer(now_s)
 
     def take(self, message: Message, now_s: float) -> None:
         """Answer a client; a client that has gone meanwhile gets nothing."""
-        del now_s
-        body = message.delivered.message
-        if body[: len(self._token)] == self._token:
-            try:
-                self._station.member.services.respond(self._name, Name(message.delivered.publisher), body)
-            except LocalError as error:
-                print(f"not answered: {error}", file=sys.stderr, flush=True)
+        self._core.receive(message, now_s)
+        while self._core.turns:
+            turn = self._core.turns.popleft()
+            is_ours = turn.request.startswith(self._token)
+            self._core.finish(turn.number, turn.request if is_ours else "a request of another channel", now_s)
 
 
 def main() -> None:
@@ -198,12 +172,11 @@ def main() -> None:
     out, incarnation_id = RecordWriter(Path(settings["records"])), settings["incarnation_id"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
     station = End.from_config(Path(settings["config"]), 0.0)
-    takers: dict[Name, Reading | Serving | Caller] = {}
+    takers: dict[Name, Reading | Server | Caller] = {}
     for each in settings["read"]:
         takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
     for each in settings["serve"]:
-        name = station.serve(each["name"])
-        takers[name] = Serving(station, name, tokens[each["channel"]])
+        takers[station.name_of(each["name"])] = Server(station, each["name"], tokens[each["channel"]])
     remote_clients = [Caller(station, each, tokens[each["channel"]], incarnation_id, out) for each in settings["call"]]
     for each, caller in zip(settings["call"], remote_clients, strict=True):
         takers[station.name_of(each["name"])] = caller
@@ -228,11 +201,11 @@ def main() -> None:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for caller in remote_clients:
-                caller.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)
+                else:
+                    taker.go_on(now_s)
             station.member.flush(now_s)
             out.flush()
             due = [each.due_s for each in sources] + [each.next_s() for each in remote_clients]

@@ -11,10 +11,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from machine import clear_offloads
-
 from gdp.host.run_registry import Run
 from lab.machines import Lab
+from lab.namespaces import clear_offloads
 from lab.topology import MIDDLE, ROW, row
 
 NODES: Final = ROW

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from machine import clear_offloads
-
 from gdp.host.run_registry import Run
 from lab.machines import Lab
-from lab.namespaces import mac_addresses
+from lab.namespaces import clear_offloads, mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
 from thin_link.conditions import FRAME_BYTES, Conditions

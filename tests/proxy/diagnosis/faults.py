@@ -282,6 +282,14 @@ def too_large(folder: Path) -> Stage:
     return stage
 
 
+def without_control(folder: Path) -> Stage:
+    stage = Stage(folder).add(into=f"{CHATTER}, control: exclusive")
+    stage.listen()
+    stage.talk()
+    stage.run(10)
+    return stage
+
+
 def no_route(folder: Path) -> Stage:
     return _plain_with(folder, options={"leaves": ("s2",)}, rib_at="s2")
 
@@ -519,6 +527,7 @@ FAULTS: Final = (
     Fault("deadline drops", Cause.DEADLINE, "core", deadline),
     Fault("max_bits_s", Cause.BIT_RATE_LIMIT, "core", bit_rate),
     Fault("max_bytes", Cause.TOO_LARGE, "core", too_large),
+    Fault("control that no publisher holds", Cause.NOT_IN_CONTROL, "core", without_control),
     Fault("no route: a leaf in between", Cause.NO_ROUTE, "core", no_route),
     Fault("untrusted domain", Cause.UNTRUSTED_DOMAIN, "core", untrusted_domain),
     Fault("MTU hole", Cause.MTU_HOLE, "core", mtu_hole),

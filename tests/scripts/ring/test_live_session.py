@@ -71,7 +71,7 @@ def test_what_does_not_come_is_waited_for_only_while_something_moves(run: Run, m
 
 def test_a_node_that_does_not_report_is_named(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_run, "ENDING_S", 0.2)
-    with pytest.raises(FailedError, match=r"lamp did not report within 0\.2 s"):
+    with pytest.raises(FailedError, match=r"lamp did not say 'done' within 0\.2 s"):
         play(run, lamp=HEAD + "signal.pause()")
 
 

@@ -116,7 +116,7 @@ def test_faults_are_injected_at_their_seconds_and_those_that_come_too_late_are_c
     supervisor, injected = Supervisor(), list[str]()
     cuts = [cut_from_text("a-b@0-0.05"), cut_from_text("a-c@60")]
     injection = Injection(supervisor, cuts, lambda fault, begins: injected.append(f"{text_of(fault)} {begins}"))
-    supervisor.follow((), lambda: len(injected) == 2, patience_s=10)
+    supervisor.follow(lambda: len(injected) == 2, 10)
     assert injected == ["a-b@0-0.05 True", "a-b@0-0.05 False"]
     assert injection.stop() == ["a-c@60 came too late: the traffic was over"]
 
@@ -126,5 +126,5 @@ def test_a_restarted_process_is_required_once_it_is_ready(run: Run) -> None:
     with LabProcess(run, "again", [sys.executable, "-c", HEAD + "say(event='ready'); sys.exit('no more')"]) as again:
         supervisor.expect(again, lambda event: back.append(event["event"]))
         with pytest.raises(FailedError, match=r"again ended with code 1\n    no more"):
-            supervisor.follow((), lambda: False, patience_s=10)
+            supervisor.follow(lambda: False, 10)
     assert back == ["ready"]

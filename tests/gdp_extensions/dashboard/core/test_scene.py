@@ -94,6 +94,18 @@ def test_what_comes_and_goes_is_an_event_once() -> None:
     assert texts(scene)[3:] == ["switch b is up", "link switch a – switch b is up"]
 
 
+def test_who_gets_the_control_of_a_topic_is_an_event() -> None:
+    scene = Scene()
+    flow = {"name": "n1", "local": "/cmd_vel", "kind": "topic"}
+    robot = {"role": "proxy", "id": "r", "label": "robot"}
+    desk = Reading({"role": "proxy", "id": "d", "label": "desk"})
+    for at, holder in enumerate(("", "", "d", "d")):
+        scene.update([desk, Reading({**robot, "flows": [{**flow, "holder": holder}]})], at, at)
+    assert texts(scene) == ["proxy desk controls /cmd_vel"]
+    structure: Any = scene.structure()
+    assert structure["names"][0][-1] == [0]
+
+
 def test_many_names_at_once_are_one_event() -> None:
     scene = Scene()
     scene.update([switch("a")], 0, 0)
