@@ -16,6 +16,7 @@ from gdp.intervals import REPORT_S, TICK_S
 from gdp.message.loss import LossReason
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.keeping import TopicKeeper
 from proxy.bridge.sent_stats import SentStats
 from proxy.node.node import ProxyNode
 from proxy.recordings.endpoint import ReplayEndpoint
@@ -108,6 +109,7 @@ class Replay:
     Args:
         rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
         empty_max_s: of a longer time without a message, the rest is skipped; None: it is waited for.
+        keeper: of topics that are kept; their holders confirm what was replayed.
     """
 
     def __init__(
@@ -118,8 +120,10 @@ class Replay:
         rate: float,
         report: Callable[[], None],
         empty_max_s: float | None = None,
+        keeper: TopicKeeper | None = None,
     ) -> None:
         self._node = node
+        self._keeper = keeper
         self._bridge = bridge
         self._endpoint = endpoint
         self._pace = Pace(rate, empty_max_s)
@@ -206,8 +210,7 @@ class Replay:
         Readers of best-effort topics have ``REPORT_S`` to report what they lost.
         """
         progress, stalled_s = (self.confirmed, self.sent_best_effort, 0), time.monotonic()
-        keeper = self._node.state.context.keeper
-        kept = None if keeper is None else keeper.capsules
+        kept = None if self._keeper is None else self._keeper.capsules
         while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics) or (
             kept is not None and not kept.is_uploaded
         ):
