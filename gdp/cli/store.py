@@ -69,7 +69,7 @@ def serve(
         server.serve_forever()
 
 
-@app.command("ls")
+@app.command("ls", epilog="Example: gdp store ls --store /var/lib/gdp/capsules")
 def list_capsules(store: Folder, json: Json = False) -> None:
     """List the capsules in a folder, with their topic, writer, bytes and records."""
     with failing_clearly():
@@ -77,7 +77,7 @@ def list_capsules(store: Folder, json: Json = False) -> None:
             _print(_row(capsule), json=json)
 
 
-@app.command()
+@app.command(epilog="Example: gdp store show 75e1 --store /var/lib/gdp/capsules")
 def show(name: Which, store: Folder, json: Json = False) -> None:
     """Show a capsule: who writes it, since when, and each segment."""
     with failing_clearly():
@@ -88,7 +88,7 @@ def show(name: Which, store: Folder, json: Json = False) -> None:
         _print({**_row(capsule), "metadata": dict(capsule.descriptor.metadata), "segments": segments}, json=json)
 
 
-@app.command()
+@app.command(epilog="Example: gdp store verify 75e1 --store /var/lib/gdp/capsules --known last.checkpoint")
 def verify(
     name: Which,
     store: Folder,
@@ -119,11 +119,13 @@ def verify(
     raise typer.Exit(_DAMAGED if found else 0)
 
 
-@app.command()
-def rm(name: Which, store: Folder) -> None:
+@app.command(epilog="Example: gdp store rm 75e1 --store /var/lib/gdp/capsules")
+def rm(name: Which, store: Folder, json: Json = False) -> None:
     """Remove a capsule from a folder whose holder does not run."""
     with failing_clearly():
-        remove(store, _find(store, name).name)
+        found = _find(store, name).name
+        remove(store, found)
+        report("removed", f"capsule {found.short} is removed", json=json, capsule=found.to_text())
 
 
 for _name in _Store.extensions:

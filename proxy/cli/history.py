@@ -1,6 +1,6 @@
 """Commands ``gdp store export`` and ``gdp store replay``: what a holder has of topics, as a recording, or live again.
 
-I/O; they are commands of ``gdp recording`` as well.
+I/O; the entry point of ``gdp recording`` has them.
 """
 
 from __future__ import annotations

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import fcntl
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+from typer.core import TyperGroup
 
 from gdp.cli.node import Json, failing_clearly
 from gdp.cli.program import ungrouped
@@ -19,7 +20,17 @@ from proxy.cli.tool_options import print_json, print_text
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import PARTIAL, BagWriter
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+
+class _Recording(TyperGroup):
+    """Group that lists its own commands; it also has those that ``gdp store`` lists."""
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+        """Return the names of the commands, for the help."""
+        return [name for name in super().list_commands(ctx) if name not in _OF_STORE]
+
+
+_OF_STORE: Final = ("export", "replay")
+app = typer.Typer(cls=_Recording, add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help=f"The recording, such as rec.mcap{PARTIAL}.", exists=True)]
 Output = Annotated[
