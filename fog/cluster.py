@@ -114,11 +114,7 @@ class ClusterPlan:
 
     @classmethod
     def from_json(cls, text: str) -> ClusterPlan:
-        """Read a plan.
-
-        Raises:
-            LocalError: the text is not a plan.
-        """
+        """Read a plan. Raises ``LocalError``: the text is not a plan."""
         from pydantic import TypeAdapter, ValidationError  # a launch file that only makes a plan needs no such check
 
         from gdp.config.schema import first_fault

@@ -1,7 +1,4 @@
-"""Machine of a cluster: the request to a provider, the bootstrap bundle, and the provider's description.
-
-Sans-I/O.
-"""
+"""Machine of a cluster: the request to a provider, the bootstrap bundle, and the provider's description."""
 
 from __future__ import annotations
 

@@ -30,9 +30,8 @@ from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig, SkyPilotConfig
 from fog.providers.cloud_init import Setup
-from fog.providers.skypilot_config import SkyPilotConfig
 from fog.software.config import SOFTWARE_PORT, SoftwareConfig, listening_host_port
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.config.config import LeaseSeconds, SwitchConfig
@@ -43,8 +42,7 @@ from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
 from gdp.host_port import split_host_port
 from gdp.intervals import ADVERTISEMENT
-from gdp.stores.checkout import ignore_folder
-from gdp.stores.files import private, read_private, write_all
+from gdp.stores.files import ignore_folder, private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.ownership import refuse_foreign_folder
 
@@ -185,11 +183,7 @@ class SiteConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> SiteConfig:
-        """Read ``fog.yaml``.
-
-        Raises:
-            ConfigError: all errors of the file, each with line and column.
-        """
+        """Read ``fog.yaml``. Raises ``ConfigError``: all errors of the file, each with line and column."""
         return load(cls, path)
 
 
@@ -357,11 +351,7 @@ def with_gateway(site: Site, *, is_replica: bool) -> Site:
 
 
 def topology_now(site: Site) -> Gateway:
-    """Return a site's topology of the last launch.
-
-    Raises:
-        LocalError: the site's file cannot be read.
-    """
+    """Return a site's topology of the last launch. Raises ``LocalError``: the site's file cannot be read."""
     if site.file is not None:
         return site.topology
     return AUTOMATIC_REPLICA if _identifier(site.state)[1] else AUTOMATIC

@@ -1,7 +1,4 @@
-"""Object that closes itself at the end of a ``with`` block.
-
-Sans-I/O.
-"""
+"""Object that closes itself at the end of a ``with`` block."""
 
 from __future__ import annotations
 

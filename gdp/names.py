@@ -33,11 +33,7 @@ class Name(bytes):
 
     @classmethod
     def from_text(cls, text: str) -> Name:
-        """Read 64 hex digits.
-
-        Raises:
-            LocalError: anything else.
-        """
+        """Read 64 hex digits. Raises ``LocalError``: anything else."""
         if len(text) != 2 * NAME_BYTES or not set(text) <= set("0123456789abcdefABCDEF"):
             raise LocalError(f"a name is written as {2 * NAME_BYTES} hex digits")
         return cls(bytes.fromhex(text))

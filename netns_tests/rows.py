@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import ETHERTYPE, Flag, Kind
+from gdp.frame.codec import ETHERTYPE, Flag, Header, Kind, encode
 from gdp.limits import HOPS_MAX
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.netdev import NetdevPlane

@@ -19,8 +19,7 @@ import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag, decode
 from gdp.ports import sockets
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table

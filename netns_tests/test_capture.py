@@ -12,8 +12,7 @@ import pytest
 from scapy.layers.l2 import Ether
 from scapy.utils import PcapNgReader, RawPcapReader
 
-from gdp.frame.codec import Header, encode, ethernet
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode, ethernet
 from gdp.frame.layers import GDP
 from lab.machine import LabMachine
 from lab.namespaces import Space

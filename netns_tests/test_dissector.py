@@ -14,7 +14,7 @@ pytest.importorskip("gdp_extensions.dissector")
 
 from scapy.utils import RawPcapReader
 
-from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.frame.codec import ETHERTYPE, Kind
 from gdp.host.run_registry import RunRegistry
 from gdp_extensions.dissector.capture_opener import Outcome
 from netns_tests.test_ring import FAST, crossed, make_demo

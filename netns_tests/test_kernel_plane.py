@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pyroute2 import IPRoute
 
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.ports.kernel.abi import BRANCHES_MAX
 from gdp.ports.kernel.device import TxDrops
 from gdp.ports.kernel.plane import KernelPlane

@@ -18,7 +18,7 @@ import pytest
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.rib_host import RibHost
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.envelope import SIGNATURE_BYTES, fragment_capacity
@@ -26,8 +26,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.limits import MTU_MIN_BYTES
 from gdp.metadata import Metadata
 from gdp.ports.kernel.plane import KernelPlane

@@ -20,15 +20,15 @@ from weakref import WeakKeyDictionary
 import pytest
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.frame.codec import ETHERTYPE, Kind, decode
 from gdp.ports import raw, sockets
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.mmsg import MmsgBatch
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
+from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
+from gdp.sansio import BROADCAST, ReceivedFrame
 from gdp.switch.table import Table
 from lab.namespaces import Space, wait_for_carrier
 from lab.process import until

@@ -10,8 +10,7 @@ import pytest
 from pyroute2 import IPRoute
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, Flag, Kind, decode
 from gdp.ports.raw import RawPlane
 from gdp.sansio import ReceivedFrame
 from lab.namespaces import Space

@@ -10,7 +10,7 @@ from contextlib import closing
 import pytest
 
 from gdp.errors import LocalError
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHERTYPE
 from gdp.ports.kernel.device import TxDrops
 from gdp.ports.netlink import NetlinkSocket
 from gdp.ports.tunnel.rate_limit import limit_rate

@@ -13,7 +13,7 @@ import pytest
 from fog.providers.cloud_init import Setup, placed
 from gdp.crypto.certificates import Role
 from gdp.ports.confine import landlock
-from gdp.ports.sandbox import Capability
+from gdp.ports.confine.capabilities import Capability
 from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.right import Right
 from lab.credentials import make_nodes

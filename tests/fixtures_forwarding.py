@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import ETHERTYPE, Flag, Kind
+from gdp.frame.codec import ETHERTYPE, Flag, Header, Kind, encode
 from gdp.switch.table import NOWHERE, Hops, Table
 
 IN, WIDE, NARROW, ABSENT = range(4)

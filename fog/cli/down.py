@@ -1,7 +1,4 @@
-"""``fog down``: release of machines, and then of the infrastructure under them; works after any crash.
-
-I/O.
-"""
+"""``fog down``: release of machines, and then of the infrastructure under them; works after any crash."""
 
 from __future__ import annotations
 

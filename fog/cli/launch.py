@@ -1,7 +1,4 @@
-"""``fog launch``: start of a launch file's cluster, then of the robot's nodes when it serves.
-
-I/O.
-"""
+"""``fog launch``: start of a launch file's cluster, then of the robot's nodes when it serves."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``fog logs``: what programs of machines wrote, and what they write while it runs.
-
-I/O.
-"""
+"""``fog logs``: what programs of machines wrote, and what they write while it runs."""
 
 from __future__ import annotations
 
@@ -15,9 +12,9 @@ import typer
 
 from fog.bootstrap.bundles import PROXY, SWITCH
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened
-from fog.cli.views import print_json, stage
+from fog.cli.views import print_json
 from fog.supervisor.background import LOG
-from fog.supervisor.core.record import Record
+from fog.supervisor.core.record import Record, stage
 from fog.supervisor.final_logs import MACHINE
 from fog.supervisor.infrastructure import open_provider
 from fog.supervisor.journal import Journal

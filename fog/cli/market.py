@@ -1,7 +1,4 @@
-"""Offers of a provider for the machines of a plan, latencies of its regions, and the offer chosen for each machine.
-
-I/O.
-"""
+"""Offers of a provider for the machines of a plan, latencies of its regions, and the offer chosen for each machine."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options and site access shared by the verbs of ``fog``.
-
-I/O.
-"""
+"""Options and site access shared by the verbs of ``fog``."""
 
 from __future__ import annotations
 

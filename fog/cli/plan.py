@@ -1,7 +1,4 @@
-"""``fog plan``: number, offers and price of machines for a target. ``fog prices``: prices of machines.
-
-I/O.
-"""
+"""``fog plan``: number, offers and price of machines for a target. ``fog prices``: prices of machines."""
 
 from __future__ import annotations
 
@@ -12,9 +9,8 @@ from typing import Annotated
 import typer
 from rich.table import Column, Table
 
-from fog.catalog.aws import aws_prices
 from fog.catalog.measured import measured
-from fog.catalog.prices import price_list, regions_of
+from fog.catalog.prices import aws_prices, price_list, regions_of
 from fog.cli.options import SiteFile, State
 from fog.cli.views import latency_lines, ms_text
 from fog.hardware import Hardware, Offer

@@ -1,7 +1,4 @@
-"""Robot's nodes of a launch file: they start on the robot's host and end with the command.
-
-I/O.
-"""
+"""Robot's nodes of a launch file: they start on the robot's host and end with the command."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``fog scale``, ``push``, ``ssh`` and ``supervise``: verbs for existing clusters and machines.
-
-I/O.
-"""
+"""``fog scale``, ``push``, ``ssh`` and ``supervise``: verbs for existing clusters and machines."""
 
 from __future__ import annotations
 
@@ -16,9 +13,10 @@ import typer
 from fog.cli.launch import WAIT_S, follow
 from fog.cli.market import choices, market, refusal
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened, the_cluster
-from fog.cli.views import print_json, stage
+from fog.cli.views import print_json
 from fog.cluster import ClusterPlan
 from fog.supervisor.background import ensure
+from fog.supervisor.core.record import stage
 from fog.supervisor.infrastructure import open_provider, set_up
 from gdp.cli.node import Logs, running
 from gdp.errors import LocalError

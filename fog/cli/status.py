@@ -1,7 +1,4 @@
-"""``fog ls``, ``status`` and ``cost``: clusters, events and costs.
-
-I/O.
-"""
+"""``fog ls``, ``status`` and ``cost``: clusters, events and costs."""
 
 from __future__ import annotations
 

@@ -24,23 +24,6 @@ from gdp.cli.console import console, folding
 from gdp.printable import escaped
 from gdp.terminal import echo
 
-__all__ = [
-    "cluster_fields",
-    "clusters_table",
-    "cost_fields",
-    "costs_table",
-    "event_line",
-    "events_table",
-    "latency_lines",
-    "machine_fields",
-    "machines_table",
-    "ms_text",
-    "print_event",
-    "print_json",
-    "show",
-    "stage",
-]
-
 _STYLES: Final = {
     "serving": "green",
     "unreachable": "red",

@@ -1,7 +1,4 @@
-"""``fog wheels``: the wheels that rented machines install.
-
-I/O.
-"""
+"""``fog wheels``: the wheels that rented machines install."""
 
 from __future__ import annotations
 

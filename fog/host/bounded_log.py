@@ -1,7 +1,4 @@
-"""Bounded log: a full file becomes the older half, and a new file begins.
-
-I/O.
-"""
+"""Bounded log: a full file becomes the older half, and a new file begins."""
 
 from __future__ import annotations
 

@@ -38,11 +38,7 @@ def pack(boot: MachineBundle) -> dict[str, bytes]:
 
 
 def unpack(files: Mapping[str, bytes]) -> MachineBundle:
-    """Return the bundle that was packed.
-
-    Raises:
-        LocalError: ``boot.json`` is missing or invalid.
-    """
+    """Return the bundle that was packed. Raises ``LocalError``: ``boot.json`` is missing or invalid."""
     if BOOT_FILE not in files:
         raise LocalError(f"no {BOOT_FILE}")
     others = {path: content for path, content in files.items() if path != BOOT_FILE}
@@ -50,11 +46,7 @@ def unpack(files: Mapping[str, bytes]) -> MachineBundle:
 
 
 def read_programs(content: bytes) -> tuple[Program, ...]:
-    """Return the programs that a ``boot.json`` lists.
-
-    Raises:
-        LocalError: the content is invalid.
-    """
+    """Return the programs that a ``boot.json`` lists. Raises ``LocalError``: the content is invalid."""
     try:
         document = json.loads(content)["programs"]
         programs = tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in document)

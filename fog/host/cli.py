@@ -1,7 +1,4 @@
-"""``fog-machine`` command, which runs the machine agent.
-
-I/O.
-"""
+"""``fog-machine`` command, which runs the machine agent."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Restart supervisor of one program: restarts use growing pauses.
-
-I/O.
-"""
+"""Restart supervisor of one program: restarts use growing pauses."""
 
 from __future__ import annotations
 

@@ -36,11 +36,7 @@ class Status:
     reason: str = ""
 
     def write(self, home: Path) -> None:
-        """Replace the status file.
-
-        Raises:
-            OSError: the system refuses.
-        """
+        """Replace the status file. Raises ``OSError``: the system refuses."""
         draft = home / f".{STATUS_FILE}"
         with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump({**asdict(self), "state": self.state.value}, file)

@@ -1,7 +1,4 @@
-"""Specification of a cluster: the checked arguments of a ``FogCluster``; with its nodes it becomes a plan.
-
-Sans-I/O.
-"""
+"""Specification of a cluster: the checked arguments of a ``FogCluster``; with its nodes it becomes a plan."""
 
 from __future__ import annotations
 

@@ -30,11 +30,7 @@ def has_ros_launch() -> bool:
 
 
 def word(name: str) -> object:
-    """Return the object for a name of ``WORDS``.
-
-    Raises:
-        AttributeError: the name is not in ``WORDS``.
-    """
+    """Return the object for a name of ``WORDS``. Raises ``AttributeError``: the name is not in ``WORDS``."""
     if name in _OWN:
         module = _OWN[name]
     elif name in _EITHER:

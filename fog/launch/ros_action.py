@@ -5,8 +5,10 @@ Processes that follow the cluster in the description start when it serves: the l
 puts ``start_gate`` before their command line. A node with its own ``prefix`` does not wait.
 A cluster that cannot start ends the launch like any failed action, with its reason and exit code 1. An exception in an
 event handler has this effect; ``Shutdown(reason=...)`` has neither.
-Source: launch 3.4.3 (jazzy): ``Action``, ``OnShutdown``, ``LaunchService.run_async``; ``descriptions/executable.py``
-for the prefix, ``actions/group_action.py`` for scopes.
+Actions of ``launch_ros`` describe a node only after substitutions are performed in a context. The adapter performs them
+for a cloud node and never executes the node here.
+Source: launch 3.4.3 and launch_ros 0.26 (jazzy): ``Action``, ``OnShutdown``, ``LaunchService.run_async``;
+``descriptions/executable.py`` for the prefix, ``actions/group_action.py`` for scopes.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ import asyncio
 import logging
 import shlex
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -23,11 +26,13 @@ from launch import Action, Event, LaunchContext
 from launch.actions import PopLaunchConfigurations, PushLaunchConfigurations
 from launch.event_handler import BaseEventHandler
 from launch.event_handlers import OnShutdown
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from launch_ros.actions import Node
 
 from fog.cluster import CloudNode, ClusterPlan
 from fog.launch import entity
+from fog.launch.cloud_node import parameter_rule, parameters_in
 from fog.launch.interface_discovery import offered
-from fog.launch.launch_ros_adapter import cloud_node
 from fog.launch.start_gate import StartGate
 from fog.launch.unreturned import watch_ros_launch
 from gdp.errors import GdpError, LocalError
@@ -35,6 +40,7 @@ from gdp.host.run_registry import Run, RunRegistry
 
 log = logging.getLogger(__name__)
 
+_MADE: Final = "launch_params_"  # prefix of files that launch_ros creates for maps of parameters and does not delete
 FOG: Final = (sys.executable, "-m", "fog.cli.app")
 _PREFIX: Final = "launch-prefix"
 _ERROR: Final = "error: "
@@ -187,3 +193,43 @@ async def _reason(process: asyncio.subprocess.Process) -> str:
 
 
 watch_ros_launch()
+
+
+def cloud_node(node: object, context: LaunchContext) -> CloudNode:
+    """Return a node with all substitutions performed."""
+    if not isinstance(node, Node) or node.node_package is None:
+        raise LocalError(f"cloud_nodes: expected launch_ros.actions.Node with a package, not {type(node).__name__}")
+    node._perform_substitutions(context)
+    name = str(node.node_name).rpartition("/")[2]
+    namespace = str(node.expanded_node_namespace or "")
+    context.extend_locals({"ros_specific_arguments": {"name": f"__node:={name}", "ns": f"__ns:={namespace}"}})
+    # The first word is the executable; this machine need not have its package.
+    words = [str(perform_substitutions(context, word)) for word in node.cmd[1:]]
+    package, executable = (
+        str(perform_substitutions(context, normalize_to_list_of_substitutions(said)))
+        for said in (node.node_package, node.node_executable)
+    )
+    environment = {
+        str(perform_substitutions(context, key)): str(perform_substitutions(context, value))
+        for key, value in node.additional_env or ()
+    }
+    is_named = not name.startswith("<") and not namespace.startswith("<")
+    arguments = _without_files(words, name if is_named else None, namespace if is_named else None)
+    return CloudNode(package, executable, tuple(arguments), environment)
+
+
+def _without_files(words: Sequence[str], name: str | None, namespace: str | None) -> list[str]:
+    kept: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        if word == "--params-file":
+            path = Path(next(rest))
+            is_made = path.name.startswith(_MADE) and path.parent == Path(tempfile.gettempdir())
+            kept += parameters_in(path, name, namespace, has_tuples=is_made)
+            if is_made:
+                path.unlink()
+        elif word == "-p":
+            kept += [word, parameter_rule(next(rest))]
+        else:
+            kept.append(word)
+    return [] if kept == ["--ros-args"] else kept

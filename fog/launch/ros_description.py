@@ -15,8 +15,7 @@ from launch_ros.actions import Node
 
 from fog.cluster import CloudNode, RobotNode
 from fog.launch.cluster_spec import ClusterSpec
-from fog.launch.launch_ros_adapter import cloud_node
-from fog.launch.ros_action import FogCluster
+from fog.launch.ros_action import FogCluster, cloud_node
 from gdp.errors import LocalError
 
 

@@ -1,7 +1,4 @@
-"""Starter of a node that is resolved on this machine: ``python -m fog.launch.run PACKAGE EXECUTABLE ...``.
-
-I/O.
-"""
+"""Starter of a node that is resolved on this machine: ``python -m fog.launch.run PACKAGE EXECUTABLE ...``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,1 @@
-"""Planning of machines: failure arithmetic, choice by price and latency, and replay of recorded traces.
-
-Sans-I/O.
-"""
+"""Planning of machines: failure arithmetic, choice by price and latency, and replay of recorded traces."""

@@ -1,7 +1,4 @@
-"""Result of ``fog plan``: pool, choices and price, with all assumptions.
-
-Sans-I/O.
-"""
+"""Result of ``fog plan``: pool, choices and price, with all assumptions."""
 
 from __future__ import annotations
 
@@ -11,10 +8,9 @@ from dataclasses import dataclass
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware, Offer
 from fog.plan.choice import BY_BOTH, Choice, Weights, choose
-from fog.plan.correlation import joint_over_regions
 from fog.plan.duration import duration_text
 from fog.plan.evidence import Measured
-from fog.plan.failure import chance_down, joint
+from fog.plan.failure import chance_down, joint, joint_over_regions
 from fog.plan.mix import Kind
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S, Pool, Standing, pool_for
 
@@ -74,11 +70,7 @@ class Answer:
 
 
 def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answer:
-    """Compute a plan.
-
-    Raises:
-        LocalError: an input is out of bounds, or no offer has enough hardware.
-    """
+    """Compute a plan. Raises ``LocalError``: an input is out of bounds, or no offer has enough hardware."""
     uptime_s = question.uptime_s or PAPER_UPTIME_S
     recovery_s = question.recovery_s or PAPER_RECOVERY_S
     factor = seen.factors[1]

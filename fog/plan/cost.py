@@ -1,7 +1,4 @@
-"""Comparison of costs per hour and month, in the form of the paper's Table I.
-
-Sans-I/O.
-"""
+"""Comparison of costs per hour and month, in the form of the paper's Table I."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Durations in textual form: ``15h``, ``20min``, ``90s``.
-
-Sans-I/O.
-"""
+"""Durations in textual form: ``15h``, ``20min``, ``90s``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Mixed pools: the cheapest number of machines of each kind that reaches a target, given those that run already.
-
-Sans-I/O.
-"""
+"""Mixed pools: the cheapest number of machines of each kind that reaches a target, given those that run already."""
 
 from __future__ import annotations
 

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fog.plan.correlation import joint_in_one_region, more_in_one_region
-from fog.plan.failure import joint
+from fog.plan.failure import joint, joint_in_one_region, more_in_one_region
 from fog.plan.mix import Kind, Mix, cheapest_mix
 
 PAPER_UPTIME_S: Final = 15 * 3600.0  # the worked example of FogROS2-FT

@@ -14,9 +14,8 @@ from fog.cluster import MachineRequest
 from fog.hardware import Offer
 from fog.plan.answer import assumptions
 from fog.plan.choice import Choice, choose
-from fog.plan.correlation import joint_over_regions
 from fog.plan.evidence import Measured
-from fog.plan.failure import chance_down, joint
+from fog.plan.failure import chance_down, joint, joint_over_regions
 from fog.plan.pool import ON_DEMAND_DOWN, PAPER_RECOVERY_S, PAPER_UPTIME_S
 from gdp.errors import LocalError
 

@@ -30,11 +30,7 @@ _COMMENT: Final = re.compile(r"(?:^|\s)#.*")
 
 
 def pinned(requirement: str) -> str:
-    """Return the requirement if it is pinned by hash.
-
-    Raises:
-        ValueError: it is not pinned by hash.
-    """
+    """Return the requirement if it is pinned by hash. Raises ``ValueError``: it is not pinned by hash."""
     if not (_URL.match(requirement) or _PINNED.match(requirement)) or "\n" in requirement:
         raise ValueError(f"{requirement!r}: {_EXPECTED}")
     return requirement

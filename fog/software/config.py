@@ -1,7 +1,4 @@
-"""Section ``software:`` of ``fog.yaml``: what ``fog`` sends to rented machines, and where they fetch it.
-
-Sans-I/O.
-"""
+"""Section ``software:`` of ``fog.yaml``: what ``fog`` sends to rented machines, and where they fetch it."""
 
 from __future__ import annotations
 

@@ -72,11 +72,7 @@ def wheels(
 
 
 def own_project() -> Path:
-    """Return the source folder of this package.
-
-    Raises:
-        LocalError: it was installed from a wheel.
-    """
+    """Return the source folder of this package. Raises ``LocalError``: it was installed from a wheel."""
     text = metadata.distribution(_PACKAGE).read_text("direct_url.json")
     url = urlsplit(json.loads(text)["url"]) if text else None
     here = Path(__file__).resolve().parents[2]

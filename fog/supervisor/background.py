@@ -1,7 +1,4 @@
-"""Background process of a site's single supervisor, identified by a lock that the kernel releases with the process.
-
-I/O.
-"""
+"""Background process of a site's single supervisor, identified by a lock that the kernel releases with the process."""
 
 from __future__ import annotations
 

@@ -54,11 +54,7 @@ def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
 
 
 def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:
-    """Return the provider ``local`` of a site.
-
-    Raises:
-        LocalError: its folder belongs to another user.
-    """
+    """Return the provider ``local`` of a site. Raises ``LocalError``: its folder belongs to another user."""
     from fog.providers.local.provider import LocalProvider
 
     boot = partial(gateway_boot, site.authority, days=_GATEWAY_DAYS)

@@ -124,11 +124,7 @@ class Journal(TransactionFile):
         return [Cluster(self._plan(name, plan), bool(is_up), why, begun) for name, plan, is_up, why, begun in rows]
 
     def cluster(self, name: str) -> Cluster:
-        """Return a cluster.
-
-        Raises:
-            LocalError: no cluster has that name.
-        """
+        """Return a cluster. Raises ``LocalError``: no cluster has that name."""
         found = {each.plan.name: each for each in self.clusters()}
         if name not in found:
             known = f"there are {', '.join(found)}" if found else "there is none"

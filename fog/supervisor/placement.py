@@ -1,7 +1,4 @@
-"""Placement of the next machine: the best offer, away from other machines and from recent losses.
-
-Sans-I/O.
-"""
+"""Placement of the next machine: the best offer, away from other machines and from recent losses."""
 
 from __future__ import annotations
 

@@ -22,8 +22,7 @@ from fog.site import Site
 from fog.supervisor.autoscaling import Autoscaling
 from fog.supervisor.core.reconcile import Timeouts, decide
 from fog.supervisor.core.record import Record, update_record
-from fog.supervisor.event_log import EventLog
-from fog.supervisor.events import changes
+from fog.supervisor.event_log import EventLog, changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions

@@ -29,9 +29,9 @@ from gdp.frame.codec import (
     PACE_AT,
     PART_AT,
     PARTS_AT,
+    Flag,
     authenticated,
 )
-from gdp.frame.kinds import Flag
 from gdp.sansio import ReceivedFrame
 
 SALT_BYTES: Final = 8

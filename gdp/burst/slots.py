@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, HOPS_MASK, SECOND_PATH, second_path_key
-from gdp.frame.kinds import CONTROL_FROM, VERSION
+from gdp.frame.codec import CONTROL_FROM, ETHER_BYTES, HEADER_BYTES, HOPS_MASK, SECOND_PATH, VERSION, second_path_key
 from gdp.sansio import ReceivedFrame
 
 _SAMPLE_BITS: Final = 63  # of a frame's last byte: none is set in a sample

@@ -15,8 +15,7 @@ from gdp.client.key_epochs import Openers, Secrets
 from gdp.crypto.envelope import SIGNATURE_BYTES, digest_of
 from gdp.crypto.keys import PublicKey
 from gdp.errors import DropReason, RemoteError
-from gdp.frame.codec import HEADER_BYTES, Header, decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, decode
 from gdp.limits import SEQUENCE_BYTES
 from gdp.message.bundle import unpack
 from gdp.message.heartbeat import Heartbeat

@@ -1,7 +1,4 @@
-"""``gdp audit``: verification of what a node or an authority accepted, refused and revoked.
-
-I/O.
-"""
+"""``gdp audit``: verification of what a node or an authority accepted, refused and revoked."""
 
 from __future__ import annotations
 

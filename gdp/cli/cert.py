@@ -1,7 +1,4 @@
-"""``gdp cert``: commands for memberships: issue, install, show, renew and revoke.
-
-I/O.
-"""
+"""``gdp cert``: commands for memberships: issue, install, show, renew and revoke."""
 
 from __future__ import annotations
 

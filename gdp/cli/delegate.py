@@ -27,8 +27,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
-from gdp.stores.checkout import work_tree_of
-from gdp.stores.files import private, public, write_all
+from gdp.stores.files import private, public, work_tree_of, write_all
 from gdp.stores.issue import DELEGATION_DAYS, delegate, delegate_route, install_delegation
 from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
 from gdp.terminal import echo

@@ -1,7 +1,4 @@
-"""``gdp domain``: commands that create and show a trust domain.
-
-I/O.
-"""
+"""``gdp domain``: commands that create and show a trust domain."""
 
 from __future__ import annotations
 

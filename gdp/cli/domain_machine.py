@@ -1,7 +1,4 @@
-"""``gdp domain create``, ``token``, ``ls``, ``remove`` and ``serve``: a domain whose machines join with tokens.
-
-I/O.
-"""
+"""``gdp domain create``, ``token``, ``ls``, ``remove`` and ``serve``: a domain whose machines join with tokens."""
 
 from __future__ import annotations
 
@@ -18,6 +15,7 @@ from gdp.cli import options
 from gdp.cli.machine import AtDirectory, NoSystemd, Start, directory_of, say, start_machine
 from gdp.cli.node import set_up_logging
 from gdp.cli.output import moment, show
+from gdp.cli.tables import columns
 from gdp.enrolment.addresses import default_addresses, duration_s, endpoint_of, is_private, server_text
 from gdp.enrolment.create import BORDER, DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DomainFiles
@@ -28,7 +26,6 @@ from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import POLL_MAX_S, bind_server, serve_domain
 from gdp.errors import LocalError
 from gdp.host.interruption import Interrupted, interruptible
-from gdp.state.columns import columns
 from gdp.terminal import echo
 from gdp.trust.join_token import JoinRole
 

@@ -1,7 +1,4 @@
-"""``gdp endpoints``: the endpoint record of a switch, which its peers need for a tunnel to it.
-
-I/O.
-"""
+"""``gdp endpoints``: the endpoint record of a switch, which its peers need for a tunnel to it."""
 
 from __future__ import annotations
 

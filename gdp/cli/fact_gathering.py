@@ -14,6 +14,7 @@ from typing import Final
 
 from gdp.diagnosis.facts import Facts
 from gdp.diagnosis.survey import ROLES, Survey
+from gdp.diagnosis.view import short
 from gdp.errors import LocalError
 from gdp.host.ros_processes import ros_processes
 from gdp.intervals import PROMPT_S
@@ -110,9 +111,9 @@ class FactGathering:
                 if result := _result(reply):
                     survey.add(str(reply.get("role")), result, is_near=is_near)
                 else:
-                    survey.add_silent(role, _short(target), str(reply.get("error") or "it withholds facts"))
+                    survey.add_silent(role, short(target), str(reply.get("error") or "it withholds facts"))
         for target in left:
-            survey.add_silent(role, _short(target), "no answer")
+            survey.add_silent(role, short(target), "no answer")
 
     def _with_host(self, facts: Facts, pid: int | None) -> Facts:
         """Add the ROS processes of this host, where a near flow has no local node."""
@@ -144,10 +145,6 @@ def _listed_if_silent(node: LocalDirectory, survey: Survey) -> Iterator[None]:
 
 def _is_lacking(reply: Mapping[str, object], *, is_last: bool) -> bool:
     return reply.get("state") != "answered" or (reply.get("cut") is True and not is_last)
-
-
-def _short(name: str) -> str:
-    return f"{name[:3]}…{name[-3:]}"
 
 
 def _result(reply: Mapping[str, object]) -> Mapping[str, object]:

@@ -1,7 +1,4 @@
-"""``gdp join``, ``gdp up`` and ``gdp agent``: a machine that becomes a member with a token, and its programs.
-
-I/O.
-"""
+"""``gdp join``, ``gdp up`` and ``gdp agent``: a machine that becomes a member with a token, and its programs."""
 
 from __future__ import annotations
 
@@ -34,9 +31,8 @@ from gdp.cli.secret import PROMPT, Secret
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
 from gdp.enrolment.domain_join import JoinRequest, join_domain, prefer_server
-from gdp.enrolment.machine_programs import Machine, check_program, read_machine
 from gdp.enrolment.preflight import check_tunnels
-from gdp.enrolment.programs import missing_ros
+from gdp.enrolment.programs import Machine, check_program, missing_ros, read_machine
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.upkeep import ShareUpkeep
 from gdp.stores.keyring import CARD

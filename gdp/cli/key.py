@@ -1,7 +1,4 @@
-"""``gdp key``: commands for the protection of private keys of a domain, an owner or a node.
-
-I/O.
-"""
+"""``gdp key``: commands for the protection of private keys of a domain, an owner or a node."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""``gdp keygen``: commands that make keys for an owner and keys for a node.
-
-I/O.
-"""
+"""``gdp keygen``: commands that make keys for an owner and keys for a node."""
 
 from __future__ import annotations
 

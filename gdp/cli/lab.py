@@ -1,7 +1,4 @@
-"""``gdp lab``: command that makes the keys, memberships and files of a small lab, except the rules of its proxies.
-
-I/O.
-"""
+"""``gdp lab``: command that makes the keys, memberships and files of a small lab, except the rules of its proxies."""
 
 from __future__ import annotations
 

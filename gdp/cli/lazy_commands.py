@@ -78,11 +78,7 @@ class LazyCommands(UserDict[str, Any]):
         return [(name, each.summary) for name, each in self._known.items()]
 
     def __getitem__(self, name: str) -> Any:
-        """Return a command.
-
-        Raises:
-            KeyError: there is none of that name.
-        """
+        """Return a command. Raises ``KeyError``: there is none of that name."""
         found = self.data[name]
         if isinstance(found, LazyCommand):
             found = self.data[name] = found.import_as(name)

@@ -1,7 +1,4 @@
-"""Nodes of this machine, by their control sockets, and names by text.
-
-I/O.
-"""
+"""Nodes of this machine, by their control sockets, and names by text."""
 
 from __future__ import annotations
 

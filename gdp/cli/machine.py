@@ -1,7 +1,4 @@
-"""Start of a machine's programs, for the commands that create or join a domain.
-
-I/O.
-"""
+"""Start of a machine's programs, for the commands that create or join a domain."""
 
 from __future__ import annotations
 
@@ -18,8 +15,7 @@ import typer
 
 from gdp.cli.node import set_up_logging
 from gdp.enrolment.addresses import default_directory
-from gdp.enrolment.machine_programs import read_machine
-from gdp.enrolment.programs import MachineProgram, missing_ros
+from gdp.enrolment.programs import MachineProgram, missing_ros, read_machine
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.supervisor import Failures, supervise
 from gdp.enrolment.units import has_systemd, install_units

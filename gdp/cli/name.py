@@ -1,7 +1,4 @@
-"""``gdp name``: command that prints the 256-bit name of metadata and an owner.
-
-I/O.
-"""
+"""``gdp name``: command that prints the 256-bit name of metadata and an owner."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Common parts of the commands of long-running nodes: logging, events, errors.
-
-I/O.
-"""
+"""Common parts of the commands of long-running nodes: logging, events, errors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options that several sub-commands of ``gdp`` share.
-
-I/O.
-"""
+"""Options that several sub-commands of ``gdp`` share."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from gdp.cli.output import items_from_text
-from gdp.cli.salt import SaltFile, read_salt
+from gdp.cli.secret import SaltFile, read_salt
 from gdp.errors import LocalError
 from gdp.limits import CERTIFICATE_LIFE_MAX_S
 from gdp.metadata import Metadata

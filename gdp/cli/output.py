@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from gdp.cli.salt import NAME_SALT
+from gdp.cli.secret import NAME_SALT
+from gdp.cli.tables import columns
 from gdp.errors import LocalError
 from gdp.metadata import SALT
-from gdp.state.columns import columns
 from gdp.terminal import echo
 
 if TYPE_CHECKING:  # a short command loads nothing of keys
@@ -69,11 +69,7 @@ def items_from_text(texts: Iterable[str]) -> dict[str, str]:
 
 
 def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
-    """Read the rights to delegate.
-
-    Raises:
-        LocalError: an unknown right.
-    """
+    """Read the rights to delegate. Raises ``LocalError``: an unknown right."""
     from gdp.trust.right import Right
 
     known = {right.value: right for right in Right}
@@ -84,11 +80,7 @@ def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
 
 
 def epochs_from_text(text: str) -> list[int]:
-    """Read epochs, such as ``0``, ``0-3`` or ``0,2,7-9``.
-
-    Raises:
-        LocalError: anything else.
-    """
+    """Read epochs, such as ``0``, ``0-3`` or ``0,2,7-9``. Raises ``LocalError``: anything else."""
     from gdp.trust.grants import EPOCH_MAX
 
     epochs: set[int] = set()

@@ -23,11 +23,7 @@ _SWITCHES: Final = ("switch", "leaf")
 
 
 class PathProbe:
-    """Requests about the path of one name.
-
-    Args:
-        connection: to the node that asks.
-    """
+    """Requests about the path of one name; ``connection``: to the node that asks."""
 
     def __init__(self, connection: NodeConnection, name: Name) -> None:
         self._connection = connection

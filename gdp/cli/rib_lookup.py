@@ -1,7 +1,4 @@
-"""``gdp rib lookup``: who advertises a name, as the RIB states it to a switch of this machine.
-
-I/O.
-"""
+"""``gdp rib lookup``: who advertises a name, as the RIB states it to a switch of this machine."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, field_v
 from gdp.cli import options
 from gdp.cli.delegations import until
 from gdp.cli.output import show, table
-from gdp.cli.salt import read_salt
+from gdp.cli.secret import read_salt
 from gdp.config.schema import Directory, ExistingFile, Section, load, relative
 from gdp.errors import LocalError, StatementError
 from gdp.intervals import DAY_S

@@ -1,7 +1,4 @@
-"""``gdp cert rollover``: commands that replace the root key of a domain without an interruption.
-
-I/O.
-"""
+"""``gdp cert rollover``: commands that replace the root key of a domain without an interruption."""
 
 from __future__ import annotations
 

@@ -9,11 +9,12 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import typer
 
 from gdp.errors import LocalError
+from gdp.metadata import SALT
 
 PROMPT: Final = Path("-")
 
@@ -76,3 +77,28 @@ class Secret:
             f"{argument}: every user of this host reads arguments; put the {self.name} into a private file and say"
             f" {instead}"
         )
+
+
+NAME_SALT: Final = Secret("salt", "--salt-file", "GDP_SALT")
+
+SaltFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--salt-file",
+        metavar="FILE",
+        help="the unguessable part of the name: a private file with it; -: ask for it. Without: GDP_SALT, if set",
+    ),
+]
+
+
+def read_salt(file: Path | None) -> dict[str, str]:
+    """Return the salt as an item of metadata; empty if none is given.
+
+    Args:
+        file: as for ``Secret.read``.
+
+    Raises:
+        LocalError: the file is not private, or the salt is empty or not text.
+    """
+    text = NAME_SALT.read(file)
+    return {} if text is None else {SALT: text}

@@ -22,7 +22,7 @@ from gdp.client.send_options import RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import HOUR_S, LOOK_S
-from gdp.sharing.folder_exchange import FolderExchange
+from gdp.sharing.exchange import FolderExchange
 from gdp.sharing.grants import ShareReport
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.member_exchange import MemberExchange

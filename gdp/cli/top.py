@@ -1,7 +1,4 @@
-"""``gdp top``: live rates of the names that this machine's nodes carry.
-
-I/O.
-"""
+"""``gdp top``: live rates of the names that this machine's nodes carry."""
 
 from __future__ import annotations
 
@@ -18,11 +15,11 @@ import typer
 
 from gdp.cli.options import Host
 from gdp.cli.output import show
+from gdp.cli.tables import bits, columns, short_count
 from gdp.cli.topic import JsonLines, Sockets, answers_of
 from gdp.management.running_nodes import find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, rated_rows
 from gdp.printable import escaped
-from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction
 from gdp.terminal import echo
 

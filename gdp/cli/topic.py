@@ -16,10 +16,10 @@ from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.options import Host, known_name
 from gdp.cli.output import show
+from gdp.cli.tables import bits, columns, short_count
 from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
 from gdp.management.topic_rates import RatedRow, known_names, rated_rows
 from gdp.names import Name
-from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
 from gdp.terminal import echo
 

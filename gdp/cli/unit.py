@@ -17,13 +17,13 @@ import typer
 from gdp.cli import options
 from gdp.cli.machine import say
 from gdp.cli.output import show
-from gdp.enrolment.machine_programs import check_program, read_machine
+from gdp.cli.tables import columns
+from gdp.enrolment.programs import check_program, read_machine
 from gdp.enrolment.service_status import UnitState, known_units, unit_state
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import UNIT_FOLDER, has_systemd, install_units, installed_units, remove_units
 from gdp.errors import LocalError
 from gdp.intervals import SERVER_S
-from gdp.state.columns import columns
 
 _NOT_WELL: Final = 1
 _NOTHING: Final = 3

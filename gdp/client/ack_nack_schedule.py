@@ -1,7 +1,4 @@
-"""Schedule of a reader's reports: when the next one is due, and what it states of the frames that came.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Schedule of a reader's reports: when the next one is due, and what it states of the frames that came."""
 
 from __future__ import annotations
 

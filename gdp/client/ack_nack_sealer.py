@@ -15,7 +15,7 @@ from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import seal_key
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import READER
 from gdp.message.acknack import AckNack
 from gdp.names import Name
@@ -99,11 +99,7 @@ class AckNackSealer:
         return frames
 
     def sealer(self, epoch: int) -> ControlSealer:
-        """Return the sealer of reports under an epoch.
-
-        Raises:
-            KeyError: there is no secret of that epoch.
-        """
+        """Return the sealer of reports under an epoch. Raises ``KeyError``: there is no secret of that epoch."""
         if epoch not in self._sealers:
             key = control_key(self._shared, self._secrets[epoch], *self._context(Kind.ACKNACK))
             self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)

@@ -15,18 +15,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import RightEvidence
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello import NodeSettings
 from gdp.control.hello_port import TWO_HELLOS_S
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.pace import ReaderPace
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
-from gdp.control.settings import NodeSettings
+from gdp.control.rib_statements import AdvertiseAck
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -35,19 +34,17 @@ from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind
 from gdp.intervals import SoftState, renew_after_s
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps, new_tuple
-from gdp.trust.advertisement import MS, UnverifiedAdvertisement
+from gdp.trust.advertisement import MS, UnverifiedAdvertisement, Withdrawal
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.withdrawal import Withdrawal
 
 _FIRST_S: Final = 0.5  # until the first acknowledgement
 _FIRST: Final = Backoff(_FIRST_S, _FIRST_S)

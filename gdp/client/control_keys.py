@@ -37,11 +37,7 @@ class ControlKeys:
         return shared
 
     def introduced(self, wire: bytes, name: Name, incarnation: int) -> Introduction:
-        """Return a verified introduction of a reader.
-
-        Raises:
-            StatementError: it is invalid.
-        """
+        """Return a verified introduction of a reader. Raises ``StatementError``: it is invalid."""
         key = name + incarnation.to_bytes(8, "big") + wire
         introduction = self._introduced.get(key)
         if introduction is None:

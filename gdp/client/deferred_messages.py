@@ -1,7 +1,4 @@
-"""Deferred messages of a writer: kept before its first reader, unsealed, oldest first.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Deferred messages of a writer: kept before its first reader, unsealed, oldest first."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, RemoteError
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.intervals import NEVER_S
 from gdp.limits import NUMBER_MAX, REPLAY_WINDOW_MESSAGES, SEQUENCE_BYTES
 from gdp.message.bundle import unpack

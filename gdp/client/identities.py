@@ -1,7 +1,4 @@
-"""Identities of a writer, of a reader and of another publisher in one incarnation of their process, with their keys.
-
-Sans-I/O.
-"""
+"""Identities of a writer, of a reader and of another publisher in one incarnation of their process, with their keys."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from gdp.client.identities import WriterIdentity
 from gdp.crypto.envelope import KeyContext, Opener, Sealer
 from gdp.crypto.parity_seal import ParityOpener, ParitySealer
 from gdp.errors import DropReason, EnvelopeError, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import EPOCH_GRACE_S
 from gdp.names import Name
 
@@ -105,11 +105,7 @@ class KeyEpochs:
 
 
 class Openers:
-    """Openers of what one incarnation of a writer seals.
-
-    Args:
-        is_signed: its messages have signatures.
-    """
+    """Openers of what one incarnation of a writer seals; ``is_signed``: its messages have signatures."""
 
     def __init__(self, secrets: Secrets, publisher: Name, incarnation: int, topic: Name, *, is_signed: bool) -> None:
         self._secrets = secrets

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from gdp.client.key_epochs import KeyEpochs
 from gdp.crypto.envelope import Sealed
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.limits import FRAME_MAX_BYTES, SEQUENCE_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, Gathered, pack
 

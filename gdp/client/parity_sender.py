@@ -19,11 +19,11 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final
 
+from gdp.burst.cipher import TAG_BYTES
 from gdp.client.key_epochs import KeyEpochs
 from gdp.client.redundancy import CopyBudget
-from gdp.crypto.envelope import SIGNATURE_BYTES, TAG_BYTES, fragment_capacity
-from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT, PACE_AT, PARTS_MASK
-from gdp.frame.kinds import Flag
+from gdp.crypto.envelope import SIGNATURE_BYTES, fragment_capacity
+from gdp.frame.codec import FLAGS_AT, HEADER_BYTES, NUMBER_AT, PACE_AT, PARTS_MASK, Flag
 from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
 from gdp.message.parity import OVERHEAD_BYTES, SHARD_OVERHEAD_BYTES, Parity, blocks_of, shard_of, span_of

@@ -28,17 +28,16 @@ from gdp.client.unicast_stream import PeerIncarnation
 from gdp.client.writer_proxy import WriterProxy
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.diagnostics import Diagnostics, Question
+from gdp.control.hello import NodeSettings
 from gdp.control.join import Join
-from gdp.control.query import Response
-from gdp.control.settings import NodeSettings
+from gdp.control.rib_statements import Response
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.statements import Statement, StatementType
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError
-from gdp.frame.codec import Header, decode
-from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.frame.codec import CONTROL_FROM, Header, Kind, decode
 from gdp.intervals import NEVER_S
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

@@ -1,7 +1,4 @@
-"""Publications of a participant: a publisher for each name, and unicast streams where it serves or calls.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Publications of a participant: a publisher for each name, and unicast streams where it serves or calls."""
 
 from __future__ import annotations
 
@@ -170,11 +167,7 @@ class Publications:
             streams.forget(party)
 
     def receive_introduction(self, header: Header, frame: bytes) -> None:
-        """Process a reader's introduction.
-
-        Raises:
-            RemoteError: it concerns nothing that is published here.
-        """
+        """Process a reader's introduction. Raises ``RemoteError``: it concerns nothing that is published here."""
         publisher = self._publishers.get(topic_of(header, frame))  # type: ignore[call-overload]
         if publisher is None:
             raise StatementError(DropReason.NOT_FOR_US)

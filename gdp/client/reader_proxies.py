@@ -20,8 +20,7 @@ from gdp.client.identities import WriterIdentity
 from gdp.crypto.control_seal import ControlOpener, ControlReplayWindow, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
-from gdp.frame.codec import Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind
 from gdp.intervals import FORGET_S, NEVER_S, READER, SERVER
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.message.heartbeat import StreamStart
@@ -65,11 +64,7 @@ class _Incarnation:
         self._openers: dict[bytes, ControlOpener] = {}  # by topic secret
 
     def open(self, header: Header, frame: bytes, secret: bytes, now_s: float) -> bytes:
-        """Return a report's body.
-
-        Raises:
-            EnvelopeError: REPLAYED, MALFORMED or BAD_TAG.
-        """
+        """Return a report's body. Raises ``EnvelopeError``: REPLAYED, MALFORMED or BAD_TAG."""
         self._numbers.check(header.number, now_s)
         opener = self._openers.get(secret)
         if opener is None:

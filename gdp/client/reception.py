@@ -1,7 +1,4 @@
-"""Reception of a participant: frames go to their writer proxies; messages and reports come out.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Reception of a participant: frames go to their writer proxies; messages and reports come out."""
 
 from __future__ import annotations
 
@@ -49,11 +46,7 @@ class Reception:
         self._paces: dict[tuple[Name, Name], tuple[int, float]] = {}  # stated; and when again, by topic and publisher
 
     def receive(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
-        """Pass a frame to its writer proxy.
-
-        Raises:
-            StatementError: NOT_FOR_US.
-        """
+        """Pass a frame to its writer proxy. Raises ``StatementError``: NOT_FOR_US."""
         found = self._subscriptions.find(header, now_s)
         if found is None:
             raise StatementError(DropReason.NOT_FOR_US)

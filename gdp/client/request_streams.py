@@ -60,11 +60,7 @@ class RequestStreams:
         self._held: dict[Hashable, _Request] = {}  # ... and those with copies that have not begun
 
     def send_to_all(self, call: Hashable, message: bytes, now_s: float) -> None:
-        """Send a request to all servers.
-
-        Raises:
-            LocalError: above the limits.
-        """
+        """Send a request to all servers. Raises ``LocalError``: above the limits."""
         servers, fits = self._paths.fastest_first(self._public.matched.reporting(now_s), len(message), now_s)
         if len(servers) < 2 or (fits and not self._apart):
             self._public.publish(message)

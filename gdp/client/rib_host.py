@@ -13,13 +13,12 @@ from gdp.client.attachment import Attachment
 from gdp.control.channel import Channels
 from gdp.control.diagnostics import Diagnostics
 from gdp.control.fragments import ControlReassembler
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.frame.codec import CONTROL_FROM, Kind, decode
 from gdp.names import Name
 from gdp.rib.core import RibCore
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

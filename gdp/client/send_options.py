@@ -1,7 +1,4 @@
-"""Settings of a publisher, and its send options: how fresh, how much and how often its messages leave.
-
-Sans-I/O.
-"""
+"""Settings of a publisher, and its send options: how fresh, how much and how often its messages leave."""
 
 from __future__ import annotations
 
@@ -105,11 +102,7 @@ RELIABLE: Final = PublisherSettings()
 
 
 def checked(options: SendOptions) -> SendOptions:
-    """Return the options.
-
-    Raises:
-        LocalError: one of them is out of bounds.
-    """
+    """Return the options. Raises ``LocalError``: one of them is out of bounds."""
     deadline_s, weight, max_bits_s = options.deadline_s, options.weight, options.max_bits_s
     if deadline_s is not None and not 0 < deadline_s <= HOUR_S:
         raise LocalError(f"deadline_s is above 0 and at most {HOUR_S:g} s, not {deadline_s!r}")

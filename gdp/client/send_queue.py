@@ -26,7 +26,7 @@ from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, LENGTH_BYTES, SMALL, Gathered, pack
 from gdp.message.ledger import Ledger

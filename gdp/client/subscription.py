@@ -20,7 +20,7 @@ from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.unicast_stream import Party, PeerIncarnation, UnicastReceiver, private_incarnation, private_name
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
-from gdp.control.query import Response
+from gdp.control.rib_statements import Response
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import Header
 from gdp.intervals import SERVER

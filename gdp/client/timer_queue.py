@@ -1,7 +1,4 @@
-"""Timers of many objects, each of which is read again only after it may have changed.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Timers of many objects, each of which is read again only after it may have changed."""
 
 from __future__ import annotations
 

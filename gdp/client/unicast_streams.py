@@ -1,7 +1,4 @@
-"""Unicast streams of one node on one name: one for each peer, and the choice of those to forget.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Unicast streams of one node on one name: one for each peer, and the choice of those to forget."""
 
 from __future__ import annotations
 

@@ -30,8 +30,7 @@ from gdp.client.delivery import NOT_BEGUN, Delivery, Ended
 from gdp.client.identities import PublisherIdentity, ReaderIdentity
 from gdp.client.key_epochs import Openers, Secrets
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import HOPS_AT, SECOND_PATH, Header, decode, second_path_copy
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HOPS_AT, SECOND_PATH, Flag, Header, Kind, decode, second_path_copy
 from gdp.intervals import NEVER_S, READER
 from gdp.limits import (
     COST_UNREACHABLE,

@@ -38,8 +38,7 @@ from gdp.config.schema import (
     Unique,
     load,
 )
-from gdp.control.endpoint_record import UPLINKS_MAX
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import UPLINKS_MAX, Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError

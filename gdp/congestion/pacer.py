@@ -1,7 +1,4 @@
-"""Pacer of a path: when the next frame may leave by the pace alone.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Pacer of a path: when the next frame may leave by the pace alone."""
 
 from __future__ import annotations
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from gdp.congestion.filters import WindowedExtreme
-
 FIRST_RTT_S: Final = 0.02  # until one is measured
 _NOISE_S: Final = 0.002
 _STANDING_REPORTS: Final = 4  # that all show a queue, where the empty path is shorter than that noise
@@ -21,6 +19,30 @@ _RATE_ROUNDS: Final = 10
 _RECENT_ROUNDS: Final = 2
 _CAPACITY_WINDOW_S: Final = 60.0  # longer than a competitor hides what the path can carry
 _LOSS_FRAMES: Final = 1_000
+
+
+class WindowedExtreme:
+    """Highest sample of a window, or the lowest one; ``is_lowest``: which of both."""
+
+    __slots__ = ("_sign", "_waiting")
+
+    def __init__(self, *, is_lowest: bool) -> None:
+        self._sign = 1.0 if is_lowest else -1.0
+        self._waiting = deque[tuple[float, float]]()  # moment, signed value; ascending in both
+
+    def add(self, at: float, value: float, oldest: float) -> float:
+        """Add a sample, and forget those before ``oldest``; moments never decrease. Return the extreme."""
+        signed, waiting = self._sign * value, self._waiting
+        while waiting and waiting[-1][1] >= signed:
+            waiting.pop()
+        waiting.append((at, signed))
+        while waiting[0][0] < oldest:
+            waiting.popleft()
+        return self._sign * waiting[0][1]
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._waiting.clear()
 
 
 class PathModel:

@@ -53,11 +53,7 @@ class Cookies:
         self._drawn_s = float("-inf")
 
     def make(self, session: bytes, mac: bytes, now_s: float) -> bytes:
-        """Return the cookie of an address.
-
-        Args:
-            session: nonce of our port.
-        """
+        """Return the cookie of an address; ``session``: nonce of our port."""
         self._rotate(now_s)
         return _cookie(self._secrets[0], session, mac)
 

@@ -149,11 +149,7 @@ class _Asker:
 
 
 class Channels:
-    """Channels of one node.
-
-    Args:
-        accepts: whether others may open channels here.
-    """
+    """Channels of one node; ``accepts``: whether others may open channels here."""
 
     def __init__(
         self, identity: Identity, policy: Policy, random_bytes: Callable[[int], bytes], *, accepts: bool

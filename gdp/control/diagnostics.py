@@ -19,8 +19,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, check_sequence, parse
 from gdp.errors import DropReason, FrameError, LocalError, StatementError
-from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HOPS_AT, HOPS_MASK, Header, Kind
 from gdp.limits import DIAGNOSTIC_FRAMES_RATE, DIAGNOSTIC_WAIT_S, DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.message.clock_offset import ClockEstimate, ClockOffset, ClockStamps
 from gdp.message.replay import ReplayWindow

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.errors import DropReason, FrameError, LocalError
-from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, encode
 from gdp.limits import (
     CONTROL_JOIN_BYTES,
     CONTROL_JOIN_SOURCE_BYTES,

@@ -1,4 +1,4 @@
-"""Hello: the periodic message between neighbours on a link.
+"""Hello: the periodic message between neighbours on a link, and the settings with which a node begins to send it.
 
 Sans-I/O. Source: OSPF (RFC 2328, section 9.5).
 """
@@ -6,6 +6,7 @@ Sans-I/O. Source: OSPF (RFC 2328, section 9.5).
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Final, NamedTuple
 
@@ -15,6 +16,7 @@ from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.schema import CERT, OCTETS, STATEMENT, Body, Keyed, many, mapped, octets, or_empty, packed, row, uint
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
+from gdp.intervals import ADVERTISEMENT, DETECT_MULTIPLIER, KEEPALIVE_MS, NEIGHBOUR
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 
@@ -114,3 +116,41 @@ class Hello(Body):
         """Return if the message about a preshared key has one of its sizes. Raises ``StatementError``: MALFORMED."""
         if len(self.preshared) not in SIZES:
             raise StatementError(DropReason.MALFORMED, "a message about a preshared key")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeSettings:
+    """Start settings of a switch, a RIB or a participant.
+
+    Args:
+        incarnation: 64 random bits, new at each start.
+        first_sequence: above every sequence number of an earlier incarnation; wall-clock milliseconds suffice.
+        random_bytes: source of nonces.
+        hello_s: between two hellos on a port.
+        dead_s: a neighbour silent for this time is lost, while it sends no keepalives.
+        lease_s: lease of what the node keeps at RIBs: advertisements of a participant or a RIB, watches of a switch.
+        keepalive_ms: between keepalives, which neighbours negotiate; 0: none; None: in proportion to ``dead_s``.
+        detect_multiplier: a neighbour silent for this number of keepalives is lost.
+    """
+
+    incarnation: int
+    first_sequence: int
+    random_bytes: Callable[[int], bytes]
+    hello_s: float = NEIGHBOUR.refresh_s
+    dead_s: float = NEIGHBOUR.lease_s
+    lease_s: float = ADVERTISEMENT.lease_s
+    keepalive_ms: int | None = None
+    detect_multiplier: int = DETECT_MULTIPLIER
+
+    @property
+    def incarnation_id(self) -> bytes:
+        """Return the mark of this incarnation, ``INCARNATION_BYTES``: of two, that of the older one is less."""
+        return self.first_sequence.to_bytes(8, "big") + self.incarnation.to_bytes(8, "big")
+
+    @property
+    def timing(self) -> Timing:
+        """Return the keepalive timing that this node requests."""
+        every_ms = (
+            round(KEEPALIVE_MS * self.dead_s / NEIGHBOUR.lease_s) if self.keepalive_ms is None else self.keepalive_ms
+        )
+        return Timing(every_ms, every_ms, self.detect_multiplier)

@@ -1,7 +1,4 @@
-"""Port of the hello protocol: its session, its neighbours, and what hellos on it must carry.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Port of the hello protocol: its session, its neighbours, and what hellos on it must carry."""
 
 from __future__ import annotations
 
@@ -11,19 +8,19 @@ from typing import Final
 from gdp.control.admission import Admission
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import echo_of
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.link_quality import LinkQuality
 from gdp.control.link_state import link_key
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.pace import ReaderPace
-from gdp.control.strangers import Strangers
+from gdp.crypto.certificates import issuer_label
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, StatementError
 from gdp.limits import COST_AUTO
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 
+STRANGERS_MAX: Final = 8  # on one port; the one silent for longest is evicted
 _ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
 _CREDIT_MAX_BYTES: Final = 16 << 10
 _QUALITIES_MAX: Final = 128  # neighbours and former ones; above all that a port has at once
@@ -32,6 +29,45 @@ _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 TWO_HELLOS_S: Final = 0.04  # in which two hellos may be asked for, both at once: a handshake needs them
 _EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
 UNREACHABLE: Final = (-1, -1)
+
+
+@dataclass(slots=True)
+class Stranger:
+    """A node whose membership is not accepted here.
+
+    Args:
+        domain: label of the domain that its certificate names; empty where it cannot be read.
+        heard_s: monotonic seconds of its last hello.
+    """
+
+    domain: str
+    reason: DropReason
+    heard_s: float
+
+
+class Strangers:
+    """The refused neighbours of one port, kept for a message to the operator.
+
+    Nothing here is proven: a refused certificate may contain anything. So labels serve for reading only, and their
+    number is bounded.
+    """
+
+    def __init__(self) -> None:
+        self._by_membership: dict[bytes, Stranger] = {}
+
+    def record(self, membership: bytes, reason: DropReason, now_s: float) -> None:
+        """Remember that a hello with this certificate, DER, was refused."""
+        known = self._by_membership.get(membership)
+        if known is not None:
+            known.reason, known.heard_s = reason, now_s
+            return
+        if len(self._by_membership) >= STRANGERS_MAX:
+            del self._by_membership[min(self._by_membership, key=lambda each: self._by_membership[each].heard_s)]
+        self._by_membership[membership] = Stranger(issuer_label(membership), reason, now_s)
+
+    def since(self, begin_s: float) -> list[Stranger]:
+        """Return those heard at ``begin_s`` or later."""
+        return [each for each in self._by_membership.values() if each.heard_s >= begin_s]
 
 
 @dataclass(slots=True, kw_only=True)

@@ -12,15 +12,13 @@ from typing import Final, NamedTuple
 
 from gdp.control.admission import NEIGHBOUR_HELLOS, Cookies, cookie_payload
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
-from gdp.control.hello import HELLO_MAX_BYTES, Hello
+from gdp.control.hello import HELLO_MAX_BYTES, Hello, NodeSettings
 from gdp.control.hello_port import HelloPort
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import HEADER_BYTES, Header
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Header, Kind
 from gdp.limits import MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

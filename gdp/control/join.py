@@ -1,24 +1,47 @@
-"""Join and leave: a switch's request to the next one towards a publisher, to extend or prune a multicast tree.
+"""Join and leave: a switch's request to the next one towards a publisher, to extend or prune a multicast tree; refresh.
 
 Sans-I/O. Source: PIM-SM (RFC 7761). A recorded join or leave has no effect: each names the present sessions of both
 ends and counts up within them. So a restarted sender is accepted at once, independent of its clock.
+
+A join has several frames: two advertisements with all their certificates. While nothing in it changes, its number alone
+renews it, and one refresh renews the joins of many trees. A receiver that does not know a number says so, and gets the
+whole join again. Source: RFC 2961, section 5 (the Summary Refresh of RSVP, and its MESSAGE_ID_NACK).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Final, NamedTuple
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
 from gdp.control.link_state import LINK_KEY_MAX
-from gdp.control.query import TRANSIT_MAX
-from gdp.crypto.schema import NAME, NAME_OR_ZERO, STATEMENT, Body, Keyed, many, mapped, number, octets, row, uint
+from gdp.control.rib_statements import TRANSIT_MAX
+from gdp.crypto.schema import (
+    FLAG,
+    NAME,
+    NAME_OR_ZERO,
+    STATEMENT,
+    Body,
+    Keyed,
+    joined,
+    many,
+    mapped,
+    number,
+    octets,
+    row,
+    uint,
+)
 from gdp.crypto.statements import StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.intervals import LEASE_MAX_S
 from gdp.limits import FRAME_MAX_BYTES, PACE_MAX, PATHS_MAX
 from gdp.names import ZERO, Name
 
+NUMBERS_MAX: Final = 128  # of one statement, so that it fits into a frame of Ethernet's MTU
+_NUMBERS: Final = joined(
+    8, partial(int.from_bytes, byteorder="big"), partial(int.to_bytes, length=8, byteorder="big"), NUMBERS_MAX
+)
 ROUTE_MAX: Final = 32  # links of one path
 
 
@@ -82,3 +105,27 @@ class Join(Body):
         """Return if the route has no loop. Raises ``StatementError``: MALFORMED, a switch stands twice."""
         if len({link.name for link in self.route}) < len(self.route):
             raise StatementError(DropReason.MALFORMED, "a route with a loop")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinRefresh(Body):
+    """Numbers of joins that stand, or (``is_reply``) of those in a refresh that the receiver does not have.
+
+    Args:
+        numbers: ``sequence`` of each join, at most ``NUMBERS_MAX``.
+        session: echo of the receiver's port (``echo_of``).
+        sender_session: nonce of the sender's port.
+        sequence: rises with every join, leave and refresh of the sender within its session.
+    """
+
+    TYPE = StatementType.JOIN_REFRESH
+    numbers: Annotated[tuple[int, ...], Keyed("k", _NUMBERS)]
+    session: Annotated[bytes, Keyed("i", octets(ECHO_BYTES))]
+    sender_session: Annotated[bytes, Keyed("o", octets(NONCE_BYTES))]
+    sequence: Annotated[int, Keyed("s", uint())]
+    is_reply: Annotated[bool, Keyed("u", FLAG, absent=False, is_omitted=True)] = False
+
+    def check(self) -> None:
+        """Return if there are numbers. Raises ``StatementError``: MALFORMED."""
+        if not self.numbers:
+            raise StatementError(DropReason.MALFORMED, "no numbers of joins")

@@ -27,8 +27,7 @@ from gdp.control.link_probe import LinkProbe
 from gdp.control.link_quality import LinkQuality, LinkReport
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, FrameError
-from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Flag, KeepaliveFlag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, KeepaliveFlag, Kind, encode
 from gdp.intervals import NEVER_S
 from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
@@ -216,11 +215,7 @@ class KeepaliveSession:
         *,
         poll: bool,
     ) -> bytes:
-        """Return the next keepalive, and schedule the one after it.
-
-        Args:
-            source: our name and incarnation.
-        """
+        """Return the next keepalive, and schedule the one after it; ``source``: our name and incarnation."""
         flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
         self.is_final_due = self.is_poll_due = False
         name, incarnation = source

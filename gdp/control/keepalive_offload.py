@@ -17,8 +17,7 @@ from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_table import NeighbourTable
 from gdp.errors import DropReason, StatementError
-from gdp.frame.codec import encode
-from gdp.frame.kinds import KeepaliveFlag
+from gdp.frame.codec import KeepaliveFlag, encode
 from gdp.intervals import NEVER_S, SCHEDULED_S, UPKEEP_S
 from gdp.limits import COST_AUTO
 from gdp.names import Name

@@ -11,12 +11,11 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Final
 
-from gdp.control.hello import Timing
+from gdp.control.hello import NodeSettings, Timing
 from gdp.control.hello_port import HelloPort
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import Neighbour
 from gdp.control.neighbour_table import NeighbourTable
-from gdp.control.settings import NodeSettings
 from gdp.intervals import HELLO_IDLE, NEVER_S, SCHEDULED_S
 from gdp.names import Name
 

@@ -26,7 +26,7 @@ from typing import Final
 from gdp.control.admission import Admission, read_cookie, seal_cookie
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, Timing
+from gdp.control.hello import DIGEST_BYTES, NONCE_BYTES, RTCERTS_MAX, Hello, NodeSettings, Timing
 from gdp.control.hello_port import UNREACHABLE, HelloPort
 from gdp.control.hello_reception import HelloReception
 from gdp.control.identity_conflicts import IdentityConflicts
@@ -36,13 +36,11 @@ from gdp.control.liveness import LivenessMonitor
 from gdp.control.neighbour import Neighbour, NeighbourEvent, NeighbourState
 from gdp.control.neighbour_table import Change, NeighbourTable
 from gdp.control.preshared_key import PresharedKeys
-from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, FrameError, StatementError
-from gdp.frame.codec import HEADER_BYTES, Header, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Header, Kind, decode
 from gdp.intervals import HELLO_IDLE, NEVER_S, UPKEEP_S
 from gdp.limits import COST_AUTO, MTU_MIN_BYTES
 from gdp.names import Name

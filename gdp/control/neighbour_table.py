@@ -1,7 +1,4 @@
-"""Neighbour table: the neighbours at all ports of a node, and what has changed about them since it was read.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Neighbour table: the neighbours at all ports of a node, and what has changed about them since it was read."""
 
 from __future__ import annotations
 
@@ -24,11 +21,7 @@ Change = tuple[Neighbour, NeighbourState]
 
 
 class NeighbourTable:
-    """Neighbours of one node.
-
-    Attributes:
-        ports: by index, with the neighbours and candidates of each.
-    """
+    """Neighbours of one node; ``ports``: by index, with the neighbours and candidates of each."""
 
     def __init__(self) -> None:
         self.ports: dict[int, HelloPort] = {}

@@ -114,11 +114,7 @@ class PresharedKeyAgreement:
 
 
 class PresharedKeys:
-    """Preshared keys of one node's tunnels, by port.
-
-    Attributes:
-        refused: messages of an agreement, by reason.
-    """
+    """Preshared keys of one node's tunnels, by port; ``refused``: messages of an agreement, by reason."""
 
     def __init__(self, me: Name, random_bytes: Callable[[int], bytes]) -> None:
         self._me = me

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from gdp.control.query import TRANSIT_MAX
+from gdp.control.rib_statements import TRANSIT_MAX
 from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, FieldSet, Keyed, many, number, uint
 from gdp.intervals import LEASE_MAX_S
 from gdp.names import Name

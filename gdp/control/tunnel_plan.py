@@ -1,7 +1,4 @@
-"""Plan of a switch's tunnels: which of its uplinks is joined to which uplink of a peer, and where to dial.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Plan of a switch's tunnels: which of its uplinks is joined to which uplink of a peer, and where to dial."""
 
 from __future__ import annotations
 
@@ -10,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_record import UPLINKS_MAX, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import UPLINKS_MAX, CandidateType, Endpoint, EndpointRecord
 from gdp.names import Name
 from gdp.requests import Backoff
 

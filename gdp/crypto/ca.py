@@ -1,8 +1,10 @@
 """Certificate authority of a domain: it creates the root and issues memberships on request.
 
-Sans-I/O except for the randomness of serial numbers. Source: RFC 5280 (certificates), RFC 2986 (requests). ``openssl
-x509`` and ``openssl verify`` read what this module writes. ``certificates`` reads what ``openssl x509 -req
--copy_extensions copy`` issues from such a request.
+Sans-I/O except for the randomness of serial numbers and of a token. Source: RFC 5280 (certificates), RFC 2986
+(requests). ``openssl x509`` and ``openssl verify`` read what this module writes. ``certificates`` reads what ``openssl
+x509 -req -copy_extensions copy`` issues from such a request. The library signs with its own keys only. For another key,
+such as one in a token, a temporary key signs first; the part to be signed is taken from its result and gets the real
+key's signature (RFC 6979 for those of this process).
 """
 
 from __future__ import annotations
@@ -14,9 +16,12 @@ from datetime import datetime, timezone
 from typing import Final
 
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from gdp.crypto.certificates import Membership, Role, Root
-from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
+from gdp.crypto.pbes2 import der_element
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import (
@@ -26,10 +31,12 @@ from gdp.crypto.x509_profile import (
     distinguished_name,
     read_request,
 )
-from gdp.crypto.x509_sign import signed_certificate, signed_request
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.metadata import Metadata
 
+_SEQUENCE: Final = 0x30
+_BITS: Final = 0x03
+_ECDSA_SHA256: Final = bytes.fromhex("300a06082a8648ce3d040302")  # RFC 5758, section 3.2
 _KEY_ID_BYTES: Final = 20
 
 
@@ -206,3 +213,31 @@ def _key_usage(*, is_authority: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+
+
+def signed_certificate(builder: x509.CertificateBuilder, key: SigningKey) -> bytes:
+    """Return a certificate, DER."""
+    if isinstance(key, SoftwareKey):
+        return builder.sign(key.private, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.DER)
+    draft = builder.sign(SigningKey.generate().private, hashes.SHA256())
+    return _completed(draft.tbs_certificate_bytes, key)
+
+
+def signed_request(builder: x509.CertificateSigningRequestBuilder, key: SigningKey) -> bytes:
+    """Return a certificate request, PEM."""
+    if isinstance(key, SoftwareKey):
+        return builder.sign(key.private, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.PEM)
+    drawn = SigningKey.generate()
+    draft = builder.sign(drawn.private, hashes.SHA256()).tbs_certrequest_bytes
+    # Both are P-256 keys, so that the temporary one has the same length.
+    wire = _completed(draft.replace(_info(drawn.public), _info(key.public)), key)
+    return x509.load_der_x509_csr(wire).public_bytes(Encoding.PEM)
+
+
+def _completed(signed_part: bytes, key: SigningKey) -> bytes:
+    signature = der_element(_BITS, b"\0" + key.sign_der(signed_part))
+    return der_element(_SEQUENCE, signed_part + _ECDSA_SHA256 + signature)
+
+
+def _info(key: PublicKey) -> bytes:
+    return key.point.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.envelope import TAG_BYTES
+from gdp.burst.cipher import TAG_BYTES
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import (
     HEADER_BYTES,
@@ -30,11 +30,11 @@ from gdp.frame.codec import (
     NUMBER_AT,
     PACE_AT,
     PART_AT,
+    Flag,
     Header,
     authenticated,
     encode,
 )
-from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 

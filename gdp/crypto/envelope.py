@@ -40,30 +40,11 @@ from gdp.frame.codec import (
     NUMBER_AT,
     PACE_AT,
     PART_AT,
+    Flag,
     Header,
     encode,
 )
-from gdp.frame.kinds import Flag
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, PARTS_MAX, SEQUENCE_BYTES
-
-__all__ = [
-    "SALT_BYTES",
-    "SEAL_BYTES",
-    "SHARED_FLAGS",
-    "SIGNATURE_BYTES",
-    "TAG_BYTES",
-    "KeyContext",
-    "MessageKeys",
-    "Opened",
-    "Opener",
-    "Sealed",
-    "Sealer",
-    "Signer",
-    "digest_of",
-    "fragment_capacity",
-    "salt_of",
-    "seal_key",
-]
 
 SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its ciphertext
 SIGNATURE_BYTES: Final = 64

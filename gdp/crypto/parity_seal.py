@@ -14,10 +14,10 @@ from typing import Final
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCMSIV
 
-from gdp.crypto.envelope import TAG_BYTES, seal_key
+from gdp.burst.cipher import TAG_BYTES
+from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import HEADER_BYTES, Header, authenticated, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, authenticated, encode
 from gdp.limits import HOPS_MAX
 
 _NONCE: Final = struct.Struct("!QI")

@@ -18,11 +18,7 @@ _NONCE_BYTES: Final = 12
 
 
 class RecordKey:
-    """The key of one direction.
-
-    Args:
-        secret: 32 bytes, known to both ends only.
-    """
+    """The key of one direction; ``secret``: 32 bytes, known to both ends only."""
 
     __slots__ = ("_aead",)
 

@@ -201,11 +201,7 @@ class FieldSet:
 
 
 class Body(FieldSet):
-    """Body of a statement.
-
-    Attributes:
-        TYPE: of its statement.
-    """
+    """Body of a statement; ``TYPE``: of its statement."""
 
     __slots__ = ()
     TYPE: ClassVar[StatementType]

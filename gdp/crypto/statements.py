@@ -24,8 +24,6 @@ from gdp.intervals import DAY_S
 from gdp.limits import CONTROL_MAX_BYTES
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Statement", "StatementType", "Value", "assemble", "check_sequence", "parse", "sign"]
-
 
 class StatementType(str, Enum):
     """Registry of statement types; the value stands in the payload under ``t``."""

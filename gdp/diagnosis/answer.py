@@ -1,7 +1,4 @@
-"""Answer of a diagnosis: the cause, one sentence, the next command.
-
-Sans-I/O.
-"""
+"""Answer of a diagnosis: the cause, one sentence, the next command."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""View of the facts about one name: its two ends, and whether the network between them is whole.
-
-Sans-I/O.
-"""
+"""View of the facts about one name: its two ends, and whether the network between them is whole."""
 
 from __future__ import annotations
 

@@ -75,11 +75,7 @@ def duration_s(text: str) -> float:
 
 
 def default_directory(name: str, *, is_root: bool, state_home: str) -> Path:
-    """Return the directory of a domain's files on this machine.
-
-    Args:
-        state_home: ``XDG_STATE_HOME``, or empty.
-    """
+    """Return the directory of a domain's files on this machine; ``state_home``: ``XDG_STATE_HOME``, or empty."""
     if is_root:
         return Path("/var/lib/gdp") / name
     return (Path(state_home) if state_home else Path.home() / ".local/state") / "gdp" / name

@@ -21,7 +21,7 @@ from typing import Final
 
 from gdp.config.config import SwitchConfig
 from gdp.config.relay_config import RelayConfig
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.crypto.certificates import Membership, Unverified
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import FLAG, OCTETS, Keyed

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Endpoint, EndpointRecord
 from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.identity import node_metadata

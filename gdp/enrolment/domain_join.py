@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Role, Root
 from gdp.crypto.identity import Identity, NodeKeys

@@ -48,11 +48,7 @@ class MemberConfig(Section):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MemberFiles:
-    """The loaded ``member.yaml`` of a directory.
-
-    Args:
-        fingerprint: of the domain's founding root.
-    """
+    """The loaded ``member.yaml`` of a directory; ``fingerprint``: of the domain's founding root."""
 
     directory: Path
     config: MemberConfig

@@ -15,8 +15,7 @@ from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import to_pem
 from gdp.errors import LocalError
 from gdp.intervals import DAY_S
-from gdp.stores.checkout import ignore_folder
-from gdp.stores.files import private, write_all
+from gdp.stores.files import ignore_folder, private, write_all
 from gdp.stores.keyring import load_domain
 
 CERTIFICATE_DAYS: Final = 30.0  # the server issues another one at each start, and each day

@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.config.machine_file import NODE_SECTIONS, section_source
 from gdp.config.yaml_source import read_yaml
-from gdp.enrolment.machine_programs import configured_identity
+from gdp.enrolment.programs import configured_identity
 from gdp.enrolment.units import UNIT_FOLDER, installed_units, systemctl
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import ANSWER_S
@@ -63,11 +63,7 @@ def known_units(directory: Path | None = None) -> list[str]:
 
 
 def unit_state(unit: str) -> UnitState:
-    """Return the state of a unit.
-
-    Raises:
-        LocalError: systemd does not answer.
-    """
+    """Return the state of a unit. Raises ``LocalError``: systemd does not answer."""
     text = systemctl(["show", *(f"--property={key}" for key in _KEYS), unit])
     shown = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     active = shown.get("ActiveState", "unknown")

@@ -14,8 +14,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from gdp.enrolment.machine_programs import Machine
-from gdp.enrolment.programs import MachineProgram
+from gdp.enrolment.programs import Machine, MachineProgram
 from gdp.enrolment.units import MARK, quoted, unit_names
 from gdp.errors import LocalError
 

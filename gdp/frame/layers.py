@@ -33,9 +33,8 @@ from scapy.packet import Packet, bind_layers
 from scapy.utils import strxor
 
 from gdp.errors import LocalError
-from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH
+from gdp.frame.codec import CONTROL_FROM, ETHERTYPE, HEADER_BYTES, HOPS_MASK, SECOND_PATH, VERSION, Flag, Kind
 from gdp.frame.diagnostic import byte_string, diagnose
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 

@@ -1,7 +1,4 @@
-"""Interruption of work by a signal, so that the caller can still remove what the work made.
-
-I/O.
-"""
+"""Interruption of work by a signal, so that the caller can still remove what the work made."""
 
 from __future__ import annotations
 
@@ -16,11 +13,7 @@ _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(Exception):  # noqa: N818  (not an error)
-    """A signal cancelled the work.
-
-    Attributes:
-        exit_code: exit code of a shell for that signal.
-    """
+    """A signal cancelled the work; ``exit_code``: exit code of a shell for that signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -28,11 +21,7 @@ class Interrupted(Exception):  # noqa: N818  (not an error)
 
 
 async def interruptible(work: Coroutine[None, None, T]) -> T:
-    """Do the work and return its result.
-
-    Raises:
-        Interrupted: a signal cancelled it.
-    """
+    """Do the work and return its result. Raises ``Interrupted``: a signal cancelled it."""
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(work)
     caught: list[int] = []

@@ -30,9 +30,8 @@ from dataclasses import fields, replace
 from itertools import islice
 from typing import Any, Final, TypeVar
 
-from gdp.control.hello import Timing
+from gdp.control.hello import NodeSettings, Timing
 from gdp.control.rib_replication import Entry
-from gdp.control.settings import NodeSettings
 from gdp.crypto.cbor import encode
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey, SigningKey

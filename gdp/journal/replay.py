@@ -15,14 +15,13 @@ from itertools import islice, takewhile, zip_longest
 from typing import Any
 
 from gdp.client.rib_host import RibHost
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import Identity
 from gdp.crypto.kem import KemPrivateKey, KemPublicKey
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
-from gdp.frame.codec import KIND_AT
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import KIND_AT, Kind
 from gdp.journal.incident import Incident, well_formed
 from gdp.journal.journal import CALLS, JournalKey
 from gdp.names import Name

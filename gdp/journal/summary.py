@@ -1,7 +1,4 @@
-"""Summary of an incident for people: what came, went and was lost, by neighbour, kind and name, and when.
-
-Sans-I/O.
-"""
+"""Summary of an incident for people: what came, went and was lost, by neighbour, kind and name, and when."""
 
 from __future__ import annotations
 
@@ -10,8 +7,7 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from typing import Final
 
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, KIND_AT, SOURCE_AT
-from gdp.frame.kinds import CONTROL_FROM
+from gdp.frame.codec import CONTROL_FROM, DESTINATION_AT, HEADER_BYTES, KIND_AT, SOURCE_AT
 from gdp.journal.incident import Incident, well_formed
 from gdp.journal.replay import kind_of
 from gdp.names import Name

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.control.tunnel_plan import Dialer, RebindSchedule, TunnelId, planned_tunnels
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
@@ -48,11 +48,7 @@ class _Peer:
 
 
 class TunnelLinks:
-    """Decisions on the tunnels of a running switch.
-
-    Args:
-        underlays: a WireGuard device for each uplink.
-    """
+    """Decisions on the tunnels of a running switch; ``underlays``: a WireGuard device for each uplink."""
 
     def __init__(
         self,

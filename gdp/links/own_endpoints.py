@@ -11,8 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import CANDIDATES_MAX, Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.links.endpoint_files import own_record, public_candidates

@@ -1,28 +1,35 @@
 """What all parts of a relay share: its identity, its policy, its loop, and TLS contexts that follow renewals.
 
-I/O.
+I/O: the private key reaches the TLS library through a file in memory, never one on a disk.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.identity import Identity
+from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.statements import parse
-from gdp.errors import RemoteError
+from gdp.crypto.x509_profile import to_pem
+from gdp.errors import LocalError, RemoteError
 from gdp.links.relay_loop import RelayLoop
-from gdp.links.relay_tls import tls_context
 from gdp.ports.tap import relay_alias
 from gdp.relay.connection import ConnectionSettings
+from gdp.relay.tls_channel import ALPN
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 from gdp.trust.revocations import OPERATOR
 
 log = logging.getLogger(__name__)
+
+_NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME: ``Policy`` checks it, with the project's tolerance of clocks
+_PARTIAL_CHAIN = ssl.VERIFY_X509_PARTIAL_CHAIN  # a root that succeeds another is an anchor by itself
 
 
 @dataclass(slots=True, kw_only=True)
@@ -89,3 +96,41 @@ class RelayContext:
                 self.policy.revoked.receive_revocation(parse(path.read_bytes()), OPERATOR, at, lambda _: False)
             except (OSError, RemoteError) as error:
                 log.error("revocation not taken file=%s reason=%s", path, error)
+
+
+def tls_context(identity: Identity, policy: Policy, *, is_server: bool) -> ssl.SSLContext:
+    """Return a context that presents the node's membership and requires one of a trusted domain.
+
+    Raises:
+        LocalError: the key is in a token, which the TLS library cannot use.
+    """
+    key = identity.key
+    if not isinstance(key, SoftwareKey):
+        raise LocalError("the relay needs a signing key in a file: TLS cannot use the key in a token")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if is_server else ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # the name in the certificate is the switch's; ``verified_border`` compares it
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.verify_flags = ssl.VerifyFlags(_PARTIAL_CHAIN | _NO_CHECK_TIME)
+    context.set_alpn_protocols([ALPN])
+    context.options |= ssl.OP_NO_RENEGOTIATION | ssl.OP_NO_TICKET
+    if is_server:
+        context.num_tickets = 0  # no resumption: each connection verifies the certificate
+    with contextlib.suppress(ssl.SSLError):  # clears an error that a token's library left in this thread's queue
+        context.load_verify_locations(cadata=b"\0")
+    for root in policy.roots.values():
+        for each in root.lineage:
+            context.load_verify_locations(cadata=each.wire)
+    _load_own(context, to_pem(identity.membership) + key.to_pem())
+    return context
+
+
+def _load_own(context: ssl.SSLContext, pem: bytes) -> None:
+    descriptor = os.memfd_create("gdp-relay", os.MFD_CLOEXEC)
+    try:
+        os.write(descriptor, pem)
+        context.load_cert_chain(f"/proc/self/fd/{descriptor}")
+    except ssl.SSLError as error:
+        raise LocalError(f"the TLS library refuses the node's certificate: {error.reason or error}") from error
+    finally:
+        os.close(descriptor)

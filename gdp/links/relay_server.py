@@ -1,7 +1,4 @@
-"""Relay server of a border: accepts members over TLS and gives each a TAP device.
-
-I/O.
-"""
+"""Relay server of a border: accepts members over TLS and gives each a TAP device."""
 
 from __future__ import annotations
 

@@ -16,8 +16,7 @@ from types import MappingProxyType
 from typing import Final
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
-from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
+from gdp.control.endpoints import UPLINKS_MAX, Endpoint, EndpointRecord, inner_address, tunnel_vni
 from gdp.control.preshared_key import NO_KEY
 from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
@@ -26,12 +25,13 @@ from gdp.errors import LocalError
 from gdp.intervals import FORGET_S, UPKEEP_S
 from gdp.limits import COST_AUTO
 from gdp.names import Name
+from gdp.ports.tunnel.control import PeerState
 from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.rate_limit import limit_rate
 from gdp.ports.tunnel.uplink_routes import mark_of, remove_leftovers
 from gdp.ports.tunnel.vxlan import VXLAN_PORT, make_vxlan, remove_link, set_link_mtu
-from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
+from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore

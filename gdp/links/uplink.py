@@ -1,7 +1,4 @@
-"""Uplink device of a RIB or proxy: awaited, locked against a second node, and opened with advice in the error.
-
-I/O.
-"""
+"""Uplink device of a RIB or proxy: awaited, locked against a second node, and opened with advice in the error."""
 
 from __future__ import annotations
 

@@ -187,11 +187,7 @@ class NodeConnection(ClosedOnExit):
         return self.read_result()
 
     def show(self, what: str) -> list[Mapping[str, object]]:
-        """Return all rows of a table.
-
-        Raises:
-            LocalError: the node has no such table.
-        """
+        """Return all rows of a table. Raises ``LocalError``: the node has no such table."""
         rows: list[Mapping[str, object]] = []
         at: object = 0
         while at is not None:

@@ -1,7 +1,4 @@
-"""Rates of the names that running nodes carry, from two answers of each node.
-
-Sans-I/O.
-"""
+"""Rates of the names that running nodes carry, from two answers of each node."""
 
 from __future__ import annotations
 

@@ -64,11 +64,7 @@ class _Sample(NamedTuple):
 
 
 class ClockOffset:
-    """Offset of one node's clock.
-
-    Attributes:
-        drift: how much faster that clock runs, as a share; 0 until it is measured.
-    """
+    """Offset of one node's clock; ``drift``: how much faster that clock runs, as a share; 0 until it is measured."""
 
     __slots__ = ("_anchor", "_at_s", "_least_s", "_most_s", "_wall_s", "drift")
 

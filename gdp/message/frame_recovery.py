@@ -19,8 +19,7 @@ from typing import Final
 
 from gdp.crypto.envelope import SHARED_FLAGS
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import FLAGS_AT, Header, decode
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import FLAGS_AT, Flag, Header, decode
 from gdp.intervals import NEVER_S
 from gdp.limits import RECOVERY_BYTES
 from gdp.message import erasure

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, encode
 from gdp.message.erasure import DATA_MAX, PARITY_MAX
 
 SPAN_PARTS: Final = 1_024  # what a reader keeps for a message of any size: 1.5 MB of frames of 1,500 bytes
@@ -57,11 +56,7 @@ class Parity:
 
     @classmethod
     def from_wire(cls, body: bytes) -> Parity:
-        """Return the parity of a body.
-
-        Raises:
-            EnvelopeError: MALFORMED, too short, or an index out of bounds.
-        """
+        """Return the parity of a body. Raises ``EnvelopeError``: MALFORMED, too short, or an index out of bounds."""
         if len(body) <= OVERHEAD_BYTES:
             raise EnvelopeError(DropReason.MALFORMED, "parity without a shard")
         first, index, count = _FIELDS.unpack_from(body)

@@ -21,11 +21,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from gdp import burst
-from gdp.burst.cipher import BODY_AT, Plaintext
-from gdp.crypto.envelope import SEAL_BYTES, SHARED_FLAGS, TAG_BYTES, Opened, Opener, digest_of, salt_of
+from gdp.burst.cipher import BODY_AT, TAG_BYTES, Plaintext
+from gdp.crypto.envelope import SEAL_BYTES, SHARED_FLAGS, Opened, Opener, digest_of, salt_of
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PACE_AT, PART_AT, Header
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PACE_AT, PART_AT, Flag, Header
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.replay import ReplayWindow

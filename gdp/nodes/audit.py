@@ -47,11 +47,7 @@ def audit_folder(configured: Path | None) -> Path | None:
 
 
 class NodeAudit:
-    """Writer of a trail to the audit log.
-
-    Args:
-        drops: what the node dropped, by reason; counts only rise.
-    """
+    """Writer of a trail to the audit log; ``drops``: what the node dropped, by reason; counts only rise."""
 
     def __init__(self, audit_log: AuditLog, trail: AuditTrail, drops: Callable[[], Mapping[DropReason, int]]) -> None:
         self._log = audit_log

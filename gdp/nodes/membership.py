@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.config.schema import Directory, Domain
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError

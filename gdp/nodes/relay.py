@@ -82,11 +82,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
 
 
 class Relay:
-    """The server and the dialers of one process.
-
-    Raises:
-        LocalError: the port, a TAP device or TLS cannot be had.
-    """
+    """The server and the dialers of one process. Raises ``LocalError``: the port, a TAP device or TLS cannot be had."""
 
     def __init__(self, context: RelayContext) -> None:
         self._context = context

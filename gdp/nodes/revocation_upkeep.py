@@ -1,7 +1,4 @@
-"""Persistence of a node's revocations across restarts: loaded at the start, written when they change.
-
-I/O.
-"""
+"""Persistence of a node's revocations across restarts: loaded at the start, written when they change."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""RIB node (``gdp-rib``): the core of a RIB on a real device, with its routes in memory or in a cluster.
-
-I/O.
-"""
+"""RIB node (``gdp-rib``): the core of a RIB on a real device, with its routes in memory or in a cluster."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Upkeep of a RIB's store: a snapshot kept current, or a cluster listened to.
-
-I/O.
-"""
+"""Upkeep of a RIB's store: a snapshot kept current, or a cluster listened to."""
 
 from __future__ import annotations
 

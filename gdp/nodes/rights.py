@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Final
 from gdp.host.single_instance import lock_directory
 from gdp.nodes.audit import audit_folder
 from gdp.nodes.credentials import NodeConfig, watched_folders
-from gdp.ports.sandbox import Capability, Needs, confine
+from gdp.ports.confine.capabilities import Capability
+from gdp.ports.sandbox import Needs, confine
 
 if TYPE_CHECKING:  # a node loads its own configuration alone
     from gdp.config.config import RibConfig, SwitchConfig
@@ -42,11 +43,7 @@ _WRITABLE_BY_ALL: Final = stat.S_IWOTH
 
 
 def confine_switch(config: SwitchConfig, plane: str) -> None:
-    """Drop the rights that a switch does not need.
-
-    Args:
-        plane: the name of its data plane.
-    """
+    """Drop the rights that a switch does not need; ``plane``: the name of its data plane."""
     is_kernel = plane == "kernel"
     needs = Needs(
         capabilities=_DEVICE | (_PROGRAMS if is_kernel else frozenset()),

@@ -1,7 +1,4 @@
-"""Switch node (``gdp-switch``): the core of a switch on real devices.
-
-I/O.
-"""
+"""Switch node (``gdp-switch``): the core of a switch on real devices."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gdp.config.config import SwitchConfig
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
@@ -36,8 +33,7 @@ from gdp.state.name_lookup import SwitchLookups
 from gdp.state.node_state import SwitchState
 from gdp.state.snapshot import switch_snapshot, topology_snapshot
 from gdp.state.state_answers import answer_for_switch
-from gdp.state.switch_tables import switch_tables
-from gdp.state.switch_topics import switch_rows
+from gdp.state.switch_tables import switch_rows, switch_tables
 from gdp.state.topic_rows import rows_to_fields
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

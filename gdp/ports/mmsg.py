@@ -22,8 +22,7 @@ from typing import Final
 
 from gdp import burst
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.ports.sockets import waited_s
 from gdp.sansio import ReceivedFrame
 

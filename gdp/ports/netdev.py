@@ -26,8 +26,9 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import ETHER_BYTES
 from gdp.intervals import PACE_S, TICK_S
 from gdp.limits import FRAME_MAX_BYTES, MTU_MIN_BYTES
-from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, Keepalives, LinkCallback, Port, ReceivedFrame
+from gdp.ports.plane import MAC_BYTES, Counters, HasFileno, Keepalives, LinkCallback, Port
 from gdp.ports.rtnetlink import Link, LinkMonitor
+from gdp.sansio import ReceivedFrame
 from gdp.switch.table import Hops, Paces, Table
 
 log = logging.getLogger(__name__)

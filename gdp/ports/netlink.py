@@ -190,11 +190,7 @@ class NetlinkSocket:
         return self._ask(kind, body, 0)
 
     def dump(self, kind: Rtm, body: bytes) -> list[Message]:
-        """Return the reply to a request for all objects.
-
-        Raises:
-            RefusedError: the kernel refuses.
-        """
+        """Return the reply to a request for all objects. Raises ``RefusedError``: the kernel refuses."""
         return self._ask(kind, body, _NLM_F_DUMP)
 
     def queues(self) -> list[tuple[int, int, dict[int, bytes]]]:

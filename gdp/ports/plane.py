@@ -13,9 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from gdp.errors import DROP_COUNTERS
-from gdp.sansio import BROADCAST, KeepaliveOffer, KeepaliveRun, ReceivedFrame
-
-__all__ = ["BROADCAST", "MAC_BYTES", "Counters", "HasFileno", "LinkCallback", "Plane", "Port", "ReceivedFrame"]
+from gdp.sansio import KeepaliveOffer, KeepaliveRun, ReceivedFrame
 
 MAC_BYTES: Final = 6
 

@@ -14,27 +14,29 @@ from __future__ import annotations
 
 import select
 import socket
+import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
 from gdp import burst
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import (
+    CONTROL_FROM,
     ETHER_BYTES,
     FLAGS_AT,
     HOPS_AT,
     KIND_AT,
     OVERHEAD_BYTES,
+    Flag,
 )
-from gdp.frame.kinds import CONTROL_FROM, Flag
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
-from gdp.ports.closing import Closing
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import Port, ReceivedFrame
+from gdp.ports.plane import Port
 from gdp.ports.sockets import (
     TrafficClass,
     attach_drop_all_filter,
@@ -43,6 +45,7 @@ from gdp.ports.sockets import (
     open_port,
     tell_neighbours,
 )
+from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 from gdp.token_bucket import TokenBucket
@@ -280,3 +283,32 @@ class RawPlane(NetdevPlane):
             left = self._batch.forward(sinks[hop[0]], first, count, hop[1], counters.drops)
             counters.forwarded += left
             counters.frames_out += left
+
+
+class Closing:
+    """What a plane has given up, and the kernel still holds: it takes 8 to 30 ms (a grace period of RCU) to close each.
+
+    A port has seven sockets or bpf links. Without a thread, a switch would do nothing for 100 ms when a robot leaves
+    it.
+    """
+
+    def __init__(self) -> None:
+        self._threads: list[tuple[str, threading.Thread]] = []  # each with its device
+
+    def close(self, ifname: str, closes: Sequence[Callable[[], object]]) -> None:
+        """Call these, which belong to one device, one after the other in a thread, whatever one raises."""
+        if not closes:
+            return
+        stack = ExitStack()
+        for close in reversed(closes):
+            stack.callback(close)
+        thread = threading.Thread(target=stack.close, name="closing", daemon=True)
+        self._threads.append((ifname, thread))
+        thread.start()
+
+    def wait(self, ifname: str | None = None) -> None:
+        """Wait until a device, or all, is closed, as it must be before it is opened again."""
+        for name, thread in self._threads:
+            if ifname in (None, name):
+                thread.join()
+        self._threads = [each for each in self._threads if each[1].is_alive()]

@@ -17,8 +17,6 @@ from gdp.ports.confine import landlock, seccomp
 from gdp.ports.confine.capabilities import Capability, drop_bounding, keep_only
 from gdp.ports.confine.system import prctl
 
-__all__ = ["Capability", "Needs", "Rights", "confine"]
-
 log = logging.getLogger(__name__)
 
 _NO_NEW_PRIVS: Final = 38  # PR_SET_NO_NEW_PRIVS

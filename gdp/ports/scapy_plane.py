@@ -21,14 +21,14 @@ from scapy.sendrecv import sendp, sniff
 from scapy.utils import str2mac
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import ETHER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.frame.layers import GDP
 from gdp.ports.mmsg import send_failure
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.plane import MAC_BYTES, Port
 from gdp.ports.readiness import readable
 from gdp.ports.sockets import NO_RAW_SOCKETS, attach_ethertype_filter, kernel_drops, large_buffers
+from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import Table
 
@@ -36,11 +36,7 @@ _BURST: Final = 64  # frames of one port before the next port is read
 
 
 class ScapyPlane(NetdevPlane):
-    """``Plane`` over one Scapy socket per port.
-
-    Raises:
-        LocalError: as ``add_port``.
-    """
+    """``Plane`` over one Scapy socket per port. Raises ``LocalError``: as ``add_port``."""
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._sockets: dict[int, tuple[L2Socket, int]] = {}  # with the file descriptor, which is needed after a close

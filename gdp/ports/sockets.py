@@ -30,8 +30,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, Flag, Kind
+from gdp.frame.codec import CONTROL_FROM, ETHER_BYTES, ETHERTYPE, FLAGS_AT, KIND_AT, Flag, Kind
 
 AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
 NO_RAW_SOCKETS: Final = f"raw sockets need root or CAP_NET_RAW; {AS_ROOT}"
@@ -136,11 +135,7 @@ _BY_ADDRESS: Final = {
 
 
 def steps_of(traffic_class: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
-    """Return the filter of a traffic class.
-
-    Args:
-        neighbours: addresses, 6 bytes each; each one adds five steps.
-    """
+    """Return the filter of a traffic class; ``neighbours``: addresses, 6 bytes each; each one adds five steps."""
     steps: tuple[_Step, ...] = traffic_class.value
     if traffic_class not in _BY_ADDRESS:
         return steps

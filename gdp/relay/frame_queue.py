@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, KIND_AT
-from gdp.frame.kinds import CONTROL_FROM, Flag
+from gdp.frame.codec import CONTROL_FROM, ETHER_BYTES, FLAGS_AT, KIND_AT, Flag
 
 _KIND: Final = ETHER_BYTES + KIND_AT
 _FLAGS: Final = ETHER_BYTES + FLAGS_AT

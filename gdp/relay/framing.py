@@ -19,8 +19,7 @@ from enum import IntEnum
 from typing import Final
 
 from gdp.errors import DropReason, FrameError
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE, HEADER_BYTES
 
 MTU_MIN: Final = 576
 MTU_MAX: Final = 9_000

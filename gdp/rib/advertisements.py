@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.presence import Presence
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import AdvertiseAck, RelayedStatement
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.rib.revocations import send_revoking
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState
@@ -23,10 +22,9 @@ from gdp.rib.store import check_quota
 from gdp.rib.upstream_advertisements import Passed
 from gdp.rib.watches import Asker
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement, Withdrawal
 from gdp.trust.audit import Action
 from gdp.trust.right import Right
-from gdp.trust.withdrawal import Withdrawal
 
 
 def receive_advertisement(

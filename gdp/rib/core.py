@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
-from gdp.control.relayed_statement import RelayedStatement
 from gdp.control.rib_replication import Entry
+from gdp.control.rib_statements import RelayedStatement
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of, record_in
+from gdp.control.endpoints import ENDPOINT_NAMES_MAX, ENDPOINTS, EndpointRecord, item_of, record_in
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, check_sequence, parse
@@ -23,7 +22,7 @@ from gdp.due_queue import DueQueue, earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage, pages
 from gdp.exchange.sync_set import SyncSet, line_of, rank_in
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import ENDPOINT, LEASE_MIN_S
 from gdp.limits import (
     ENDPOINT_QUERIES_RATE,

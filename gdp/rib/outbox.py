@@ -1,20 +1,16 @@
-"""Outbox of a RIB: it signs statements, and decides which members receive a route, its move or its end.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Outbox of a RIB: it signs statements, and decides which members receive a route, its move or its end."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gdp.control.advertise_ack import AdvertiseAck
-from gdp.control.query import Response
 from gdp.control.rib_replication import Key
+from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import Body
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import LEASE_MIN_S, NEGATIVE_LEASE_S
 from gdp.names import Name
 from gdp.rib.route import Route, Withdrawn
@@ -55,11 +51,7 @@ class RibOutbox:
         self.unknown_answers = 0
 
     def send_body(self, kind: Kind, body: Body, *to: Name, about: Key | None = None) -> None:
-        """Sign a body once, and send it to each of the names.
-
-        Args:
-            about: as of ``OutgoingStatement``.
-        """
+        """Sign a body once, and send it to each of the names; ``about``: as of ``OutgoingStatement``."""
         if to:
             wire = self._identity.signed(body)
             self._outgoing += [OutgoingStatement(name, kind, wire, about) for name in to]

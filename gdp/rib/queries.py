@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.query import Query, Response
+from gdp.control.rib_statements import Query, Response
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError, StoreError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import LEASE_MIN_S
 from gdp.names import Name
 from gdp.rib.replication import is_cold

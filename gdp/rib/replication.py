@@ -8,21 +8,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.endpoint_sync import ENDPOINTS
+from gdp.control.endpoints import ENDPOINTS
 from gdp.control.rib_replication import Entry
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import CLOCK_SKEW_S
 from gdp.rib.outbox import OutgoingStatement
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.state import ROUTES, RibCoreState
 from gdp.rib.store import check_quota
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import Advertisement
-from gdp.trust.withdrawal import Withdrawal
+from gdp.trust.advertisement import Advertisement, Withdrawal
 
 COLD_S: Final = 3.0  # a RIB that just started denies no name before it compared with a peer, for so long at most
 

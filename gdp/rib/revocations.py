@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.control.query import Query
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import Query, RelayedStatement
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.rib.state import RibCoreState

@@ -1,7 +1,4 @@
-"""Route: the stored form of one advertisement in a RIB.
-
-Sans-I/O.
-"""
+"""Route: the stored form of one advertisement in a RIB."""
 
 from __future__ import annotations
 

@@ -1,16 +1,17 @@
 """State of a RIB's core: its parts, and what it counts.
 
-Sans-I/O. The handlers of statements read and change it; ``core.py`` has their table. A handler raises
-``StatementError`` for a statement that it refuses, and ``StoreError`` where a shared store did not respond.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The handlers of statements read and change it; ``core.py`` has
+their table. A handler raises ``StatementError`` for a statement that it refuses, and ``StoreError`` where a shared
+store did not respond.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from gdp.control.endpoint_sync import ENDPOINTS
+from gdp.control.endpoints import ENDPOINTS
 from gdp.control.presence import IdentityChecks
 from gdp.control.rib_replication import Entry, Key
 from gdp.crypto.certificates import Membership, Role
@@ -18,26 +19,120 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.anti_entropy import AntiEntropy, SyncPace
-from gdp.intervals import LEASE_MAX_S, Rate
+from gdp.intervals import ADVERTISEMENT, LEASE_MAX_S, NEVER_S, Rate
 from gdp.limits import ANSWER_BYTES_RATE, RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.names import NAME_BYTES, Name
 from gdp.rib.endpoints import RibEndpoints
-from gdp.rib.former import FormerAdvertisers
-from gdp.rib.lower_ribs import LowerRibs
 from gdp.rib.outbox import RibOutbox
+from gdp.rib.route import Route
 from gdp.rib.store import Store
-from gdp.rib.upstream_advertisements import UpstreamAdvertisements
+from gdp.rib.upstream_advertisements import QUIET_S, UpstreamAdvertisements
 from gdp.rib.upstream_queries import UpstreamQueries
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
+from gdp.trust.lru import Lru
 from gdp.trust.verifier import AdvertisementVerifier
 
+if TYPE_CHECKING:
+    from gdp.diagnosis.facts import GoneFact
+
+_NAMES_MAX: Final = 4_096  # whose former advertisers are kept
+_ADVERTISERS_MAX: Final = 16  # of one name
+_LAPSED: Final = "lapsed"
+_WITHDREW: Final = "withdrew"
+_Gone: TypeAlias = tuple[str, Name, Name]  # how, and its last switch and that one's domain
 PEERS_MAX: Final = 16
 ROUTES: Final = b"routes"  # without it, several RIBs share the store itself
 _PACE: Final = SyncPace(total_s=1.0, soon_s=0.2, fetch_s=0.5, reply_s=0.005, reply_bytes=128 << 10, draws=64)
 _PASSED_RATE: Final = Rate(8.0, burst=128.0)  # revocations forwarded to the tier above, of one sender
 _SENT_RATE: Final = Rate(64.0, burst=2_048.0)  # revocations to one asker, of what it lacks
+
+
+@dataclass(slots=True)
+class _Rib:
+    probed_s: float = -NEVER_S
+    heard_s: float = -NEVER_S
+    returned_s: float = -NEVER_S
+    is_silent: bool = False
+
+
+class LowerRibs:
+    """What probes say of the RIBs of the tiers below whose routes lapsed; others are not recorded.
+
+    A lease ends with its advertiser only where the RIB that relayed the advertisement is alive: it answers a probe. The
+    routes of a silent RIB are kept, as those of a silent tier above are (RFC 8767 in spirit). A RIB that is back has
+    half a lease to relay them again.
+    """
+
+    def __init__(self) -> None:
+        self._ribs: dict[Name, _Rib] = {}
+
+    def record_alive(self, rib: Name, now_s: float) -> None:
+        """Record a sign of life."""
+        known = self._ribs.get(rib)
+        if known is not None:
+            known.heard_s = now_s
+            if known.is_silent:
+                known.is_silent, known.returned_s = False, now_s
+
+    def keep_s(self, rib: Name, now_s: float) -> float:
+        """Return for how many seconds to keep a route that a RIB did not renew; 0: the RIB is alive, the lease ends."""
+        known = self._ribs.setdefault(rib, _Rib())
+        since_s = now_s - known.probed_s
+        if known.heard_s < known.probed_s and since_s >= QUIET_S:
+            known.is_silent = True
+        if known.is_silent:
+            return ADVERTISEMENT.lease_s / 2  # it renews within a third
+        left_s = known.returned_s + ADVERTISEMENT.lease_s / 2 - now_s
+        if left_s > 0.0:
+            return left_s
+        return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * QUIET_S else QUIET_S
+
+    def is_probe_due(self, rib: Name, now_s: float) -> bool:
+        """Return whether to probe a RIB whose routes are kept; that counts as done."""
+        known = self._ribs.setdefault(rib, _Rib())
+        is_due = now_s - known.probed_s >= QUIET_S
+        if is_due:
+            known.probed_s = now_s
+        return is_due
+
+
+class FormerAdvertisers:
+    """How advertisers of names left, and why an advertisement was refused last, for diagnoses.
+
+    Bounded: of too many, those that were noted or asked for longest ago are forgotten.
+    """
+
+    def __init__(self) -> None:
+        self._gone: Lru[dict[Name, _Gone]] = Lru(_NAMES_MAX)
+        self._refused: Lru[str] = Lru(_NAMES_MAX)
+
+    def note_gone(self, route: Route, *, is_lapsed: bool) -> None:
+        """Note that an advertiser withdrew a name, or that its lease ended."""
+        known = self._gone.get(route.name) or {}
+        known.pop(route.advertiser, None)
+        known[route.advertiser] = (_LAPSED if is_lapsed else _WITHDREW, route.switch, route.domain)
+        if len(known) > _ADVERTISERS_MAX:
+            del known[next(iter(known))]
+        self._gone.put(route.name, known)
+
+    def note_refused(self, name: Name, reason: DropReason) -> None:
+        """Note why an advertisement of a name was refused."""
+        self._refused.put(name, reason.label)
+
+    def gone(self, name: Name) -> tuple[GoneFact, ...]:
+        """Return the advertisers of a name that left, those that are back included."""
+        from gdp.diagnosis.facts import GoneFact  # a node gathers facts for who asks
+
+        return tuple(
+            GoneFact(advertiser=each.to_text(), how=how, switch=switch.to_text(), domain=domain.to_text())
+            for each, (how, switch, domain) in (self._gone.get(name) or {}).items()
+        )
+
+    def refused(self, name: Name) -> str:
+        """Return the label of the newest refusal of a name, or an empty text."""
+        return self._refused.get(name) or ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

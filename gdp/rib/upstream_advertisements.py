@@ -33,11 +33,7 @@ class Passed(NamedTuple):
 
 
 class UpstreamAdvertisements:
-    """The tier above as one RIB sees it.
-
-    Args:
-        ribs: of the tier above, the preferred one first; empty at the top.
-    """
+    """The tier above as one RIB sees it; ``ribs``: of the tier above, the preferred one first; empty at the top."""
 
     def __init__(self, ribs: tuple[Name, ...]) -> None:
         self._ribs = ribs

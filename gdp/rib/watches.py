@@ -1,7 +1,4 @@
-"""Watches: which members are notified of changes to a name, and until when.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Watches: which members are notified of changes to a name, and until when."""
 
 from __future__ import annotations
 

@@ -12,11 +12,7 @@ SAVED_MAX: Final = 10.0  # second copies that quiet times save for a burst
 
 
 class HedgeBudget:
-    """Budget that requests earn and second copies spend.
-
-    Args:
-        share: second copies per request, 0 to 1.
-    """
+    """Budget that requests earn and second copies spend; ``share``: second copies per request, 0 to 1."""
 
     __slots__ = ("_saved", "_share")
 

@@ -176,11 +176,7 @@ class Follower:
         self._go_on()
 
     def renewed(self, *, is_doubtful: bool) -> None:
-        """Record that the server restarted.
-
-        Args:
-            is_doubtful: it may have received an entry since.
-        """
+        """Record that the server restarted; ``is_doubtful``: it may have received an entry since."""
         self.doing = Doing.NOTHING
         self._follow, self._asked_state, self._can_tell = None, False, self._tells
         self._log, self._index, self._is_lost = NO_LOG, 0, is_doubtful

@@ -1,7 +1,4 @@
-"""Latency of recent responses, and which server responded fastest recently.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Latency of recent responses, and which server responded fastest recently."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Replication of a log to the replicas that follow it.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Replication of a log to the replicas that follow it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Pending calls of a replicated log: each waits until one replica has applied its entry.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Pending calls of a replicated log: each waits until one replica has applied its entry."""
 
 from __future__ import annotations
 

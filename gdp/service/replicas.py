@@ -1,7 +1,4 @@
-"""Replicas of a service with state, as its sequencer knows them.
-
-Sans-I/O.
-"""
+"""Replicas of a service with state, as its sequencer knows them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Replicated log of one service: its entries, and the snapshot that replaces those that were removed.
-
-Sans-I/O.
-"""
+"""Replicated log of one service: its entries, and the snapshot that replaces those that were removed."""
 
 from __future__ import annotations
 

@@ -23,11 +23,7 @@ _AGAIN_S: Final = 0.25  # until the window doubles again
 
 
 class ServerWindow:
-    """Window of one local server.
-
-    Args:
-        size: requests that its queue holds.
-    """
+    """Window of one local server; ``size``: requests that its queue holds."""
 
     def __init__(self, size: int) -> None:
         self._size = size

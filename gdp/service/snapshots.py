@@ -1,7 +1,4 @@
-"""Snapshot requests of a replicated log: which replica is asked for its state, and until when.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Snapshot requests of a replicated log: which replica is asked for its state, and until when."""
 
 from __future__ import annotations
 
@@ -17,11 +14,7 @@ LOAD_S: Final = 10.0  # until a replica counts as silent that has a snapshot to 
 
 
 class SnapshotRequests:
-    """At most one request at a time.
-
-    Args:
-        effects: requests to send are appended here.
-    """
+    """At most one request at a time; ``effects``: requests to send are appended here."""
 
     def __init__(self, effects: list[Ask | ReplicaCommand]) -> None:
         self._effects = effects

@@ -122,11 +122,7 @@ class ThreadDriver:
         return time.monotonic()
 
     def run(self, command: Callable[[], T]) -> T:
-        """Run a command on the node and return what it returns.
-
-        Raises:
-            ClosedError: the session is closed.
-        """
+        """Run a command on the node and return what it returns. Raises ``ClosedError``: the session is closed."""
         done = threading.Event()
         results: list[T] = []
         errors: list[BaseException] = []

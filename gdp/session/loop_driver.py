@@ -97,11 +97,7 @@ class LoopDriver:
             self._loop.call_soon(self._scheduled)
 
     def check(self) -> None:
-        """Return if the session works.
-
-        Raises:
-            ClosedError: it is closed, or has failed.
-        """
+        """Return if the session works. Raises ``ClosedError``: it is closed, or has failed."""
         if self._error is not None:
             raise ClosedError(f"the session has failed: {self._error!r}; open a new one") from self._error
         if self._is_closed:

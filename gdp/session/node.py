@@ -1,7 +1,4 @@
-"""Node of a session: a participant of the overlay on one device, with its credentials and its log.
-
-I/O.
-"""
+"""Node of a session: a participant of the overlay on one device, with its credentials and its log."""
 
 from __future__ import annotations
 

@@ -100,11 +100,7 @@ def _delegation(wire: str) -> Delegation:
 
 
 class IssuedStore:
-    """Issued delegations in an owner's directory.
-
-    Args:
-        owner: directory of the owner's keys.
-    """
+    """Issued delegations in an owner's directory; ``owner``: directory of the owner's keys."""
 
     def __init__(self, owner: Path) -> None:
         self.owner = owner

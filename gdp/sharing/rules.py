@@ -43,11 +43,7 @@ def kind_from_text(kind: str, type_name: str = "") -> Kind:
 
 
 def check_exposed(files: ProxyFiles, state: ShareState, offers: Iterable[Offer], wanted: ExposedName) -> None:
-    """Refuse a name that is exposed or imported already.
-
-    Raises:
-        LocalError: the text says where, and what to do.
-    """
+    """Refuse a name that is exposed or imported already. Raises ``LocalError``: the text says where, and what to do."""
     check_name(wanted.name)
     kind_from_text(wanted.kind, wanted.type_name)
     if wanted.kind != "topic" and (wanted.deadline_ms is not None or wanted.repair is not None):

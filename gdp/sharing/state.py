@@ -175,11 +175,7 @@ class Offer:
 
 
 class StateFolder:
-    """The folder ``proxy.yaml.shares`` of one proxy.
-
-    Args:
-        path: of ``proxy.yaml``.
-    """
+    """The folder ``proxy.yaml.shares`` of one proxy; ``path``: of ``proxy.yaml``."""
 
     def __init__(self, path: Path) -> None:
         self.folder = path.with_name(path.name + _SUFFIX)

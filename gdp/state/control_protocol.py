@@ -58,11 +58,7 @@ _WITH_ARGUMENTS: Final = (Command.ASK, Command.INCIDENT, Command.LOOKUP, Command
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Request of a client.
-
-    Args:
-        arguments: JSON fields; only ``ask``, ``incident``, ``lookup`` and ``show`` have any.
-    """
+    """Request of a client; ``arguments``: JSON fields; only ``ask``, ``incident``, ``lookup`` and ``show`` have any."""
 
     command: Command
     arguments: Mapping[str, object] = field(default_factory=dict)
@@ -76,11 +72,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """Response of a node.
-
-    Args:
-        result: JSON fields; empty if ``error`` gives the reason of a refusal.
-    """
+    """Response of a node; ``result``: JSON fields; empty if ``error`` gives the reason of a refusal."""
 
     result: Mapping[str, object] = field(default_factory=dict)
     error: str = ""
@@ -95,11 +87,7 @@ Respond = Callable[[Response], None]
 
 
 class LineBuffer:
-    """Buffer that splits received bytes into lines.
-
-    Args:
-        max_bytes: largest line, its line feed included.
-    """
+    """Buffer that splits received bytes into lines; ``max_bytes``: largest line, its line feed included."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes

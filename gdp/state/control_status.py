@@ -1,7 +1,4 @@
-"""Status of a node for ``gdp status``: identity, uptime and counters.
-
-Sans-I/O.
-"""
+"""Status of a node for ``gdp status``: identity, uptime and counters."""
 
 from __future__ import annotations
 

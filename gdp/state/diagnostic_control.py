@@ -1,7 +1,4 @@
-"""Diagnostic requests and tables for the control socket: from JSON fields to the core, and back.
-
-Sans-I/O.
-"""
+"""Diagnostic requests and tables for the control socket: from JSON fields to the core, and back."""
 
 from __future__ import annotations
 
@@ -66,11 +63,7 @@ class DiagnosticCommands:
         )
 
     def show(self, arguments: Mapping[str, object]) -> Mapping[str, object]:
-        """Return one page of a table.
-
-        Raises:
-            LocalError: this kind of node has no such table.
-        """
+        """Return one page of a table. Raises ``LocalError``: this kind of node has no such table."""
         what = _text(arguments, "what")
         source = self.tables.get(what)
         if source is None:

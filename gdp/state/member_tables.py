@@ -1,7 +1,4 @@
-"""Tables of a node that is no switch: what it advertises, and the members at the other ends of its names.
-
-Sans-I/O.
-"""
+"""Tables of a node that is no switch: what it advertises, and the members at the other ends of its names."""
 
 from __future__ import annotations
 

@@ -72,11 +72,7 @@ class SwitchLookups:
 
 
 def rib_lookup(rib: RibCore, me: Name, name: Name, now: Timestamps) -> Mapping[str, object]:
-    """Return what a RIB stores about a name.
-
-    Raises:
-        StoreError: its store does not answer.
-    """
+    """Return what a RIB stores about a name. Raises ``StoreError``: its store does not answer."""
     rib.state.store.prefetch([name], now)
     found = []
     for route in rib.state.store.routes(name):

@@ -162,11 +162,7 @@ class NodeState(ABC):
 
 
 class SwitchState(NodeState):
-    """State of a switch.
-
-    Attributes:
-        unwaited: returns the ports for whose neighbours it does not wait.
-    """
+    """State of a switch; ``unwaited``: returns the ports for whose neighbours it does not wait."""
 
     role = "switch"
 

@@ -1,7 +1,4 @@
-"""Facts of a switch about one name: where its advertisers are, and its trees here.
-
-Sans-I/O.
-"""
+"""Facts of a switch about one name: where its advertisers are, and its trees here."""
 
 from __future__ import annotations
 

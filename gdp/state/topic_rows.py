@@ -1,7 +1,4 @@
-"""Rows of the control command ``topics``: the names that a node carries, and its counts of each.
-
-Sans-I/O.
-"""
+"""Rows of the control command ``topics``: the names that a node carries, and its counts of each."""
 
 from __future__ import annotations
 
@@ -88,11 +85,7 @@ def rows_to_fields(rows: Iterable[TopicRow], mono_s: float, limit: int = ROWS_MA
 
 
 def rows_from_fields(fields: Mapping[str, object]) -> tuple[float, list[TopicRow], int]:
-    """Return second, rows and the number of rows left out.
-
-    Raises:
-        RemoteError: the response has another form.
-    """
+    """Return second, rows and the number of rows left out. Raises ``RemoteError``: the response has another form."""
     mono_s, rows, left_out = fields.get("mono_s"), fields.get("topics"), fields.get("left_out")
     if not isinstance(mono_s, int | float) or not isinstance(rows, list) or not isinstance(left_out, int):
         raise RemoteError(DropReason.MALFORMED, "a response about topics")

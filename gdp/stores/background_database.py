@@ -74,11 +74,7 @@ class BackgroundDatabase(ABC, Generic[_S]):
 
     @abstractmethod
     def _write(self, database: sqlite3.Connection, slice_: _S, *, is_first: bool) -> None:
-        """Write a slice within a transaction.
-
-        Args:
-            is_first: no slice was written through this connection before.
-        """
+        """Write a slice within a transaction; ``is_first``: no slice was written through this connection before."""
 
     def _is_outdated(self, slice_: _S) -> bool:
         """Return whether a slice is dropped instead of written."""

@@ -4,6 +4,7 @@ I/O.
 A file appears under its name complete and synced, or not at all, so a kill in the middle leaves no partial file. A
 private file has mode 0600 from its first byte on. It is read and written only where no other user could have read or
 replaced it (``ownership``); a link in its place is not followed.
+Each key folder has a ``.gitignore`` that covers all of it, also itself: Git reads one in every folder (gitignore(5)).
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import BinaryIO, Final
 from gdp.errors import LocalError
 from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
+_IGNORE_FILE: Final = ".gitignore"
+_IGNORE_TEXT: Final = "# private keys; git must not take any file of this folder\n*\n"
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
 _PUBLIC_MODE: Final = 0o644  # minus the umask
@@ -178,3 +181,31 @@ def _read(path: Path, *, is_private: bool = False) -> bytes:
 
 def _translated(error: OSError, path: Path) -> LocalError:
     return LocalError(f"{error.filename or path}: {error.strerror or error}")
+
+
+def refuse_work_tree(directory: Path) -> None:
+    """Refuse the root of a work tree as a key folder. Raises ``LocalError``: all in it would have to be ignored."""
+    if (directory / ".git").exists():
+        raise LocalError(
+            f"{directory} is the root of a git work tree; keep keys in a folder of their own, such as"
+            f" {directory / 'keys'}"
+        )
+
+
+def ignore_folder(directory: Path) -> None:
+    """Let git ignore a folder of keys, also if it is moved into a work tree later; an existing file stays.
+
+    Raises:
+        LocalError: the system refuses.
+    """
+    if not (directory / _IGNORE_FILE).exists() and not _is_ours(directory.parent / _IGNORE_FILE):
+        write_all(directory, {_IGNORE_FILE: public(_IGNORE_TEXT.encode())})
+
+
+def _is_ours(path: Path) -> bool:
+    return path.is_file() and path.read_text(encoding="utf-8", errors="replace") == _IGNORE_TEXT
+
+
+def work_tree_of(path: Path) -> Path | None:
+    """Return the git work tree in which a path lies, without asking git; None: it lies in none."""
+    return next((each for each in path.absolute().parents if (each / ".git").exists()), None)

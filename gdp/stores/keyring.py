@@ -32,8 +32,16 @@ from gdp.crypto.x509_profile import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.stores.checkout import ignore_folder, refuse_work_tree
-from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
+from gdp.stores.files import (
+    NewFile,
+    ignore_folder,
+    private,
+    public,
+    read_private,
+    read_public,
+    refuse_work_tree,
+    write_all,
+)
 from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor

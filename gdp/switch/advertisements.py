@@ -13,27 +13,25 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
+from gdp.control.rib_statements import AdvertiseAck
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import ADVERTISEMENTS_RATE, ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import AttachedAdvertisement
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import AttachedAdvertisement, ForwardingState
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.relocation import Relocations
 from gdp.switch.rib_client import RibClient
 from gdp.switch.unicast import Unicast
 from gdp.token_bucket import TokenBuckets
-from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
+from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement, Withdrawal
 from gdp.trust.audit import Action
 from gdp.trust.right import HEARS, Right
-from gdp.trust.withdrawal import Withdrawal
 
 _SESSIONS_MAX: Final = 4_096  # more than the neighbours that a switch has
 _INCARNATION_BYTES: Final = 8  # at the end of an instance id

@@ -1,7 +1,4 @@
-"""Readers that are attached to a switch: nodes that read a topic, serve or call.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Readers that are attached to a switch: nodes that read a topic, serve or call."""
 
 from __future__ import annotations
 

@@ -19,18 +19,17 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.control.channel import Channels, Opened
 from gdp.control.diagnostics import Diagnostics
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello import NodeSettings
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.neighbour_table import Change
-from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, HOPS_AT, HOPS_MASK, SECOND_PATH, Header, decode, encode
-from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.frame.codec import CONTROL_FROM, HEADER_BYTES, HOPS_AT, HOPS_MASK, SECOND_PATH, Header, Kind, decode, encode
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

@@ -31,7 +31,7 @@ from enum import IntEnum
 from itertools import product
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.endpoints import Candidate, CandidateType, EndpointRecord
 from gdp.control.tunnel_plan import DIAL_S
 from gdp.intervals import Rate
 from gdp.limits import DIRECT_TUNNELS_MAX

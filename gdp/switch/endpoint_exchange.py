@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, record_in
+from gdp.control.endpoints import ENDPOINT_NAMES_MAX, ENDPOINTS, EndpointRecord, record_in
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType

@@ -13,15 +13,14 @@ from collections import Counter
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.hello import DIGEST_BYTES
+from gdp.control.hello import DIGEST_BYTES, NodeSettings
 from gdp.control.identity_conflicts import IdentityConflicts
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, LinkStateVersion, Scope
 from gdp.control.neighbour import Neighbour
-from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, check_sequence
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import LINK_STATE
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATES_RATE
 from gdp.names import Name

@@ -21,8 +21,10 @@ from typing import Final, NamedTuple
 
 from gdp.errors import DropReason
 from gdp.frame.codec import (
+    CONTROL_FROM,
     DESTINATION_AT,
     ETHER_BYTES,
+    ETHERTYPE,
     HEADER_BYTES,
     HOPS_AT,
     HOPS_MASK,
@@ -30,9 +32,10 @@ from gdp.frame.codec import (
     OVERHEAD_BYTES,
     PACE_AT,
     SECOND_PATH,
+    VERSION,
+    Kind,
     second_path_key,
 )
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Kind
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hop, Hops, Paces, is_side
 

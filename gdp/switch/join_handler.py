@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.control.pace import ReaderPace
 from gdp.crypto.certificates import Role
@@ -17,8 +16,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.limits import JOINS_RATE
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import JoinedBranch
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import ForwardingState, JoinedBranch
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.relocation import Relocations
 from gdp.token_bucket import TokenBuckets
@@ -59,11 +57,7 @@ class JoinHandler:
             self._relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
 
     def handle_refresh(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Handle a refresh of joins, or the reply to one.
-
-        Raises:
-            StatementError: as ``handle_join``.
-        """
+        """Handle a refresh of joins, or the reply to one. Raises ``StatementError``: as ``handle_join``."""
         refresh = JoinRefresh.from_statement(statement)
         if statement.signer != neighbour.name or not (refresh.is_reply or neighbour.role.is_switch):
             raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
@@ -75,11 +69,7 @@ class JoinHandler:
             self._multicast.refresh(refresh, neighbour, now.mono_s)
 
     def handle_pace(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Handle the pace of an attached reader.
-
-        Raises:
-            StatementError: as ``handle_join``.
-        """
+        """Handle the pace of an attached reader. Raises ``StatementError``: as ``handle_join``."""
         pace = ReaderPace.from_fields(statement.expect(StatementType.PACE))
         if statement.signer != neighbour.name or neighbour.role.is_switch:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a pace is from an attached reader")

@@ -1,6 +1,6 @@
 """Joins of a switch: sends those of its trees, renews them by number, and finds the branches that a number renews here.
 
-Sans-I/O. Source of the refreshes: RFC 2961, section 5 (``gdp/control/join_refresh.py``).
+Sans-I/O. Source of the refreshes: RFC 2961, section 5 (``gdp/control/join.py``).
 """
 
 from __future__ import annotations
@@ -9,9 +9,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
-from gdp.control.join import Join, Route
-from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
-from gdp.frame.kinds import Kind
+from gdp.control.join import NUMBERS_MAX, Join, JoinRefresh, Route
+from gdp.frame.codec import Kind
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff

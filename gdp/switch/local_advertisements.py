@@ -1,7 +1,4 @@
-"""Local advertisements: what attached nodes advertise through this switch, and whether the RIB has acknowledged it.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Local advertisements: what attached nodes advertise through this switch, and whether the RIB has acknowledged it."""
 
 from __future__ import annotations
 

@@ -10,19 +10,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement, relayed
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response, relayed
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import KnownLocation
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import ForwardingState, KnownLocation
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_cache import Location
 from gdp.switch.relocation import Relocations
@@ -98,11 +95,7 @@ class LocationUpdates:
         return _location(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
 
     def receive(self, location: Location, statement: bytes, now_s: float) -> None:
-        """Store where an advertiser is, and update everything that depends on it.
-
-        Args:
-            statement: the proof of it.
-        """
+        """Store where an advertiser is, and update everything that depends on it; ``statement``: the proof of it."""
         is_ours = location.switch == self._state.me
         attachment = self._state.attached.get(location.name, location.advertiser)
         if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:

@@ -22,8 +22,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.control.pace import ReaderPace
 from gdp.crypto.certificates import Role

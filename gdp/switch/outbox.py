@@ -1,7 +1,4 @@
-"""Outbox of a switch: the frames to send, collected until the I/O layer takes them, and statements made into frames.
-
-Sans-I/O.
-"""
+"""Outbox of a switch: the frames to send, collected until the I/O layer takes them, and statements made into frames."""
 
 from __future__ import annotations
 

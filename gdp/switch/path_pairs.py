@@ -44,11 +44,7 @@ class _Held:
 
 
 class PathPairs:
-    """The path pairs of one switch.
-
-    Args:
-        me: this switch.
-    """
+    """The path pairs of one switch; ``me``: this switch."""
 
     def __init__(self, me: Name, paths: Paths) -> None:
         self._me = me

@@ -79,11 +79,7 @@ class PathUpdates:
         self._find_conflicts(now_s)
 
     def handle_timer(self, now_s: float, *, has_lost: bool) -> None:
-        """Run the timers that are due.
-
-        Args:
-            has_lost: a neighbour was lost, so the update is not delayed.
-        """
+        """Run the timers that are due; ``has_lost``: a neighbour was lost, so the update is not delayed."""
         if has_lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
             self.follow(now_s)
         else:

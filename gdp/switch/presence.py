@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from gdp.control.presence import Presence
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.switch.forwarding_state import ForwardingState
 from gdp.switch.unicast import Unicast
@@ -26,11 +26,7 @@ class _Question:
 
 
 class PresenceAnswers:
-    """Open questions of RIBs about attached nodes.
-
-    Attributes:
-        open: by the node that each is about.
-    """
+    """Open questions of RIBs about attached nodes; ``open``: by the node that each is about."""
 
     def __init__(self, state: ForwardingState, unicast: Unicast) -> None:
         self._state = state

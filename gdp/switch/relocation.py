@@ -22,9 +22,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.control.neighbour import Neighbour
-from gdp.control.query import Query
-from gdp.control.relayed_statement import relayed
-from gdp.frame.kinds import Kind
+from gdp.control.rib_statements import Query, relayed
+from gdp.frame.codec import Kind
 from gdp.intervals import PACE_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff, Requests

@@ -21,13 +21,12 @@ from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.requests import Backoff, Requests
 from gdp.sansio import Timestamps
-from gdp.switch.dependents import AttachedAdvertisement, JoinedBranch, KnownLocation
-from gdp.switch.forwarding_state import ForwardingState
+from gdp.switch.forwarding_state import AttachedAdvertisement, ForwardingState, JoinedBranch, KnownLocation
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.unicast import Unicast
 from gdp.trust.advertisement import Advertisement

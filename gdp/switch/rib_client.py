@@ -18,19 +18,17 @@ from __future__ import annotations
 import hashlib
 from typing import Final
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
 from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement, relayed
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.schema import CERTIFICATE
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import REFUSED_S
 from gdp.names import Name
 from gdp.sansio import Timestamps

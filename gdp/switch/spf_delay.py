@@ -53,11 +53,7 @@ _DELAYS_S: Final = {_S.QUIET: 0.005, _S.SHORT_WAIT: 0.05, _S.LONG_WAIT: 0.3}
 
 
 class SpfDelay:
-    """The SPF back-off of one switch.
-
-    Attributes:
-        due_s: monotonic second at which paths are to be computed, or None.
-    """
+    """The SPF back-off of one switch; ``due_s``: monotonic second at which paths are to be computed, or None."""
 
     def __init__(self) -> None:
         self.state = SpfState.QUIET

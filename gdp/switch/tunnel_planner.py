@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.direct_tunnels import Action, DirectTunnels

@@ -20,8 +20,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from gdp.control.join import Route
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import JoinRefresh, Route
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason

@@ -18,11 +18,11 @@ from gdp.crypto.certificates import Membership
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.identity import Identity
 from gdp.crypto.schema import CERT, FLAG, NAME, STATEMENT, Body, Keyed, octets, or_empty, uint
-from gdp.crypto.statements import StatementType
+from gdp.crypto.statements import Statement, StatementType, check_sequence
 from gdp.crypto.subject import NAMED_SUBJECT, Subject
 from gdp.errors import LocalError
 from gdp.intervals import LEASE_MAX_S, LEASE_MIN_S
-from gdp.limits import ADVERTISEMENT_MAX_BYTES, SPREAD
+from gdp.limits import ADVERTISEMENT_MAX_BYTES, SPREAD, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.trust.adcert import CHAIN, Chain
 from gdp.trust.right import RIGHT, Right
@@ -180,3 +180,28 @@ def session_value(sign: object) -> bool:
     if sign not in ("always", "session"):
         raise LocalError(f"sign is 'always' or 'session', not {sign!r}")
     return sign == "session"
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawal(Body):
+    """The name and the right that its signer advertises no more. Source: BGP (RFC 4271, section 3.1).
+
+    Its sequence number counts with those of the node's advertisements, so that a late one ends nothing newer.
+    """
+
+    TYPE = StatementType.WITHDRAW
+    MAX_BYTES = WITHDRAWAL_MAX_BYTES
+    name: Annotated[Name, Keyed("n", NAME)]
+    right: Annotated[Right, Keyed("right", RIGHT)]
+    sequence: Annotated[int, Keyed("s", uint())]
+
+    @classmethod
+    def received(cls, statement: Statement, unix_s: float) -> Withdrawal:
+        """Read a parsed statement; no signature is checked.
+
+        Raises:
+            StatementError: MALFORMED, or TOO_BIG to be forwarded.
+        """
+        withdrawal = cls.from_statement(statement)
+        check_sequence(withdrawal.sequence, unix_s)
+        return withdrawal

@@ -177,11 +177,7 @@ class ListedMail(FieldSet):
 
 
 def apply(identifier: bytes, key: SigningKey, request: bytes, kem: KemPublicKey) -> Application:
-    """Return the application of a node with this key.
-
-    Args:
-        identifier: ``join_id`` of the token.
-    """
+    """Return the application of a node with this key; ``identifier``: ``join_id`` of the token."""
     return Application(request, kem, key.sign(_application_proof(identifier, request, kem)))
 
 

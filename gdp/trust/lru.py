@@ -1,7 +1,4 @@
-"""LRU cache of verified statements, bounded in size.
-
-Sans-I/O.
-"""
+"""LRU cache of verified statements, bounded in size."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rights of a node on a name.
-
-Sans-I/O.
-"""
+"""Rights of a node on a name."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""EC2 clients, one per region, created on first use; boto3 finds the credentials.
-
-I/O.
-"""
+"""EC2 clients, one per region, created on first use; boto3 finds the credentials."""
 
 from __future__ import annotations
 

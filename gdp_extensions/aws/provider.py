@@ -21,7 +21,7 @@ from fog.catalog.prices import price_list
 from fog.hardware import Hardware, Offer
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec, Program
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig
 from fog.providers.cloud_init import lines_of, user_data
 from fog.site import Site
 from gdp.errors import LocalError

@@ -11,7 +11,7 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig
 from gdp.errors import LocalError, StoreError
 from gdp.intervals import POLL_S
 from gdp_extensions.aws.clients import filters

@@ -19,8 +19,8 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Final
 
-from gdp.control.query import TRANSIT_MAX
 from gdp.control.rib_replication import Key
+from gdp.control.rib_statements import TRANSIT_MAX
 from gdp.crypto.schema import CERT, NAME, STATEMENT, FieldSet, Keyed, many
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError

@@ -1,7 +1,4 @@
-"""Upkeep of a store in a cluster: changes by other RIBs are received and passed to the RIB's watchers.
-
-I/O.
-"""
+"""Upkeep of a store in a cluster: changes by other RIBs are received and passed to the RIB's watchers."""
 
 from __future__ import annotations
 

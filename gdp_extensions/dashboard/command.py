@@ -1,7 +1,4 @@
-"""Command ``gdp dashboard``: a live view of the nodes of this machine, as a page on the loopback address.
-
-I/O.
-"""
+"""Command ``gdp dashboard``: a live view of the nodes of this machine, as a page on the loopback address."""
 
 from __future__ import annotations
 

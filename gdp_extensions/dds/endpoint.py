@@ -18,8 +18,7 @@ from gdp_extensions.dds.node import EntityContext, Node
 from gdp_extensions.dds.services import Client, Server
 from gdp_extensions.dds.topics import Publication, Subscription
 from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 from proxy.serial.standard_types import standard_channel, type_hash
 
 _Open = Subscription | Publication | Server | Client

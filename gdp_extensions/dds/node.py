@@ -1,14 +1,17 @@
 """Node: one DDS participant that appears as one ROS 2 node, with its readers and writers.
 
 I/O. What DDS refuses raises ``LocalError``.
-Source: rmw_dds_common for the announcement of nodes; the binding's own samples of built-in topics.
+A program without ``rmw`` does not read the variables of the discovery range, so nodes that stay on this host would
+never meet it. LOCALHOST means no multicast, and this host as the only peer.
+Source: ROS 2 documentation, "Improved dynamic discovery"; Cyclone DDS configuration guide, ``Discovery/Peers``;
+rmw_dds_common for the announcement of nodes; the binding's own samples of built-in topics.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from cyclonedds._clayer import ddspy_take
@@ -20,7 +23,6 @@ from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
 from gdp_extensions.dds import library
-from gdp_extensions.dds.discovery_range import with_discovery_range
 from gdp_extensions.dds.graph_cache import GraphCache
 from gdp_extensions.dds.naming import user_data
 from gdp_extensions.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
@@ -30,6 +32,17 @@ from gdp_extensions.dds.wait_thread import News, WaitThread
 from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.core.qos import default
 
+_URI: Final = "CYCLONEDDS_URI"
+_RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_LOCALHOST_ONLY: Final = "ROS_LOCALHOST_ONLY"  # until Iron; the range takes precedence
+_PARTICIPANTS_MAX: Final = 32
+_LOCALHOST: Final = (
+    "<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    f"<MaxAutoParticipantIndex>{_PARTICIPANTS_MAX}</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
+)
+_KNOWN: Final = ("SUBNET", "LOCALHOST", "SYSTEM_DEFAULT")
 ANY_STATE: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH: Final = 64  # samples read at once
 
@@ -191,3 +204,24 @@ class EntityContext(NamedTuple):
 def _nothing(samples: list[Sample]) -> None:
     """Ignore samples that arrive after the end."""
     del samples
+
+
+def with_discovery_range(environment: Mapping[str, str]) -> str | None:
+    """Return the value of CYCLONEDDS_URI that obeys the discovery range; None: it needs no change.
+
+    What CYCLONEDDS_URI says already is kept and comes last, so it wins.
+
+    Raises:
+        LocalError: a range that this endpoint cannot have, or that ROS does not know.
+    """
+    stated = environment.get(_RANGE, "").upper()
+    if not stated:
+        stated = "LOCALHOST" if environment.get(_LOCALHOST_ONLY, "0") not in ("", "0") else "SYSTEM_DEFAULT"
+    if stated not in _KNOWN:
+        raise LocalError(
+            f"{_RANGE}={stated}: the endpoint dds knows {', '.join(_KNOWN)}; with OFF no node could meet the proxy"
+        )
+    configured = environment.get(_URI, "")
+    if stated != "LOCALHOST" or configured.startswith(_LOCALHOST):
+        return None
+    return ",".join(filter(None, (_LOCALHOST, configured)))

@@ -19,8 +19,8 @@ from gdp_extensions.dds.node import EntityContext, Sample
 from gdp_extensions.dds.profile import offered, requested
 from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
 from proxy.endpoints.core.qos import default
+from proxy.serial.channel import Service
 from proxy.serial.empty import NoAnswer
-from proxy.serial.service import Service
 
 _PREFIX: Final = 4  # CDR encapsulation
 _HEADER: Final = 16

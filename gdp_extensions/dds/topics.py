@@ -61,11 +61,7 @@ class Subscription:
 
 
 class Publication:
-    """Publishes a topic.
-
-    Raises:
-        LocalError: it has another type here, or is not ROS 2's.
-    """
+    """Publishes a topic. Raises ``LocalError``: it has another type here, or is not ROS 2's."""
 
     def __init__(self, at: EntityContext, channel: Channel, type_hash: str) -> None:
         topic, type_name = channel.topic, channel.type_name

@@ -23,8 +23,7 @@ from gdp.crypto.cbor import decode as decode_cbor
 from gdp.crypto.control_seal import ControlOpener, topic_of
 from gdp.crypto.envelope import salt_of, seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, GdpError, RemoteError
-from gdp.frame.codec import Header, decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, decode
 from gdp.limits import SEQUENCE_BYTES
 from gdp.message.bundle import unpack
 from gdp.message.frame_recovery import FrameRecovery

@@ -1,7 +1,4 @@
-"""Command ``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names.
-
-I/O.
-"""
+"""Command ``gdp decrypt-pcap``: the messages of a capture, for who holds the keys of their names."""
 
 from __future__ import annotations
 
@@ -20,8 +17,7 @@ from gdp.cli.output import show
 from gdp.cli.program import Program
 from gdp.errors import GdpError, LocalError
 from gdp.extras import require_extra
-from gdp.frame.codec import ETHER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.keyring import DELEGATIONS, load_delegations, load_identity, load_owner

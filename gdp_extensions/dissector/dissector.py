@@ -28,9 +28,8 @@ from scapy.fields import (
 from scapy.packet import Packet
 
 from gdp.errors import LocalError
-from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH
+from gdp.frame.codec import ETHERTYPE, HEADER_BYTES, HOPS_MASK, SECOND_PATH, VERSION, Kind
 from gdp.frame.diagnostic import SHOWN_BYTES
-from gdp.frame.kinds import ETHERTYPE, VERSION, Kind
 from gdp.frame.layers import (
     GDP,
     KIND_NAMES,
@@ -57,11 +56,7 @@ _HEX: Final = (XByteField, XShortField, XLongField)
 
 
 def dissector() -> str:
-    """Return the text of the Lua plugin.
-
-    Raises:
-        LocalError: a layer has a field without a form in Wireshark.
-    """
+    """Return the text of the Lua plugin. Raises ``LocalError``: a layer has a field without a form in Wireshark."""
     layers = list(dict.fromkeys(layer for pair in PAYLOADS.values() for layer in pair))
     places = {layer: at for at, layer in enumerate(layers, 1)}
     constants = {

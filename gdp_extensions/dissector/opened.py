@@ -20,7 +20,7 @@ from scapy.fields import (
 )
 from scapy.packet import Packet
 
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.frame.layers import FLAG_NAMES, KIND_NAMES, NameField, RestField, least_bytes
 
 ENCODINGS: Final = {0: "unknown", 1: "json", 2: "cbor", 3: "cdr"}

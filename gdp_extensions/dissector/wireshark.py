@@ -1,7 +1,4 @@
-"""Command ``gdp wireshark``: the dissector for Wireshark and tshark.
-
-I/O.
-"""
+"""Command ``gdp wireshark``: the dissector for Wireshark and tshark."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options that the doors share, and the course of a door's command.
-
-I/O.
-"""
+"""Options that the doors share, and the course of a door's command."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from gdp.cli.node import AwaitIface, Json
 from gdp.cli.secret import Secret
 from gdp.errors import LocalError
 from gdp.links.uplink import wait_for_device
-from proxy.cli.node_options import Delegations, Iface
+from proxy.cli.tool_options import Delegations, Iface
 
 if TYPE_CHECKING:
     from gdp_extensions.doors.endpoint import NewSession

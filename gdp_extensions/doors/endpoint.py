@@ -35,8 +35,7 @@ from gdp_extensions.doors.core.hub import DoorSession, Hub
 from proxy.bridge.core.delegated_rules import DelegatedRules
 from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived, RequestReceived
 from proxy.endpoints.in_process import InProcessEndpoint
-from proxy.serial.channel import Channel, Qos
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, Service
 from proxy.serial.standard_types import known_channel
 
 if TYPE_CHECKING:

@@ -1,7 +1,4 @@
-"""Command ``gdp foxglove``.
-
-I/O.
-"""
+"""Command ``gdp foxglove``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Node of a door: an ordinary member of the overlay, whose bridge carries what its delegations allow.
-
-I/O.
-"""
+"""Node of a door: an ordinary member of the overlay, whose bridge carries what its delegations allow."""
 
 from __future__ import annotations
 

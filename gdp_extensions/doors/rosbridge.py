@@ -1,7 +1,4 @@
-"""Command ``gdp rosbridge``.
-
-I/O.
-"""
+"""Command ``gdp rosbridge``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Reductions of messages: region and voxels, picture files, compression, and adaptation to the path. Sans-I/O."""
 
 from gdp_extensions.reduction.adaptation import adaptation_of
-from gdp_extensions.reduction.encoder import encoders_of
-from gdp_extensions.reduction.expander import RestoringExpander
+from gdp_extensions.reduction.encoder import RestoringExpander, encoders_of
 
 __all__ = ["RestoringExpander", "adaptation_of", "encoders_of"]

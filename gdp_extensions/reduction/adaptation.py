@@ -1,7 +1,4 @@
-"""Adaptation of an exposed topic: its controller, and what the overlay's publisher shows of messages on their way.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Adaptation of an exposed topic: its controller, and what the overlay's publisher shows of messages on their way."""
 
 from __future__ import annotations
 
@@ -23,11 +20,7 @@ def adaptation_of(rule: Rule) -> Adaptation:
 
 
 class PathAdaptation(Adaptation):
-    """Adaptation of one topic to its path.
-
-    Args:
-        bounds: of rate and quality.
-    """
+    """Adaptation of one topic to its path; ``bounds``: of rate and quality."""
 
     __slots__ = ("_controller", "_dropped", "_looked_s", "_on_way", "_refused")
 

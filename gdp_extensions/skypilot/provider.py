@@ -18,8 +18,8 @@ from typing import Final
 from fog.hardware import Hardware, Offer
 from fog.host.bundle import pack
 from fog.machine import Machine, MachineBundle, MachineSpec
+from fog.providers.cloud_config import SkyPilotConfig
 from fog.providers.cloud_init import lines_of, shell_script
-from fog.providers.skypilot_config import SkyPilotConfig
 from fog.site import Site
 from gdp.errors import LocalError, StoreError
 from gdp.extras import install_command

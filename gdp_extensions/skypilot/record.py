@@ -97,11 +97,7 @@ def cluster_name(spec: MachineSpec) -> str:
 
 
 def labels_of(spec: MachineSpec) -> dict[str, str]:
-    """Return the labels of a machine, which ``machine_of`` reads.
-
-    Raises:
-        LocalError: a name is too long.
-    """
+    """Return the labels of a machine, which ``machine_of`` reads. Raises ``LocalError``: a name is too long."""
     offer = spec.offer
     labels = {
         _CLUSTER: _hex(spec.cluster),

@@ -1,4 +1,4 @@
-"""Cancellation of calls at one exposed service, once no client waits for them any more.
+"""Cancellation of calls at one exposed service, once no client waits for them any more; the calls of each goal.
 
 I/O: it calls the local endpoint.
 """
@@ -11,14 +11,47 @@ from typing import Final
 from gdp.names import Name
 from gdp.service.frames import Stop
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.core.action_interface import RESULT
-from proxy.bridge.goal_calls import GoalCalls
+from proxy.bridge.core.action_interface import GOAL, RESULT
 from proxy.endpoints.core.endpoint import RosEndpoint
 
 TRIGGER: Final = "std_srvs/srv/Trigger"
 
 # empty request of a Trigger; ROS 2 fills a message without fields with one byte
 NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}
+
+
+class GoalCalls:
+    """Requests to accept goals and requests for their results; each operation takes constant time."""
+
+    def __init__(self) -> None:
+        self._goals: dict[Asked, bytes] = {}
+        self._calls: dict[tuple[int, bytes], dict[Asked, None]] = {}  # by part and goal
+
+    def __len__(self) -> int:
+        return len(self._goals)
+
+    def add(self, asked: Asked, goal: bytes) -> None:
+        """Add a call."""
+        self._goals[asked] = goal
+        self._calls.setdefault((asked.part, goal), {})[asked] = None
+
+    def end(self, asked: Asked) -> bytes | None:
+        """Remove a call that has ended; return its goal, None where it has none."""
+        goal = self._goals.pop(asked, None)
+        if goal is not None:
+            calls = self._calls[asked.part, goal]
+            del calls[asked]
+            if not calls:
+                del self._calls[asked.part, goal]
+        return goal
+
+    def accepting(self, goal: bytes) -> Asked | None:
+        """Return the call by which the local server is asked to accept a goal."""
+        return next(iter(self._calls.get((GOAL, goal), ())), None)
+
+    def is_awaited(self, goal: bytes) -> bool:
+        """Return whether a client waits for a goal's result."""
+        return (RESULT, goal) in self._calls
 
 
 class Cancellation:

@@ -1,7 +1,4 @@
-"""Counters of a proxy, as its metrics expose them.
-
-Sans-I/O.
-"""
+"""Counters of a proxy, as its metrics expose them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Endpoint dispatcher: delivers events of one endpoint to the owners of its handles.
-
-I/O.
-"""
+"""Endpoint dispatcher: delivers events of one endpoint to the owners of its handles."""
 
 from __future__ import annotations
 
@@ -9,8 +6,7 @@ from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphChanged, RosEndpoint
-from proxy.serial.channel import Channel, Qos
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, Service
 
 
 class EventHandler(Protocol):

@@ -3,8 +3,7 @@
 I/O: endpoint and participant; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
 
 It combines these modules:
-- ``remote_clients.py``: decodes requests, and detects clients that left.
-- ``undescribed_requests.py``: holds requests that wait for their description.
+- ``remote_clients.py``: decodes requests, holds those that wait for a description, and detects clients that left.
 - ``response_sender.py``: sends responses to clients.
 - ``cancellation.py``: stops calls.
 - ``ordered_server.py``: drives a server that keeps state.
@@ -26,7 +25,7 @@ from gdp.service.frames import Answer, Request, Stop
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.cancellation import TRIGGER, Cancellation
+from proxy.bridge.cancellation import TRIGGER, Cancellation, GoalCalls
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT
 from proxy.bridge.core.bridge_election import presence_of, sign
@@ -34,12 +33,10 @@ from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import cancel_of, goal_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.ordered_server import OrderedServer
-from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
+from proxy.bridge.remote_clients import ClientLiveness, RemoteClients, UndescribedRequests
 from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.service_flow import ServiceFlow
-from proxy.bridge.undescribed_requests import UndescribedRequests
 from proxy.config.rule import CALL_S
 from proxy.endpoints.core.endpoint import (
     CallFailed,

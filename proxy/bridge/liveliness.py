@@ -142,11 +142,7 @@ class LivelinessTracker:
 
 
 def names_from_fields(listed: object) -> Iterator[NameLiveliness]:
-    """Yield the names that a status lists.
-
-    Raises:
-        LocalError: another form.
-    """
+    """Yield the names that a status lists. Raises ``LocalError``: another form."""
     if not isinstance(listed, list):
         raise LocalError("the proxy reports no liveliness; restart it with this version")
     for fields in listed:

@@ -51,11 +51,7 @@ class LocalOutput(Protocol):
         """
 
     def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
-        """Publish one message.
-
-        Raises:
-            LocalError: it cannot be written.
-        """
+        """Publish one message. Raises ``LocalError``: it cannot be written."""
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""

@@ -27,11 +27,7 @@ Tell: TypeAlias = Callable[[Name, "FollowerMessage | Refuse"], None]
 
 
 class OrderedServer:
-    """One local server as a replica of the log.
-
-    Args:
-        number: the first request number for the local server, random.
-    """
+    """One local server as a replica of the log; ``number``: the first request number for the local server, random."""
 
     def __init__(self, flow: ServiceFlow, number: int, *, give: Give, tell: Tell) -> None:
         node = flow.flow_spec.rule.state_node  # whose parameter is the server's state; None: it exports none

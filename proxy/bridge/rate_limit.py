@@ -1,7 +1,4 @@
-"""Rate limiter of messages, where a rule sets a maximum rate.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Rate limiter of messages, where a rule sets a maximum rate."""
 
 from __future__ import annotations
 

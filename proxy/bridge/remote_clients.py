@@ -1,14 +1,13 @@
-"""Remote clients of a local service: decoders of their requests, or the reason why there are none; and their liveness.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Remote clients of a local service: their liveness, decoders of their requests, and requests that wait for those."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.client.participant import Message
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.limits import CALLER_AWAY_S
 from gdp.names import Name
@@ -17,6 +16,8 @@ from proxy.serial.channel import RosVersion
 from proxy.serial.schema import DefinitionError
 from proxy.wire.service import Exchange
 
+EARLY_MAX: Final = 256  # of one client
+EARLY_MAX_BYTES: Final = 64 << 20  # of all clients; one client may use as much as it leaves free for others
 REMOTE_CLIENTS_MAX: Final = 1_024  # clients whose decoders are kept; the oldest are dropped
 
 
@@ -97,3 +98,34 @@ class ClientLiveness:
             for client, heard_s in self._heard_s.items()
             if client not in present and (bytes(client) not in known or now_s - heard_s >= CALLER_AWAY_S)
         ]
+
+
+class UndescribedRequests:
+    """Waiting messages by client, in order."""
+
+    def __init__(self, max_bytes: int = EARLY_MAX_BYTES) -> None:
+        self._waiting: dict[bytes, deque[Message]] = {}
+        self._bytes: dict[bytes, int] = {}
+        self._free_bytes = max_bytes
+
+    def __len__(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def add(self, message: Message) -> bool:
+        """Add a message; return False where its client has used its quota of messages or bytes."""
+        client, size = bytes(message.delivered.publisher), len(message.delivered.message)
+        if len(self._waiting.get(client, ())) >= EARLY_MAX or self._bytes.get(client, 0) + size > self._free_bytes:
+            return False
+        self._waiting.setdefault(client, deque()).append(message)
+        self._bytes[client] = self._bytes.get(client, 0) + size
+        self._free_bytes -= size
+        return True
+
+    def poll_messages(self, client: bytes) -> list[Message]:
+        """Remove and return the waiting messages of a client."""
+        self._free_bytes += self._bytes.pop(client, 0)
+        return list(self._waiting.pop(client, ()))
+
+    def forget_all_but(self, clients: Collection[bytes]) -> int:
+        """Drop the messages of clients that are gone; return their number."""
+        return sum(len(self.poll_messages(client)) for client in self._waiting.keys() - clients)

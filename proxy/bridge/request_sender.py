@@ -27,11 +27,7 @@ Effect: TypeAlias = "DispatchEffect | ReplicaCommand"
 
 
 def wire_of(part: int, effect: Effect) -> bytes:
-    """Return the encoded form of an effect.
-
-    Raises:
-        LocalError: it cannot be encoded.
-    """
+    """Return the encoded form of an effect. Raises ``LocalError``: it cannot be encoded."""
     if isinstance(effect, Ask):
         return effect.request
     return to_wire(effect.word) if isinstance(effect, ReplicaCommand) else Stop(part, effect.calls).to_wire()

@@ -1,7 +1,4 @@
-"""Check command: ``--check`` reports what a configuration means here and now, without joining the overlay.
-
-I/O.
-"""
+"""Check command: ``--check`` reports what a configuration means here and now, without joining the overlay."""
 
 from __future__ import annotations
 

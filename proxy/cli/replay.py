@@ -1,7 +1,4 @@
-"""Command ``gdp-replay``.
-
-I/O.
-"""
+"""Command ``gdp-replay``."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import yaml
 from gdp.cli import options
 from gdp.cli.output import show
 from gdp.cli.program import Program
-from gdp.cli.salt import NAME_SALT
+from gdp.cli.secret import NAME_SALT
 from gdp.config.drop_in import drop_in_directory
 from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import LocalError

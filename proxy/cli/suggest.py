@@ -1,7 +1,4 @@
-"""``gdp up --suggest``: writes a commented ``proxy.yaml`` from the live ROS graph.
-
-I/O.
-"""
+"""``gdp up --suggest``: writes a commented ``proxy.yaml`` from the live ROS graph."""
 
 from __future__ import annotations
 
@@ -19,9 +16,8 @@ from gdp.extras import install_command
 from gdp.ports.readiness import readable
 from gdp.printable import printable
 from gdp.stores.files import public, write_all
-from proxy.check.graph_snapshot import LOOK_S
+from proxy.check.graph_snapshot import LOOK_S, measured
 from proxy.check.suggestion import Offered, offered_names, suggested_file
-from proxy.check.traffic import measured
 from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.core.endpoint import Graph, RosEndpoint, proxy_node_name
 from proxy.endpoints.live import open_endpoint

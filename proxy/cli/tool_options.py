@@ -1,7 +1,4 @@
-"""Options and output of the commands that read or call one name as a member.
-
-I/O.
-"""
+"""Options and output of the commands that read or call one name as a member."""
 
 from __future__ import annotations
 
@@ -19,11 +16,17 @@ from gdp.cli.completion import complete_node
 from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
 from gdp.errors import GdpError
 from gdp.terminal import echo, for_stdout
-from proxy.cli.node_options import Delegations, Iface
 
 if TYPE_CHECKING:
     from proxy.node.tool_member import Access, Wanted
 
+Iface = Annotated[
+    str | None, typer.Option("--iface", metavar="DEVICE", help="Device towards the switch. Default: as the node says.")
+]
+Delegations = Annotated[
+    Path | None,
+    typer.Option("--delegations", metavar="DIR", help="What owners gave the node. Default: as the node says."),
+]
 Node = Annotated[
     Path,
     typer.Option(

@@ -45,11 +45,7 @@ class RosGraphConfig(Section):
 
     @property
     def domain_id(self) -> int:
-        """Return the ROS 2 domain.
-
-        Raises:
-            LocalError: the environment states an invalid one.
-        """
+        """Return the ROS 2 domain. Raises ``LocalError``: the environment states an invalid one."""
         if self.domain is not None:
             return self.domain
         text = os.environ.get("ROS_DOMAIN_ID") or "0"

@@ -1,7 +1,4 @@
-"""Rule matching: a rule with a full name precedes every pattern, and among equals the first of the file applies.
-
-Sans-I/O.
-"""
+"""Rule matching: a rule with a full name precedes every pattern, and among equals the first of the file applies."""
 
 from __future__ import annotations
 

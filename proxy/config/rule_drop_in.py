@@ -45,11 +45,7 @@ class ListedRule:
 
 
 class RuleDropIn:
-    """The drop-in of ``gdp rule`` of one proxy.
-
-    Args:
-        path: of ``proxy.yaml``.
-    """
+    """The drop-in of ``gdp rule`` of one proxy; ``path``: of ``proxy.yaml``."""
 
     def __init__(self, path: Path) -> None:
         self._path = path.absolute()

@@ -1,4 +1,1 @@
-"""Endpoints: each implements one dialect of ROS and has no knowledge of overlay names.
-
-I/O.
-"""
+"""Endpoints: each implements one dialect of ROS and has no knowledge of overlay names."""

@@ -12,8 +12,7 @@ from typing import ClassVar
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Event
-from proxy.serial.channel import RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import RosVersion, Service
 
 
 class InProcessEndpoint:

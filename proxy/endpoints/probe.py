@@ -12,8 +12,7 @@ from itertools import count
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, RequestReceived, Role
 from proxy.endpoints.in_process import InProcessEndpoint
-from proxy.serial.channel import Channel, Qos
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, Service
 from proxy.serial.standard_types import known_channel
 
 _NODE = "/gdp_tool"

@@ -1,7 +1,4 @@
-"""Bridge node: the loop that drives the overlay's participant, the endpoints and the bridge between them.
-
-I/O.
-"""
+"""Bridge node: the loop that drives the overlay's participant, the endpoints and the bridge between them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Configuration of a member that has no rules: a door, or a tool.
-
-I/O.
-"""
+"""Configuration of a member that has no rules: a door, or a tool."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Proxy node: a participant of the overlay on one device, with the names that its configuration makes global.
-
-I/O.
-"""
+"""Proxy node: a participant of the overlay on one device, with the names that its configuration makes global."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Recorder: a proxy without a live graph, whose bridge records or only counts what it imports.
-
-I/O.
-"""
+"""Recorder: a proxy without a live graph, whose bridge records or only counts what it imports."""
 
 from __future__ import annotations
 
@@ -62,11 +59,7 @@ def _finish(writer: SplitWriter | None) -> str:
 
 
 def refuse_existing_file(settings: ProxyConfig) -> None:
-    """Refuse to record into an existing file.
-
-    Raises:
-        LocalError: the file exists.
-    """
+    """Refuse to record into an existing file. Raises ``LocalError``: the file exists."""
     record = settings.record
     if record is not None and (path := first_part(record.path, is_split=record.is_split)).exists():
         raise LocalError(f"{path} exists already; move or delete it, or change record.path")

@@ -1,7 +1,4 @@
-"""Member that a tool runs as: a node whose delegation gives the right that the tool needs, for as long as it works.
-
-I/O.
-"""
+"""Member that a tool runs as: a node whose delegation gives the right that the tool needs, for as long as it works."""
 
 from __future__ import annotations
 

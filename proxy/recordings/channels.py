@@ -1,7 +1,4 @@
-"""Channels of a recording: conversion from rosbags' connections.
-
-Sans-I/O.
-"""
+"""Channels of a recording: conversion from rosbags' connections."""
 
 from __future__ import annotations
 
@@ -40,11 +37,7 @@ _FORMATS: dict[MessageDefinitionFormat, DefinitionFormat] = {
 
 
 def from_connection(connection: Connection) -> Channel:
-    """Return the channel of one of rosbags' connections.
-
-    Raises:
-        LocalError: its messages are not CDR.
-    """
+    """Return the channel of one of rosbags' connections. Raises ``LocalError``: its messages are not CDR."""
     extra = connection.ext
     definition_format = _FORMATS[connection.msgdef.format]
     if isinstance(extra, ConnectionExtRosbag1):

@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import ConfigError, LocalError
+from gdp.ports.confine.capabilities import Capability
 from gdp.ports.readiness import readable
-from gdp.ports.sandbox import Capability, Needs, confine
+from gdp.ports.sandbox import Needs, confine
 from proxy.recordings.decoder import BagDecoder
 from proxy.recordings.source import Message
 from proxy.recordings.stream import (

@@ -22,8 +22,7 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.in_process import InProcessEndpoint
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 if TYPE_CHECKING:  # what records loads nothing that reads, and the reverse
     from proxy.recordings.reader import BagReader
@@ -43,11 +42,7 @@ class _TopicsEndpoint(InProcessEndpoint):
         self._put(GraphChanged())
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Refuse: a recording has its own definitions and no installed types.
-
-        Raises:
-            LocalError: always.
-        """
+        """Refuse: a recording has its own definitions and no installed types. Raises ``LocalError``: always."""
         raise LocalError(f"{self.label}: {topic}: its messages bring the definition of {type_name}")
 
     def service(self, name: str, type_name: str) -> Service:
@@ -108,11 +103,7 @@ class ReplayEndpoint(_TopicsEndpoint):
         return index in self._subscribed
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Subscribe to a topic.
-
-        Raises:
-            LocalError: the recording does not have it.
-        """
+        """Subscribe to a topic. Raises ``LocalError``: the recording does not have it."""
         del qos
         indexes = self.channels_of(topic, type_name)
         if not indexes:

@@ -1,7 +1,4 @@
-"""Limits of the process that decodes a recording.
-
-Sans-I/O.
-"""
+"""Limits of the process that decodes a recording."""
 
 from __future__ import annotations
 

@@ -50,11 +50,7 @@ class McapWriter:
         self._append(MAGIC + _record(Opcode.HEADER, _text("ros2") + _text("gdp")))
 
     def connect(self, channel: Channel) -> None:
-        """Add a channel; the first has number 0.
-
-        Raises:
-            struct.error: one too many.
-        """
+        """Add a channel; the first has number 0. Raises ``struct.error``: one too many."""
         key = channel.type_name, channel.definition
         if key not in self._schemas:
             self._schemas[key] = len(self._schemas) + 1  # 0: no schema

@@ -66,11 +66,7 @@ class SplitWriter:
         return self._numbers[channel]
 
     def write(self, handle: int, stamp_ns: int, raw: bytes, origin: Origin | None = None) -> None:
-        """Record one message.
-
-        Raises:
-            LocalError: as of ``BagWriter.write``, or the next part cannot be made.
-        """
+        """Record one message. Raises ``LocalError``: as of ``BagWriter.write``, or the next part cannot be made."""
         self.received += 1
         if self.failure:
             raise LocalError(self.failure)

@@ -93,11 +93,7 @@ def message_head(message: Message) -> bytes:
 
 
 def opened_to(count: int, counts: Sequence[int] | None) -> bytes:
-    """Return the bytes of OPENED.
-
-    Raises:
-        LocalError: there are too many channels, or numbers above 64 bits.
-    """
+    """Return the bytes of OPENED. Raises ``LocalError``: there are too many channels, or numbers above 64 bits."""
     if counts is not None and len(counts) > CHANNELS_MAX:
         raise LocalError(f"{len(counts)} topics; at most {CHANNELS_MAX} are read")
     try:

@@ -1,4 +1,4 @@
-"""Channel: description of a topic's messages for a reader; it travels sealed, once per reader.
+"""Channel: description of a topic's messages for a reader; it travels sealed, once per reader. A service has two.
 
 Sans-I/O. The wire form is a bounded CBOR map with one-letter keys; a malformed one is refused as a whole.
 """
@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, astuple, dataclass, fields
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from gdp.crypto.schema import FLAG, OCTETS, FieldSet, Form, Keyed, literal, many, mapped, row, text, uint
-from gdp.errors import LocalError, RemoteError
+from gdp.errors import DropReason, LocalError, RemoteError, StatementError
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
 RosVersion: TypeAlias = Literal[1, 2]
@@ -87,11 +87,7 @@ class Channel(FieldSet):
     callerid: Annotated[str | None, Keyed("c", TEXT, absent=None, is_omitted=True)] = None
 
     def to_wire(self) -> bytes:
-        """Return the bounded CBOR form.
-
-        Raises:
-            LocalError: a part is longer than a peer would accept.
-        """
+        """Return the bounded CBOR form. Raises ``LocalError``: a part is longer than a peer would accept."""
         wire = self.to_cbor()
         try:
             Channel.from_cbor(wire)
@@ -106,3 +102,35 @@ CHANNEL: Final = mapped(OCTETS, Channel.from_cbor, Channel.to_wire)
 def ros1_format(text: str, md5: str) -> DefinitionFormat:
     """Return the format of a ROS 1 definition: an empty text is one where the md5 sum says that there are no fields."""
     return "msg" if text or md5 == EMPTY_MD5 else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Service(FieldSet):
+    """A service.
+
+    Args:
+        type_name: as ROS 2 writes it (``std_srvs/srv/SetBool``), for ROS 1 too.
+        hash: md5 sum of the ROS 1 service, ``RIHS01_...`` for ROS 2; empty where unknown.
+        request: of type ``std_srvs/srv/SetBool_Request``, for ROS 1 too; its ``topic`` is the service's name.
+        response: of type ``std_srvs/srv/SetBool_Response``.
+    """
+
+    MAX_BYTES = 2 * CHANNEL_MAX_BYTES + 4_096
+    name: Annotated[str, Keyed("n", TEXT)]
+    type_name: Annotated[str, Keyed("t", TEXT)]
+    hash: Annotated[str, Keyed("h", TEXT)]
+    request: Annotated[Channel, Keyed("q", CHANNEL)]
+    response: Annotated[Channel, Keyed("r", CHANNEL)]
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return the ROS version of the messages' wire form."""
+        return self.request.ros
+
+    def check(self) -> None:
+        """Return if both parts are of one ROS. Raises ``StatementError``: MALFORMED."""
+        if self.request.ros != self.response.ros:
+            raise StatementError(DropReason.MALFORMED, "a service description")
+
+
+SERVICE: Final = mapped(OCTETS, Service.from_cbor, Service.to_cbor)

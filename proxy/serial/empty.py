@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Final, TypeAlias
 
 from gdp.limits import MESSAGE_MAX_BYTES
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Service
 from proxy.serial.cost import fixed_bytes, items_of
 from proxy.serial.dialect import Wide
 from proxy.serial.msg_text import Default
@@ -20,7 +20,6 @@ from proxy.serial.native_dialect import NativeDialect
 from proxy.serial.reader import ITEMS_MAX
 from proxy.serial.schema import Array, DefinitionError, Number, Record, Sequence, Text, Type, parse
 from proxy.serial.serializer import Codec
-from proxy.serial.service import Service
 
 Defaults: TypeAlias = "Mapping[tuple[str, str], Default]"  # by type and field
 

@@ -16,7 +16,7 @@ from typing import Final, TypeAlias
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Basename, Constdefs, FieldDesc, NameDesc, Typesdict
 
-from proxy.serial.msg_text import STATEMENTS_MAX
+from proxy.serial.msg_text import STATEMENTS_MAX, end_of, shortened
 
 _TOKENS_MAX: Final = 16_384  # a text of rosidl has one in five bytes
 _DEPTH_MAX: Final = 16  # modules within modules, sequences within sequences
@@ -82,7 +82,7 @@ def _tokens(text: str) -> Iterator[str]:
     count = at = 0
     while at < len(text):
         if text[at].isspace():
-            at = _end(_SPACE, text, at)
+            at = end_of(_SPACE, text, at)
             continue
         if text.startswith(("//", "/*", "#"), at):
             at = _comment_end(text, at)
@@ -107,9 +107,9 @@ def _token_end(text: str, at: int) -> int:
         stop = text.find("'", at + 2)
         if 0 < stop <= at + 4:
             return stop + 1
-    stop = _end(_WORD if sign.isascii() and sign.isalpha() else _NUMBER, text, at)
+    stop = end_of(_WORD if sign.isascii() and sign.isalpha() else _NUMBER, text, at)
     if stop == at or (stop == at + 1 and sign in "+-."):
-        raise ValueError(f"neither a word nor a number: {_short(text[at : at + 40])}")
+        raise ValueError(f"neither a word nor a number: {shortened(text[at : at + 40])}")
     return stop
 
 
@@ -161,7 +161,7 @@ class _Parser:
     def _expect(self, wanted: str) -> None:
         token = self._next()
         if token != wanted:
-            raise ValueError(f"{wanted!r} expected, not {_short(token)}")
+            raise ValueError(f"{wanted!r} expected, not {shortened(token)}")
 
     def _takes(self, wanted: str) -> bool:
         if self._token != wanted:
@@ -172,13 +172,13 @@ class _Parser:
     def _word(self) -> str:
         token = self._next()
         if _WORD.fullmatch(token) is None or len(token) > _WORD_MAX:
-            raise ValueError(f"a name expected, not {_short(token)}")
+            raise ValueError(f"a name expected, not {shortened(token)}")
         return token
 
     def _full(self, name: str) -> str:
         full = "/".join((*self._scope, name))
         if len(full) > _WORD_MAX:
-            raise ValueError(f"a name of more than {_WORD_MAX} characters: {_short(full)}")
+            raise ValueError(f"a name of more than {_WORD_MAX} characters: {shortened(full)}")
         return full
 
     def _count(self) -> None:
@@ -201,7 +201,7 @@ class _Parser:
         elif word == "enum":
             self._enumeration()
         else:
-            raise ValueError(f"no definition begins with {_short(word)}")
+            raise ValueError(f"no definition begins with {shortened(word)}")
         self._expect(";")
 
     def _module(self) -> None:
@@ -303,7 +303,7 @@ class _Parser:
                 if f"{token} {self._token}" in _BASES:
                     token = f"{token} {self._next()}"
             if token not in _BASES:
-                raise ValueError(f"no type is called {_short(token)}")
+                raise ValueError(f"no type is called {shortened(token)}")
             return _Kind((Nodetype.BASE, (_BASES[token], 0)))
         name = self._scoped()
         alias = self._found(name, self._aliases)
@@ -338,7 +338,7 @@ class _Parser:
     def _size(self) -> int:
         size = self._value()
         if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size <= _NUMBER_MAX:
-            raise ValueError(f"no length or bound: {_short(str(size))}")
+            raise ValueError(f"no length or bound: {shortened(str(size))}")
         return size
 
     def _value(self) -> _Value:
@@ -355,7 +355,7 @@ class _Parser:
             name = self._scoped()
             found = self._found(name, self._constants)
             if not found:
-                raise ValueError(f"no constant is called {_short(name)}")
+                raise ValueError(f"no constant is called {shortened(name)}")
             return self._constants[found]
         return _number(self._next())
 
@@ -371,7 +371,7 @@ class _Parser:
         while is_open:
             token = self._next()
             if not token or token in ("{", "}", ";", "@"):
-                raise ValueError(f"an annotation with {_short(token)}")
+                raise ValueError(f"an annotation with {shortened(token)}")
             is_open += (token == "(") - (token == ")")
 
 
@@ -384,12 +384,3 @@ def _number(token: str) -> float | int:
     if any(sign in digits for sign in ".eE"):
         return float(token)
     return int(token, 8 if digits[:1] == "0" and len(digits) > 1 else 10)
-
-
-def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
-    found = pattern.match(text, at)
-    return at if found is None else found.end()
-
-
-def _short(text: str) -> str:
-    return repr(text if len(text) <= 80 else f"{text[:80]} ...")

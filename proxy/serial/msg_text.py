@@ -119,7 +119,7 @@ class _Parser:
     def _section(self, rule: str, head: str, types: Typesdict) -> tuple[Constdefs, Fielddefs]:
         header = _HEADER.match(head)
         if rule.rstrip() != _RULE or header is None:
-            raise ValueError(f"not the beginning of a used type: {_short(rule)} {_short(head)}")
+            raise ValueError(f"not the beginning of a used type: {shortened(rule)} {shortened(head)}")
         return self._begin(header[1], types)
 
     def _begin(self, name: str, types: Typesdict) -> tuple[Constdefs, Fielddefs]:
@@ -141,21 +141,21 @@ class _Parser:
         kind = _TYPE.match(line, at)
         name = None if kind is None else _NAME.match(line, kind.end())
         if kind is None or name is None:
-            raise ValueError(f"neither a field nor a constant: {_short(line)}")
+            raise ValueError(f"neither a field nor a constant: {shortened(line)}")
         self._statements += 1
         if self._statements > STATEMENTS_MAX:
             raise ValueError(f"more than {STATEMENTS_MAX} fields and constants")
-        at = _end(_SPACE, line, name.end())
+        at = end_of(_SPACE, line, name.end())
         if line.startswith("=", at):
             if kind[1] not in _BASES or kind[3]:
-                raise ValueError(f"a constant of such a type: {_short(line)}")
+                raise ValueError(f"a constant of such a type: {shortened(line)}")
             if kind[1] != "wstring":
                 text = line[at + 1 :]
                 value = "" if kind[1] == "string" and not text.strip() else _value(text, line)  # legal in ROS 1
                 constants.append((name[0], _BASES[kind[1]], value))
             return
         if at < len(line) and line[at] != "#" and at == name.end():
-            raise ValueError(f"not the name of a field: {_short(line)}")
+            raise ValueError(f"not the name of a field: {shortened(line)}")
         if at < len(line) and line[at] != "#":
             self.defaults[self._owner, name[0]] = line[at:]
         fields.append((name[0], self._shape(kind, line)))
@@ -172,7 +172,7 @@ class _Parser:
         if len(word) > _WORD_MAX:
             raise ValueError(f"a field's type of {len(word)} characters")
         if kind[2] and kind[1] not in ("string", "wstring"):
-            raise ValueError(f"a bound of what is no string: {_short(line)}")
+            raise ValueError(f"a bound of what is no string: {shortened(line)}")
         item: _Item
         if kind[1] in _BASES:  # the bound of a wide string affects no wire form and no hash here
             item = (Nodetype.BASE, (_BASES[kind[1]], _number(kind[2]) if kind[2] and kind[1] == "string" else 0))
@@ -183,7 +183,7 @@ class _Parser:
         if kind[5] and not kind[4]:
             return (Nodetype.ARRAY, (item, _number(kind[5])))
         if kind[4] and not kind[5]:
-            raise ValueError(f"a bound without a number: {_short(line)}")
+            raise ValueError(f"a bound without a number: {shortened(line)}")
         return (Nodetype.SEQUENCE, (item, _number(kind[5]) if kind[5] else 0))
 
     def _full(self, word: str) -> str:
@@ -216,7 +216,7 @@ def _value(text: str, line: str) -> _Value:
         if found is not None and _COMMENT.match(text, found.end()) is not None:
             return read(found[0])
     if not text or text[0] == "#":
-        raise ValueError(f"a constant without a value: {_short(line)}")
+        raise ValueError(f"a constant without a value: {shortened(line)}")
     stop = _closing_quote(text) if text[0] in "'\"" else 0
     if stop and _COMMENT.match(text, stop + 1) is not None:
         return text[1:stop]
@@ -250,10 +250,12 @@ def _number(digits: str) -> int:
     return int(digits)
 
 
-def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
+def end_of(pattern: re.Pattern[str], text: str, at: int) -> int:
+    """Return where a match at a position ends; the position itself if there is none."""
     found = pattern.match(text, at)
     return at if found is None else found.end()
 
 
-def _short(text: str) -> str:
+def shortened(text: str) -> str:
+    """Return a text for an error: quoted, and cut after 80 characters."""
     return repr(text if len(text) <= 80 else f"{text[:80]} ...")

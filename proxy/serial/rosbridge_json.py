@@ -99,11 +99,7 @@ class RosbridgeCodec:
         return [name for name, _ in self._record.fields if name != _DUMMY]
 
     def to_json(self, raw: bytes) -> bytes:
-        """Return the message as JSON.
-
-        Raises:
-            RemoteError: it does not fit the definition.
-        """
+        """Return the message as JSON. Raises ``RemoteError``: it does not fit the definition."""
         return orjson.dumps(self._tree(self._codec, raw), option=orjson.OPT_SERIALIZE_NUMPY)
 
     def to_cbor(self, topic: str, raw: bytes) -> bytes:

@@ -13,10 +13,9 @@ from typing import Final
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.channel import Channel, RosVersion, Service
 from proxy.serial.converter import translated_channel
 from proxy.serial.schema import msg_name
-from proxy.serial.service import Service
 from proxy.serial.type_translation import md5_text, retyped, rihs01, types_of
 
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"

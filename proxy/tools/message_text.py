@@ -1,7 +1,4 @@
-"""Messages as text: YAML as ``ros2 topic echo`` prints it, and JSON as rosbridge writes it; and back from YAML.
-
-Sans-I/O.
-"""
+"""Messages as text: YAML as ``ros2 topic echo`` prints it, and JSON as rosbridge writes it; and back from YAML."""
 
 from __future__ import annotations
 
@@ -66,11 +63,7 @@ class MessageText:
             raise LocalError(f"{channel.topic}: the definition of {channel.type_name} is of no use: {error}") from error
 
     def to_yaml(self, raw: bytes) -> str:
-        """Return the message in YAML, without the separator.
-
-        Raises:
-            RemoteError: it does not fit the definition.
-        """
+        """Return the message in YAML, without the separator. Raises ``RemoteError``: it does not fit the definition."""
         tree = self._codec.to_tree(raw)
         if tree is None:
             raise RemoteError(DropReason.MALFORMED, f"a message that does not fit {self._name}")
@@ -87,11 +80,7 @@ class MessageText:
 
 
 def request_tree(text: str) -> object:
-    """Return the fields of a request in YAML.
-
-    Raises:
-        LocalError: the text is no YAML mapping.
-    """
+    """Return the fields of a request in YAML. Raises ``LocalError``: the text is no YAML mapping."""
     try:
         tree: object = yaml.safe_load(text)
     except yaml.YAMLError as error:

@@ -1,7 +1,4 @@
-"""Rates of a topic: messages and bytes in a window, as ``ros2 topic hz`` and ``ros2 topic bw`` state them.
-
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-"""
+"""Rates of a topic: messages and bytes in a window, as ``ros2 topic hz`` and ``ros2 topic bw`` state them."""
 
 from __future__ import annotations
 
@@ -15,11 +12,7 @@ _UNITS = ((1e6, "MB"), (1e3, "KB"))
 
 
 class Arrivals:
-    """Arrival times and sizes of the latest messages of a topic.
-
-    Args:
-        window: most messages that count, at least 2.
-    """
+    """Arrival times and sizes of the latest messages of a topic; ``window``: most messages that count, at least 2."""
 
     def __init__(self, window: int) -> None:
         self._latest = deque[tuple[float, int]](maxlen=window)
@@ -39,11 +32,7 @@ class Arrivals:
 
 
 class Frequency(NamedTuple):
-    """Rate of messages, and the spread of the time between two of them.
-
-    Attributes:
-        window: messages in the window.
-    """
+    """Rate of messages, and the spread of the time between two of them; ``window``: messages in the window."""
 
     rate_hz: float
     min_s: float

@@ -119,11 +119,7 @@ class TopicDescription(FieldSet):
         return zstd | Step.IMAGE if self.image else zstd
 
     def to_wire(self) -> bytes:
-        """Return the wire form.
-
-        Raises:
-            LocalError: too many channels, or too long descriptions.
-        """
+        """Return the wire form. Raises ``LocalError``: too many channels, or too long descriptions."""
         if len(self.channels) > CHANNELS_MAX:
             raise LocalError(f"{len(self.channels)} connections of one topic; at most {CHANNELS_MAX} are allowed")
         if self.definitions_bytes > DEFINITION_MAX_BYTES:

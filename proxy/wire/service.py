@@ -19,9 +19,8 @@ from gdp.crypto.schema import FLAG, FieldSet, Keyed, many
 from gdp.errors import DropReason, StatementError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.service.frames import HEAD_MAX_BYTES, VERSION, read_head
-from proxy.serial.channel import CHANNEL, CHANNEL_MAX_BYTES, Channel
+from proxy.serial.channel import CHANNEL, CHANNEL_MAX_BYTES, SERVICE, Channel, Service
 from proxy.serial.serializer import ENCODING, Encoding
-from proxy.serial.service import SERVICE, Service
 
 PARTS_MAX: Final = 8
 _NEWS: Final = struct.Struct("!BBQ")

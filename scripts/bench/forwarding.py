@@ -27,8 +27,7 @@ from plot import Panel, panel_of
 from report import Rounds, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
-from gdp.frame.codec import OVERHEAD_BYTES, Header, encode
-from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.frame.codec import ETHERTYPE, OVERHEAD_BYTES, Header, Kind, encode
 from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab

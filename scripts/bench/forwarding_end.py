@@ -21,8 +21,7 @@ from typing import Any, Final
 from peers.jsonl import order_waits, read_order, say
 
 from gdp.errors import LocalError
-from gdp.frame.codec import ETHER_BYTES
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.mmsg import SLOTS, make_batch
 from gdp.ports.sockets import kernel_drops

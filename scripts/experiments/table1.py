@@ -20,7 +20,7 @@ from plot import Bar, Panel, save_bars
 from report import markdown_table, print_table
 from skeleton import Options
 
-from fog.catalog.aws import aws_prices
+from fog.catalog.prices import aws_prices
 from fog.hardware import Hardware, Offer
 from fog.plan.cost import Bill, compared
 from gdp.errors import LocalError

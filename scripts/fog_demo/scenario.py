@@ -15,8 +15,8 @@ from typing import Final
 from rich.console import Console, Group, RenderableType
 from rich.text import Text
 
-from fog.cli.views import event_line, machine_fields, machines_table, stage
-from fog.supervisor.core.record import Record
+from fog.cli.views import event_line, machine_fields, machines_table
+from fog.supervisor.core.record import Record, stage
 from fog.supervisor.journal import Entry
 from fog_demo.cluster import DEDICATED, Cluster, requests_in
 from gdp.host.interruption import let_nothing_interrupt

@@ -9,7 +9,7 @@ from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.config.config import RibConfig
 from gdp.config.schema import Domain
-from gdp.control.settings import NodeSettings
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.names import Name

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from lab.simulation import Simulation

@@ -12,7 +12,7 @@ from gdp.client.rib_host import RibHost
 from gdp.control.link_state import Scope
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import LINK_STATE
 from gdp.limits import LINK_STATE_AGE_MAX_S
 from gdp.rib.core import RibCore

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gdp.control.endpoint_record import CandidateType, EndpointRecord
+from gdp.control.endpoints import CandidateType, EndpointRecord
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.statements import parse

@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint
 from gdp.crypto.cbor import Value, encode
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity, NodeKeys

@@ -16,8 +16,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, RemoteError
-from gdp.frame.codec import HEADER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Kind, decode
 from gdp.intervals import NEIGHBOUR
 from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import at, hello_in, node

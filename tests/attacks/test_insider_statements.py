@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gdp.control.hello import Hello, Timing
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import control, still_flows
 

@@ -9,7 +9,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.switch.core import SwitchCore
 from gdp.switch.trees import Tree
 from lab.simulation import Simulation

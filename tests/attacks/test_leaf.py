@@ -14,7 +14,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert

@@ -13,8 +13,7 @@ from gdp.crypto.control_seal import ControlContext, ControlSealer
 from gdp.crypto.envelope import seal_key
 from gdp.crypto.introduction import Introduction
 from gdp.errors import DropReason
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.limits import EPOCH_GRACE_S, MTU_HOLD_S, MTU_NARROWINGS, NACKS_PER_REPORT
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.send_window import SendWindow

@@ -10,7 +10,7 @@ from gdp.control.link_state import AttachedRib, LinkState, Scope
 from gdp.crypto.identity import Identity
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.trust.rtcert import RtCert
 from lab.simulation import Simulation

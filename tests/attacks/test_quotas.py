@@ -10,15 +10,13 @@ import pytest
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.join import Join
 from gdp.control.link_state import LinkState, Scope
-from gdp.control.query import Query
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import Query, RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StatementError
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from gdp.intervals import Rate
 from gdp.limits import ATTACHED_MAX, HOPS_MAX, QUESTIONS_RATE
 from gdp.metadata import Metadata

@@ -5,8 +5,7 @@ from __future__ import annotations
 from os import urandom
 
 from gdp.crypto.envelope import KeyContext, Opener, Sealer, Signer
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.limits import JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, MESSAGE_MAX_BYTES
 from gdp.message.reassembly import ReassembledMessage, Reassembler
 from gdp.message.reassembly_quota import ReassemblyQuota

@@ -10,8 +10,7 @@ import pytest
 
 from gdp.client import writer_proxy
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.message.acknack import AckNack
 from lab.simulation import Simulation
 from lab.topology import chain

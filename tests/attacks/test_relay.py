@@ -16,7 +16,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.statements import parse
 from gdp.crypto.x509_profile import to_pem
-from gdp.links.relay_tls import tls_context
+from gdp.links.relay_context import tls_context
 from gdp.relay.connection import ConnectionState, RelayConnection
 from gdp.relay.framing import ControlMessage, ControlType
 from gdp.relay.tls_channel import ALPN

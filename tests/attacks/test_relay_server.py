@@ -16,11 +16,10 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.intervals import Rate
 from gdp.links import relay_server as relay_server_module
-from gdp.links.relay_context import RelayContext
+from gdp.links.relay_context import RelayContext, tls_context
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_loop import RelayLoop
 from gdp.links.relay_server import BorderServer, listen_tls
-from gdp.links.relay_tls import tls_context
 from gdp.ports.tap import TapDevice
 from gdp.relay.admission import verified_border
 from gdp.relay.connection import ConnectionSettings, RelayConnection

@@ -6,7 +6,7 @@ import pytest
 
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.switch.core import SwitchCore
 from gdp.trust.right import Right

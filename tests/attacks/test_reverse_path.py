@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import is_side

@@ -16,8 +16,7 @@ from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
 from gdp.exchange import anti_entropy
 from gdp.exchange.sync_message import SyncMessage
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from gdp.ports.confine import landlock, seccomp
-from gdp.ports.sandbox import Capability
+from gdp.ports.confine.capabilities import Capability
 from tests.pages import ROOT
 
 CHILD = """

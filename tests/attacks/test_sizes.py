@@ -6,14 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.link_state import LINKS_MAX, MEMBERS_MAX, RIBS_MAX, Adjacency, AttachedRib, LinkState, Scope
+from gdp.control.rib_statements import AdvertiseAck
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, encode
 from gdp.limits import ADVERTISEMENT_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
 from gdp.trust.advertisement import UnverifiedAdvertisement

@@ -8,11 +8,11 @@ from os import urandom
 
 import pytest
 
+from gdp.burst.cipher import SALT_BYTES
 from gdp.crypto.control_seal import ControlContext, ControlSealer
-from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, KeyContext, Sealer
+from gdp.crypto.envelope import SIGNATURE_BYTES, KeyContext, Sealer
 from gdp.crypto.records import RecordKey
-from gdp.frame.codec import HEADER_BYTES
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Kind
 from gdp.names import NAME_BYTES
 from gdp.nodes.membership import fresh_bytes, incarnation
 from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, WRITER

@@ -8,8 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.endpoints import inner_address
+from gdp.control.endpoints import EndpointRecord, inner_address
 from gdp.control.tunnel_plan import TunnelId
 from gdp.links import tunnels as tunnels_module
 from gdp.links.tunnels import Tunnels

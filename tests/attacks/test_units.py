@@ -25,8 +25,7 @@ from fog.host.managed_process import NODE_USER, ManagedProcess
 from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
 from gdp.enrolment import service_units
-from gdp.enrolment.machine_programs import Machine
-from gdp.enrolment.programs import MachineProgram
+from gdp.enrolment.programs import Machine, MachineProgram
 from gdp.enrolment.service_units import service_texts
 from lab.process import until
 from tests.fog.bootstrap.desk import made_desk

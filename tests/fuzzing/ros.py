@@ -8,11 +8,10 @@ from typing import Final
 from gdp.errors import LocalError, RemoteError
 from gdp.service.frames import Answer, Outcome, Request, Stop
 from proxy.serial.cbor_bounds import check_bounds
-from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError, parse
 from proxy.serial.serializer import Encoding, Serializer
-from proxy.serial.service import Service
 from proxy.wire.message import RosMessage, TopicDescription
 from proxy.wire.service import Exchange, News
 from tests.fuzzing.bodies import decoders

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Final, TypeVar
 
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
@@ -27,7 +27,7 @@ from gdp.crypto.validity import VALIDITY
 from gdp.crypto.x509_profile import read_request
 from gdp.errors import EnvelopeError, FrameError, LocalError, RemoteError, StatementError
 from gdp.frame import codec
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind
 from gdp.message import bundle
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat, StreamStart

@@ -21,7 +21,7 @@ from gdp.control.hello import CONFLICTS_MAX, COOKIE_BYTES, COOKIES_MAX, HEARD_MA
 from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
-from gdp.control.query import TRANSIT_MAX
+from gdp.control.rib_statements import TRANSIT_MAX
 from gdp.crypto import cbor
 from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.crypto.identity import Identity
@@ -31,8 +31,7 @@ from gdp.crypto.validity import VALIDITY, Validity
 from gdp.errors import DropReason, LocalError, StatementError
 from gdp.exchange.sync_message import ASKED_MAX, ITEMS_MAX, LACKING_MAX, SETS_MAX
 from gdp.exchange.sync_set import LINE_BYTES, line_of
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, encode
 from gdp.intervals import DAY_S
 from gdp.limits import CHAIN_MAX, HOPS_MAX, NACKS_PER_REPORT
 from gdp.message import bundle

@@ -11,8 +11,7 @@ from functools import partial
 from itertools import count, pairwise
 from typing import Final
 
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.limits import COST_AUTO
 from gdp.names import Name
 from gdp.service.replication import Mode, Replication

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT, Kind
 from gdp.sansio import ReceivedFrame
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.name_resolver import PendingFrames

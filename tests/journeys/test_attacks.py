@@ -10,14 +10,12 @@ import pytest
 
 from gdp.client.participant import Participant
 from gdp.client.rib_host import RibHost
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.join import Join
-from gdp.control.query import Response
+from gdp.control.rib_statements import AdvertiseAck, Response
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import StatementType, sign
 from gdp.errors import DropReason
-from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, decode, encode
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame

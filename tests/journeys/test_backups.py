@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import LEASE_S, Flow, Tap, flowing

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.client.publisher import Publisher
 from gdp.client.writer_proxy import WriterProxy
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind
 from gdp.names import Name
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, flowing, ring
 

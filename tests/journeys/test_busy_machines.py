@@ -9,8 +9,7 @@ from functools import partial
 import pytest
 
 from gdp.client.participant import Participant
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from lab.network import SimNetwork
 from lab.simulation import Simulation

@@ -11,8 +11,7 @@ import pytest
 from gdp.client.participant import Participant
 from gdp.control.diagnostics import Question, Reply
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.frame.pace import pace_of
 from gdp.limits import DIAGNOSTICS_RATE, HOPS_MAX
 from gdp.names import ZERO, Name

@@ -6,8 +6,7 @@ from functools import partial
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.intervals import ENDPOINT, KEEPALIVE_MS
 from gdp.names import Name

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.participant import Topic
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.limits import CLOCK_SKEW_S
 from gdp.trust.grants import EPOCH_S, begun_epochs, daily_epochs
 from gdp.trust.node_descriptor import NodeDescriptor

@@ -11,8 +11,7 @@ from typing import Final
 import pytest
 
 from gdp.client.participant import Participant, Topic
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import CONTROL_FROM, Kind
+from gdp.frame.codec import CONTROL_FROM, ETHER_BYTES, Kind, decode
 from gdp.message.loss import LossReason
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.service.replication import ALL

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import JOIN, NEIGHBOUR
 from gdp.trust.right import Right
 from lab.simulation import Simulation

@@ -6,12 +6,11 @@ from collections import Counter
 
 import pytest
 
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, Kind, decode
 from gdp.intervals import JOIN, JOIN_PROOF, SoftState
 from gdp.limits import JOINS_AGAIN_MAX
 from gdp.switch import multicast, upstream_joins

@@ -6,8 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.limits import COST_AUTO
 from lab.network import SimLink
 from lab.simulation import Simulation

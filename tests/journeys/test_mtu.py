@@ -10,7 +10,7 @@ import pytest
 
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
 from lab.simulation import Simulation
 from lab.topology import Topology, chain, ring5

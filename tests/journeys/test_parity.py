@@ -11,8 +11,7 @@ import pytest
 from gdp.client.participant import Participant
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.trust.right import Right
 from lab.network import SimLink
 from tests.journeys.flows import Flow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.trust.right import Right
 from lab.simulation import Simulation
 from lab.topology import ring5

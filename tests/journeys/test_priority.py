@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.send_scheduler import BYTES_WITH_URGENT
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind, decode
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 
 IMAGE = bytes(921_600)

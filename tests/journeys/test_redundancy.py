@@ -12,8 +12,7 @@ import pytest
 from gdp.client.participant import Participant
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, NUMBER_AT, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, NUMBER_AT, Kind, decode
 from gdp.trust.right import Right
 from lab.network import SimLink
 from tests.journeys.flows import Flow

@@ -7,8 +7,7 @@ from math import ceil
 
 import pytest
 
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from lab.network import SimLink
 from lab.simulation import Simulation
 from lab.topology import DomainPlan, Link, Topology

@@ -9,7 +9,7 @@ import pytest
 from gdp.client.unicast_stream import private_name
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import READER, SERVER
 from gdp.limits import PRIVATE_WAIT_BYTES
 from gdp.names import Name

@@ -6,7 +6,7 @@ import pytest
 
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
 from lab.simulation import Simulation

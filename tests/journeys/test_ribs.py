@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from gdp.control.query import Query
+from gdp.control.rib_statements import Query
 from gdp.intervals import ADVERTISEMENT
 from lab.simulation import Simulation
 from lab.topology import Attachment, ring5

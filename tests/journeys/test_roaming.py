@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from gdp.crypto.statements import parse
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.trust.advertisement import UnverifiedAdvertisement

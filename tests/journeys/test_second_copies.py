@@ -11,8 +11,7 @@ import pytest
 
 from gdp.client.participant import Participant
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HOPS_AT, SECOND_PATH, Header, decode, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, HOPS_AT, SECOND_PATH, Header, Kind, decode, encode
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from lab.network import SimLink

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import ADVERTISEMENT, FORGET_S, READER
 from gdp.sansio import ReceivedFrame
 from gdp.trust.adcert import AdCert

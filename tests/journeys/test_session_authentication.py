@@ -14,8 +14,7 @@ from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.session_seal import session_secret
 from gdp.errors import DropReason
-from gdp.frame.codec import FLAGS_AT
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import FLAGS_AT, Flag, Kind
 from gdp.limits import SEQUENCE_BYTES
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame

@@ -10,8 +10,7 @@ import pytest
 
 from gdp.client.participant import Participant
 from gdp.errors import DropReason
-from gdp.frame.codec import decode
-from gdp.frame.kinds import CONTROL_FROM
+from gdp.frame.codec import CONTROL_FROM, decode
 from gdp.intervals import READER
 from gdp.limits import WINDOW_BYTES
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

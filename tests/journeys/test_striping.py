@@ -7,8 +7,7 @@ from functools import partial
 import pytest
 
 from gdp.client.participant import Participant
-from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, Kind, decode
 from gdp.limits import SPREAD
 from gdp.trust.right import Right
 from tests.journeys.flows import Flow

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from gdp.control.waiting import WaitReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import ADVERTISEMENT, RETRY_S
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology

@@ -15,8 +15,7 @@ import pytest
 from gdp.control.join import Join, RouteLink
 from gdp.crypto.statements import parse
 from gdp.errors import StatementError
-from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, Kind, decode, second_path_key
 from gdp.intervals import JOIN
 from gdp.names import ZERO, Name
 from gdp.switch.join_handler import reader_of

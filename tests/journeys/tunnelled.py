@@ -26,7 +26,8 @@ from gdp.crypto.tunnel_key import TunnelKey
 from gdp.intervals import PACE_S
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.links.links import TunnelLinks
-from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.ports.tunnel.control import PeerState
+from gdp.ports.tunnel.wireguard import WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from lab.network import SimLink
 from lab.simulation import Simulation

@@ -33,11 +33,7 @@ class MachineFile:
     gone_unix_s: float | None = None
 
     def write(self, directory: Path) -> None:
-        """Replace the file.
-
-        Raises:
-            OSError: the system refuses.
-        """
+        """Replace the file. Raises ``OSError``: the system refuses."""
         draft = directory / f".{_FILE}"
         draft.write_text(json.dumps(asdict(self)), encoding="utf-8")
         draft.replace(directory / _FILE)

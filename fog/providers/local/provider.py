@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from fog.catalog.local import LOCAL_REGIONS, local_offers
+from fog.catalog.prices import LOCAL_REGIONS, local_offers
 from fog.hardware import Hardware, Offer
 from fog.host.bounded_log import last_lines
 from fog.host.bundle import install

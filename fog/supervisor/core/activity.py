@@ -1,7 +1,4 @@
-"""Activity of a cluster, computed from message counters of proxies.
-
-Sans-I/O.
-"""
+"""Activity of a cluster, computed from message counters of proxies."""
 
 from __future__ import annotations
 

@@ -34,8 +34,7 @@ from enum import IntEnum
 from typing import Final
 
 from gdp.control.keepalive import HEAD_BYTES, REPORT_AT, REPORT_BYTES, TAG_BYTES, TAGGED_BYTES
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, KIND_AT, NUMBER_AT, SOURCE_AT
-from gdp.frame.kinds import ETHERTYPE, VERSION, Kind
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE, HEADER_BYTES, KIND_AT, NUMBER_AT, SOURCE_AT, VERSION, Kind
 from gdp.names import NAME_BYTES
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.sha256 import BLOCK_BYTES, FIRST_STATE, STATE_BYTES, add_compress

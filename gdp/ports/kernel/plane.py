@@ -26,9 +26,10 @@ from gdp.ports.kernel.keepalives import KeepaliveSessions, open_sessions
 from gdp.ports.kernel.loaded_program import LoadedProgram
 from gdp.ports.kernel.map_sync import EntryCounts, MapSync
 from gdp.ports.netlink import TRAFFIC_GROUP, NetlinkSocket, Notifications
-from gdp.ports.plane import Counters, Port, ReceivedFrame
+from gdp.ports.plane import Counters, Port
 from gdp.ports.raw import RawPlane
 from gdp.ports.sockets import TrafficClass
+from gdp.sansio import ReceivedFrame
 from gdp.switch.table import Table
 
 _COUNTED_MAX: Final = 100

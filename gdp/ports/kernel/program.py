@@ -24,8 +24,17 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HOPS_MASK, OVERHEAD_BYTES, SECOND_PATH, layout
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag
+from gdp.frame.codec import (
+    CONTROL_FROM,
+    ETHER_BYTES,
+    ETHERTYPE,
+    HOPS_MASK,
+    OVERHEAD_BYTES,
+    SECOND_PATH,
+    VERSION,
+    Flag,
+    layout,
+)
 from gdp.names import NAME_BYTES
 from gdp.ports.kernel.abi import (
     BRANCH_BYTES,

@@ -1,4 +1,1 @@
-"""Tunnels: WireGuard devices, VXLAN devices in them, and the MTU that they leave.
-
-I/O.
-"""
+"""Tunnels: WireGuard devices, VXLAN devices in them, and the MTU that they leave."""

@@ -99,11 +99,7 @@ def mark_of(ifname: str) -> int:
 
 
 def remove_leftovers(marks: Iterable[int]) -> None:
-    """Remove the rules and routes of marks that no running switch uses.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Remove the rules and routes of marks that no running switch uses. Raises ``LocalError``: the kernel refuses."""
     with closing(NetlinkSocket()) as netlink:
         for mark in marks:
             _remove_all(netlink, mark)

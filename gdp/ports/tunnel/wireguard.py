@@ -44,8 +44,6 @@ from gdp.ports.tunnel.path_mtu import RouteMonitor
 from gdp.ports.tunnel.uapi import UserspaceControl
 from gdp.ports.tunnel.uplink_routes import mark_of
 
-__all__ = ["Backend", "PeerState", "WireGuardDevice", "open_wireguard"]
-
 log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "kernel", "wireguard-go"]

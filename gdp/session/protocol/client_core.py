@@ -101,11 +101,7 @@ class ClientCore:
         self._send_out(now_s)
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Process a server's response.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Process a server's response. Raises ``RemoteError``: MALFORMED or BAD_VERSION."""
         if not message.private:
             return  # on the stream for all clients, servers send only their description
         server = Name(message.delivered.publisher)

@@ -57,11 +57,7 @@ class Inbox:
         self._bytes = 0  # of all added messages, minus the dropped ones; recounted near the bound
 
     def receive(self, message: MemberMessage, now_s: float) -> None:
-        """Add a message.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Add a message. Raises ``RemoteError``: MALFORMED or BAD_VERSION."""
         del now_s
         delivered = message.delivered
         stamp_ns, payload = read_message(delivered.message)
@@ -158,11 +154,7 @@ class SessionCore:
     # calls of a program
 
     def subscribe(self, topic: Topic, limit: int, paths: int = 1) -> Inbox:
-        """Subscribe to a name.
-
-        Raises:
-            LocalError: the name is read, served or called already in this session.
-        """
+        """Subscribe to a name. Raises ``LocalError``: the name is read, served or called already in this session."""
         self.member.subscribe(topic, paths=paths)
         inbox = self._receivers[topic.name] = Inbox(topic.name, limit)
         return inbox
@@ -174,11 +166,7 @@ class SessionCore:
             self.member.unsubscribe(inbox.name)
 
     def serve(self, topic: Topic, *, at_once: int | None, **options: Unpack[ServiceOptions]) -> ServerCore:
-        """Serve a name.
-
-        Raises:
-            LocalError: the name is read, served or called already in this session.
-        """
+        """Serve a name. Raises ``LocalError``: the name is read, served or called already in this session."""
         server = ServerCore(self.member, topic, start=self._random_start(), at_once=at_once, **options)
         self._receivers[topic.name] = self._servers[topic.name] = server
         self._services.append(server)

@@ -1,7 +1,4 @@
-"""Errors of sessions; each text states what is wrong, where, and what to do.
-
-Sans-I/O.
-"""
+"""Errors of sessions; each text states what is wrong, where, and what to do."""
 
 from __future__ import annotations
 

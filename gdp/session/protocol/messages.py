@@ -1,7 +1,4 @@
-"""Messages, requests and responses of a session, and the names that its node may use.
-
-Sans-I/O.
-"""
+"""Messages, requests and responses of a session, and the names that its node may use."""
 
 from __future__ import annotations
 

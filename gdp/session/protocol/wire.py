@@ -48,11 +48,7 @@ def stop_to_wire(calls: Iterable[int]) -> bytes:
 
 
 def read_request(wire: bytes) -> Request | Sequence[int]:
-    """Return a client's request, or its calls that have ended.
-
-    Raises:
-        RemoteError: MALFORMED or BAD_VERSION.
-    """
+    """Return a client's request, or its calls that have ended. Raises ``RemoteError``: MALFORMED or BAD_VERSION."""
     if wire[1:2] == bytes([_STOP]):
         return read_calls(wire)[1]
     request = Request.from_wire(wire)
@@ -62,11 +58,7 @@ def read_request(wire: bytes) -> Request | Sequence[int]:
 
 
 def read_response(wire: bytes) -> Answer:
-    """Return a server's response to one client.
-
-    Raises:
-        RemoteError: MALFORMED or BAD_VERSION.
-    """
+    """Return a server's response to one client. Raises ``RemoteError``: MALFORMED or BAD_VERSION."""
     response = Answer.from_wire(wire)
     if response.part != RESPONSE:
         raise RemoteError(DropReason.MALFORMED, "not a response")

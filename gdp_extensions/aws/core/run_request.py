@@ -12,7 +12,7 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, cast
 
 from fog.machine import MachineSpec
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig
 from gdp_extensions.aws.core.instances import tags_of
 
 if TYPE_CHECKING:

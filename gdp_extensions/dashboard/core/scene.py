@@ -23,11 +23,7 @@ _DROP_PAUSE_S: Final = 10.0  # between two events about one reason at one node
 
 
 class Scene:
-    """The present graph with its rates, and what happened.
-
-    Attributes:
-        version: rises when the structure changes.
-    """
+    """The present graph with its rates, and what happened; ``version``: rises when the structure changes."""
 
     def __init__(self) -> None:
         self.version = 0

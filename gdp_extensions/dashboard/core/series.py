@@ -14,11 +14,7 @@ SERIES_MAX: Final = 8_192  # 39 MB
 
 
 class SeriesStore:
-    """Series by key, all sampled at the same moments.
-
-    Attributes:
-        refused: keys that found no space in the last step.
-    """
+    """Series by key, all sampled at the same moments; ``refused``: keys that found no space in the last step."""
 
     def __init__(self, samples: int = SAMPLES) -> None:
         self._samples = samples

@@ -1,7 +1,4 @@
-"""Bytes of clients' messages that have not come whole: their sum is bounded, and a slow sender gives way.
-
-Sans-I/O.
-"""
+"""Bytes of clients' messages that have not come whole: their sum is bounded, and a slow sender gives way."""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ import orjson
 
 from gdp.ros_names import resolved
 from gdp_extensions.doors.core.client_fields import word, wrong
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 
 SUBPROTOCOLS: Final = ("foxglove.websocket.v1", "foxglove.sdk.v1")
 INFO, WARNING, ERROR = 0, 1, 2  # levels of a status

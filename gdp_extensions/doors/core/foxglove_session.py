@@ -14,8 +14,7 @@ from gdp_extensions.doors.core import foxglove_protocol as protocol
 from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
 from gdp_extensions.doors.core.hub import REASON_MAX, Hub, Publication, TopicType
 from gdp_extensions.doors.core.parameter_calls import ParameterCall, ParameterCalls
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 
 SUBSCRIPTIONS_MAX: Final = 4_096
 CALLS_MAX: Final = 1_024

@@ -25,8 +25,7 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.core.qos import DEPTH_MAX, default, depth_of
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 
 REASON_MAX: Final = 4_096  # characters of an error that a client hears: it may repeat what the client sent
 REPLACED_S: Final = 0.5  # a publisher that is closed and opened again within this time keeps its number

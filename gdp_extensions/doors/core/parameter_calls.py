@@ -15,8 +15,8 @@ import orjson
 from gdp.errors import GdpError
 from gdp_extensions.doors.core.hub import DoorSession, Hub
 from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, node_and_name, to_value
+from proxy.serial.channel import Service
 from proxy.serial.rosbridge_json import RosbridgeCodec
-from proxy.serial.service import Service
 
 Done: TypeAlias = "Callable[[Mapping[str, object]], None]"
 _LIST_MAX: Final = 4_096

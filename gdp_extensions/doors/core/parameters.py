@@ -34,11 +34,7 @@ _BYTES, _DOUBLE, _INTEGER = 5, 3, 2
 
 
 def node_and_name(parameter: str) -> tuple[str, str]:
-    """Return node and name of ``/node.name``.
-
-    Raises:
-        RemoteError: another form.
-    """
+    """Return node and name of ``/node.name``. Raises ``RemoteError``: another form."""
     node, dot, name = parameter.partition(".")
     if not dot or not node.startswith("/") or not name:
         raise RemoteError(DropReason.MALFORMED, f"parameter {parameter!r}: its form is /node.name"[:300])

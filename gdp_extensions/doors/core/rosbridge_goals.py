@@ -17,9 +17,8 @@ from gdp.ros_names import ACTION_INFIX, resolved
 from gdp_extensions.doors.core.client_fields import Fields, identifier, ros2_type, text_of, word, wrong
 from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
 from gdp_extensions.doors.core.hub import REASON_MAX, DoorSession, Hub, Publication
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Service
 from proxy.serial.rosbridge_json import codec_of
-from proxy.serial.service import Service
 
 GOALS_MAX: Final = 256
 _SEND, _RESULT, _CANCEL = "send_goal", "get_result", "cancel_goal"

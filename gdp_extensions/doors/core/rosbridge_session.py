@@ -22,9 +22,8 @@ from gdp_extensions.doors.core.client_queue import ClientQueue, Pending
 from gdp_extensions.doors.core.hub import REASON_MAX, Hub, Publication, TopicType
 from gdp_extensions.doors.core.rosbridge_goals import SENDS, GoalStep, RosbridgeGoals
 from gdp_extensions.doors.core.throttle import Throttle
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Service
 from proxy.serial.rosbridge_json import RosbridgeCodec, both_spellings, cbor_raw, codec_of, png_text
-from proxy.serial.service import Service
 
 IDS_MAX: Final = 4_096  # of all subscriptions and advertised topics
 CALLS_MAX: Final = 1_024
@@ -72,11 +71,7 @@ class _Call:
 
 
 class RosbridgeSession:
-    """State of one connection.
-
-    Args:
-        goal_id: returns 16 random bytes.
-    """
+    """State of one connection; ``goal_id``: returns 16 random bytes."""
 
     def __init__(
         self, hub: Hub, number: int, queue: ClientQueue, now_s: Callable[[], float], goal_id: Callable[[], bytes]

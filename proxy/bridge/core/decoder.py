@@ -1,7 +1,4 @@
-"""Message decoder: from a remote body to a local message, by the remote definition, converted into the local one.
-
-Sans-I/O.
-"""
+"""Message decoder: from a remote body to a local message, by the remote definition, converted into the local one."""
 
 from __future__ import annotations
 

@@ -13,9 +13,8 @@ from proxy.bridge.core.action_interface import ActionInterface
 from proxy.bridge.core.decoder import MessageDecoder
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import RosEndpoint
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, Service
 from proxy.serial.serializer import Encoding
-from proxy.serial.service import Service
 from proxy.wire.service import Exchange
 
 

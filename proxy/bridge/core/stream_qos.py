@@ -1,7 +1,4 @@
-"""QoS of an exposed topic on the overlay: derived from its local publishers, or kept as recorded.
-
-Sans-I/O.
-"""
+"""QoS of an exposed topic on the overlay: derived from its local publishers, or kept as recorded."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Statistics of the topics that a proxy receives.
-
-Sans-I/O.
-"""
+"""Statistics of the topics that a proxy receives."""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ from dataclasses import KW_ONLY, dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 _PROXY_NODE: Final = re.compile(r"gdp_proxy_[0-9a-f]{12}(_[0-9a-z_]*)?\Z")
 
@@ -137,11 +136,7 @@ class MessageRecorder(Protocol):
     """An endpoint that keeps what a far publisher says of each message."""
 
     def record(self, handle: int, raw: bytes, origin: Origin) -> None:
-        """Record one message of a channel.
-
-        Raises:
-            LocalError: a recording cannot be written.
-        """
+        """Record one message of a channel. Raises ``LocalError``: a recording cannot be written."""
 
 
 class RosEndpoint(Protocol):

@@ -35,8 +35,7 @@ from proxy.endpoints.core.endpoint import (
 from proxy.endpoints.ros1.install import rospy_folder
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 from proxy.endpoints.ros1.rospy_process import RospyProcess
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 
 @dataclass(slots=True)

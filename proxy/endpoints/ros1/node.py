@@ -40,8 +40,7 @@ from proxy.endpoints.ros1.raw import (
 )
 from proxy.endpoints.ros1.services import Client, Server, tickets
 from proxy.endpoints.ros1.topics import Publisher, Subscriber
-from proxy.serial.channel import Channel, ros1_format
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service, ros1_format
 
 _Connected: TypeAlias = tuple[int, str, int]
 

@@ -15,8 +15,7 @@ import genpy
 import roslib.message
 
 from gdp.errors import LocalError
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 
 _RULE: Final = "\n" + "=" * 80 + "\n"
 _WITH_FOLDER: Final = re.compile(r"\b([A-Za-z]\w*)/msg/([A-Za-z]\w*)")

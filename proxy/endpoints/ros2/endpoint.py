@@ -26,8 +26,7 @@ from proxy.endpoints.ros2.session import (
 )
 from proxy.endpoints.ros2.types import channel_of, class_of, service_of
 from proxy.endpoints.ros2.wait_thread import WaitThread
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 from proxy.serial.standard_types import type_hash
 
 

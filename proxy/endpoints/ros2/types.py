@@ -13,8 +13,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from proxy.endpoints.definition import definition_of, interface_of, type_hash_of
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 
 _NAME: Final = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/(([A-Z][A-Za-z0-9]*)[A-Za-z0-9_]*)\Z")
 

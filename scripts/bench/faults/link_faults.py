@@ -30,7 +30,7 @@ from typing import Final
 from pyroute2 import IPRoute
 
 from gdp.closing import ClosedOnExit
-from gdp.frame.kinds import ETHERTYPE
+from gdp.frame.codec import ETHERTYPE
 from gdp.host import netns_files
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.syscall import Command, bpf, load_program

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 import make_catalog
-from fog.catalog.aws import aws_prices
 from fog.catalog.measured import measured
-from fog.catalog.prices import price_list, regions_of
+from fog.catalog.prices import aws_prices, price_list, regions_of
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 

@@ -18,10 +18,9 @@ from typer.testing import CliRunner, Result
 from fog.bootstrap.members import metadata_of
 from fog.cli import launch, logs, options, status
 from fog.cli.app import app
-from fog.cli.views import stage
 from fog.cluster import CloudNode, ClusterPlan, RobotNode
 from fog.site import Site, open_site
-from fog.supervisor.core.record import Outcome
+from fog.supervisor.core.record import Outcome, stage
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from gdp.stores.keyring import OWNER_SALT, load_salt
 from tests.fog.supervisor.machines import record, serving

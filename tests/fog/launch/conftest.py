@@ -16,7 +16,7 @@ import pytest
 _OURS = (
     "fog.launch.ros_action",
     "fog.launch.ros_node",
-    "fog.launch.launch_ros_adapter",
+    "fog.launch.ros_action",
     "fog.launch.ros_description",
     "fog.ros2cli.command",
     "fog.ros2cli.option",

@@ -6,9 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog.plan.correlation import joint_in_one_region, joint_over_regions, more_in_one_region
 from fog.plan.duration import duration_text, seconds_from_text
-from fog.plan.failure import chance_down, joint, replicas_needed
+from fog.plan.failure import (
+    chance_down,
+    joint,
+    joint_in_one_region,
+    joint_over_regions,
+    more_in_one_region,
+    replicas_needed,
+)
 from fog.plan.mix import Kind, cheapest_mix
 from gdp.errors import LocalError
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from fog.catalog.local import local_offers
 from fog.catalog.measured import measured
+from fog.catalog.prices import local_offers
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.plan.target import machines_for

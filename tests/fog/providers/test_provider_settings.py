@@ -8,9 +8,8 @@ import orjson
 import pytest
 import yaml
 
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig, SkyPilotConfig
 from fog.providers.cloud_init import Setup
-from fog.providers.skypilot_config import SkyPilotConfig
 from gdp.config.schema import Section
 from tests.pages import ROOT, blocks
 

@@ -21,8 +21,7 @@ from gdp.burst import slots
 from gdp.burst.cipher import BODY_AT, TAG_BYTES, MessageCipher, Plaintext
 from gdp.crypto.envelope import SEAL_BYTES, SIGNATURE_BYTES, KeyContext, Opener, Sealer
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
-from gdp.frame.codec import HOPS_AT, Header, decode, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HOPS_AT, Header, Kind, decode, encode
 from gdp.message.reassembly import Reassembler
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.sansio import ReceivedFrame

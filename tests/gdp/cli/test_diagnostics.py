@@ -15,8 +15,8 @@ import pytest
 from gdp.cli import tables
 from gdp.cli.gdp import main
 from gdp.cli.local_nodes import local_nodes
-from gdp.cli.path_view import path_lines
 from gdp.cli.ping import PingStatistics, quantile
+from gdp.cli.trace import path_lines
 from gdp.management import running_nodes
 from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.state.control_protocol import Respond, Response

@@ -14,9 +14,8 @@ from gdp.config.config import RibConfig, SwitchConfig
 from gdp.config.relay_config import RelayConfig
 from gdp.enrolment import service_units
 from gdp.enrolment.addresses import default_directory, duration_s, is_private, server_text
-from gdp.enrolment.machine_programs import Machine
 from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.programs import MachineProgram, programs_of
+from gdp.enrolment.programs import Machine, MachineProgram, programs_of
 from gdp.enrolment.units import install_units, remove_units
 from gdp.errors import LocalError
 from gdp.trust.join_token import JoinToken

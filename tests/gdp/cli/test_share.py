@@ -13,7 +13,7 @@ import pytest
 
 from gdp.cli.gdp import main
 from gdp.errors import StoreError
-from gdp.sharing.folder_exchange import FolderExchange
+from gdp.sharing.exchange import FolderExchange
 from gdp.stores.issue import succeed_owner
 from gdp.stores.keyring import CARD, OWNER_KEY, OWNER_SALT, load_card, load_salt
 from proxy.config.config import ProxyConfig

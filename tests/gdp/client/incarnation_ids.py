@@ -15,7 +15,7 @@ from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.introduction import Introduction
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.subject import Subject
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.message.acknack import AckNack, AckNackFlag
 from gdp.names import Name
 

@@ -16,8 +16,7 @@ from gdp.client.publisher import Publisher
 from gdp.client.send_options import DEFAULT_OPTIONS, PublisherSettings, SendOptions
 from gdp.client.writer_proxy import WriterProxy
 from gdp.crypto.keys import SigningKey
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
 from tests.gdp.client.incarnation_ids import reader_of, source_of

@@ -10,7 +10,7 @@ from gdp.client.attachment import PendingAdvertisement
 from gdp.client.participant import Topic
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import ADVERTISEMENT
 from gdp.metadata import Metadata
 from gdp.trust.right import Right

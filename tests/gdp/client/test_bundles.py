@@ -11,8 +11,7 @@ from gdp.client.publisher import Publisher
 from gdp.client.sequence_numbers import SequenceState
 from gdp.crypto.envelope import SIGNATURE_BYTES, KeyContext, Sealer, fragment_capacity
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import Header, decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, decode
 from gdp.limits import MESSAGE_MAX_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, pack
 from gdp.names import Name

@@ -10,8 +10,7 @@ from gdp.client.writer_proxy import WriterProxyState
 from gdp.crypto.envelope import KeyContext, Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind, decode
 from gdp.limits import JOIN_PATIENCE_S, JOIN_SOURCE_BYTES, JOIN_TOTAL_BYTES, NACKS_PER_REPORT
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat

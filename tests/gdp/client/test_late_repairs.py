@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from gdp.client.send_options import SendOptions
 from gdp.client.writer_proxy import WriterProxyState
-from gdp.frame.codec import Header, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, decode
 from gdp.limits import REPAIR_S, REPORT_DELAY_S
 from gdp.message.late_repairs import HOLD_S
 from tests.draws import draws

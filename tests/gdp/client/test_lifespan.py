@@ -9,7 +9,7 @@ from gdp.client.send_options import SendOptions
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.crypto.envelope import KeyContext, Sealed, Sealer
 from gdp.errors import DropReason
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.message.loss import LossReason
 from tests.gdp.client.pipe import WRITER, End, Pipe, publisher_of
 

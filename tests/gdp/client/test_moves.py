@@ -6,8 +6,7 @@ from random import Random
 
 import pytest
 
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from tests.gdp.client.pipe import End, Pipe, publisher_of
 
 WIDE, NARROW = 9_000, 800

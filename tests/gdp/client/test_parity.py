@@ -10,8 +10,7 @@ import pytest
 from gdp.client.send_options import DEFAULT_OPTIONS
 from gdp.crypto.parity_seal import ParitySealer
 from gdp.errors import DropReason
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind, decode
 from gdp.message.parity import OVERHEAD_BYTES, Parity
 from tests.gdp.client.pipe import SECRETS, TOPIC, Pipe
 from tests.gdp.client.test_late_repairs import joined

@@ -13,8 +13,7 @@ from gdp.client.parity_sender import PARITY_BYTES, ParitySender, is_protected, i
 from gdp.client.redundancy import CopyBudget, parity_budget
 from gdp.crypto.envelope import fragment_capacity
 from gdp.crypto.parity_seal import ParityOpener
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind, decode
 from gdp.message import erasure
 from gdp.message.parity import Parity
 from gdp.names import Name

@@ -9,7 +9,7 @@ import pytest
 from gdp.client.participant import Participant
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason, LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from lab.simulation import Simulation

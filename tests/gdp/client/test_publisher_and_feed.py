@@ -10,8 +10,7 @@ from gdp.client.publisher import Publisher
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind, decode
 from gdp.intervals import READER
 from gdp.names import Name
 from tests.gdp.client.incarnation_ids import reader_of

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.redundancy import CopyBudget, Redundancy, sends_for
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, encode
 from tests.gdp.client.pipe import Pipe, publisher_of
 
 NAME, READER = b"n" * 32, b"r" * 32

@@ -7,8 +7,7 @@ import pytest
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.sent_frames import SentFrames
 from gdp.congestion.controller import PathController
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from gdp.message.acknack import AckNack, AckNackFlag
 
 READER = bytes(32)

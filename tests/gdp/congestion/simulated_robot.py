@@ -24,8 +24,7 @@ from gdp.client.timer_queue import TimerQueue
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.congestion.delivery_rate import Flight
 from gdp.crypto.keys import SigningKey
-from gdp.frame.codec import Header, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, decode
 from gdp.intervals import NEVER_S
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame

@@ -8,8 +8,7 @@ import pytest
 
 from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import DeliveryRate
-from gdp.congestion.filters import WindowedExtreme
-from gdp.congestion.path_model import PathModel
+from gdp.congestion.path_model import PathModel, WindowedExtreme
 from gdp.congestion.states import State
 from tests.gdp.congestion.simulated_path import MTU, CubicSender, Flow, SimulatedPath
 from tests.lanes import nightly

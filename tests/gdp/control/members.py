@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gdp.control.fragments import ControlFragmenter
+from gdp.control.hello import NodeSettings
 from gdp.control.neighbour_discovery import HelloProtocol
-from gdp.control.settings import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.frame.codec import HEADER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Kind, decode
 from gdp.sansio import ReceivedFrame, Timestamps
 from gdp.trust.domain import Policy
 

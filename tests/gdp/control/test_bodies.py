@@ -9,15 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
-from gdp.control.join import Join
-from gdp.control.join_refresh import JoinRefresh
+from gdp.control.join import Join, JoinRefresh
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response
 from gdp.crypto.cbor import Value
 from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.control.endpoint_record import RECORD_MAX_BYTES, Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
+from gdp.control.endpoints import (
+    RECORD_MAX_BYTES,
+    Candidate,
+    CandidateType,
+    Endpoint,
+    EndpointRecord,
+    inner_address,
+    tunnel_vni,
+)
 from gdp.crypto.statements import StatementType
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import DropReason, LocalError, StatementError

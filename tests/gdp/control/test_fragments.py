@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.errors import DropReason, FrameError, LocalError
-from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HEADER_BYTES, Header, Kind, decode, encode
 from gdp.limits import (
     CONTROL_JOIN_BYTES,
     CONTROL_JOIN_SOURCE_BYTES,

@@ -8,19 +8,17 @@ from collections.abc import Callable
 import pytest
 
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import Hello, Timing
+from gdp.control.hello import Hello, NodeSettings, Timing
 from gdp.control.keepalive import QUEUED_S, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.neighbour_discovery import HelloProtocol
-from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, Header, decode
-from gdp.frame.kinds import KeepaliveFlag, Kind
+from gdp.frame.codec import HEADER_BYTES, Header, KeepaliveFlag, Kind, decode
 from gdp.intervals import HELLO_IDLE, NEIGHBOUR
 from gdp.limits import CLOCK_SKEW_S, COST_AUTO
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps

@@ -9,16 +9,14 @@ import pytest
 
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import Timing
+from gdp.control.hello import NodeSettings, Timing
 from gdp.control.link_probe import LinkProbe, patience_s
 from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbour_discovery import HelloProtocol
-from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.sansio import BROADCAST, ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node, statement_of
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from gdp.control.keepalive import keepalive_header, open_keepalive, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.errors import DropReason, FrameError
-from gdp.frame.codec import HEADER_BYTES, decode
-from gdp.frame.kinds import KeepaliveFlag, Kind
+from gdp.frame.codec import HEADER_BYTES, KeepaliveFlag, Kind, decode
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
 from tests.gdp.control.members import UNIX_S, at
 from tests.gdp.control.test_keepalive import DETECT_S, STEP_S, A, Pair, up

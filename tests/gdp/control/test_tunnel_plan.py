@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.control.tunnel_plan import (
     DIAL_S,
     REBINDS,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.attachment import Attachment, attachment_waits
-from gdp.control.settings import NodeSettings
-from gdp.control.strangers import STRANGERS_MAX, Strangers
+from gdp.control.hello import NodeSettings
+from gdp.control.hello_port import STRANGERS_MAX, Strangers
 from gdp.control.waiting import Wait, WaitLog, WaitReason
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse

@@ -21,8 +21,7 @@ from gdp.crypto.control_seal import (
 )
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Flag, Header, Kind, decode, encode
 
 SHARED, SECRET, READER, PUBLISHER, TOPIC = b"x" * 32, b"s" * 32, b"r" * 32, b"p" * 32, b"t" * 32
 KEY = control_key(SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)

@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gdp.burst.cipher import SALT_BYTES
 from gdp.crypto.envelope import (
-    SALT_BYTES,
     SEAL_BYTES,
     SIGNATURE_BYTES,
     KeyContext,
@@ -25,8 +25,7 @@ from gdp.crypto.envelope import (
 )
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.errors import DropReason, EnvelopeError, LocalError, StatementError
-from gdp.frame.codec import HEADER_BYTES, HOPS_AT, authenticated, decode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Flag, Kind, authenticated, decode
 from gdp.limits import FRAME_MAX_BYTES, HOPS_MAX, MESSAGE_MAX_BYTES, SEQUENCE_BYTES
 from tests.gdp.message.sealed import INCARNATION, MTU, SECRET, SOURCE, TOPIC, WRITER, opener_of, seal
 

@@ -10,7 +10,7 @@ import pytest
 
 from gdp.config.config import SwitchConfig
 from gdp.config.relay_config import RelayConfig
-from gdp.control.endpoint_record import CandidateType, EndpointRecord
+from gdp.control.endpoints import CandidateType, EndpointRecord
 from gdp.crypto.certificates import Role
 from gdp.enrolment.member_files import MemberFiles
 from gdp.nodes.membership import load_policy

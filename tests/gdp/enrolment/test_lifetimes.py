@@ -13,7 +13,7 @@ from typing import cast
 import pytest
 
 from gdp.cli.gdp import main
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import EndpointRecord
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect
 from gdp.enrolment.member_files import MemberFiles

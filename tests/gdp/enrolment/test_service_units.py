@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from gdp.enrolment import service_units
-from gdp.enrolment.machine_programs import Machine, read_machine
-from gdp.enrolment.programs import MachineProgram
+from gdp.enrolment.programs import Machine, MachineProgram, read_machine
 from gdp.enrolment.service_units import service_texts
 from gdp.enrolment.units import installed_units
 from gdp.errors import LocalError

@@ -16,17 +16,18 @@ from gdp.errors import DropReason, FrameError, LocalError
 from gdp.frame import codec
 from gdp.frame.codec import (
     DESTINATION_AT,
+    ETHERTYPE,
     HEADER_BYTES,
     HOPS_AT,
     KIND_AT,
     SECOND_PATH,
     SOURCE_AT,
     Header,
+    Kind,
     decode,
     encode,
     ethernet,
 )
-from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.frame.layers import GDP, Keepalive, Statement, layout
 from gdp.limits import PARTS_MAX
 from tests.gdp.frame.frames import frames

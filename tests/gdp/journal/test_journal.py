@@ -16,7 +16,7 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import NodeKeys, node_metadata
 from gdp.errors import LocalError
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.journal.incident import Incident
 from gdp.journal.journal import Journal
 from gdp.journal.replay import Replay, kind_of

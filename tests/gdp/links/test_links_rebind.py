@@ -10,9 +10,8 @@ from unittest.mock import MagicMock
 import pytest
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
-from gdp.control.settings import NodeSettings
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
+from gdp.control.hello import NodeSettings
 from gdp.control.tunnel_plan import REBINDS, TunnelId
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.links.own_endpoints import listed_candidates
 from gdp.names import Name
 from gdp.switch.direct_tunnels import slots_between

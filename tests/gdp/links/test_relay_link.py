@@ -13,7 +13,7 @@ from typing import cast
 
 import pytest
 
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.links.relay_loop import RelayLoop
 from gdp.ports.tap import TapDevice

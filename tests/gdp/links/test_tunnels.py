@@ -8,14 +8,15 @@ from typing import cast
 
 import pytest
 
+from gdp.control.hello import NodeSettings
 from gdp.control.preshared_key import NO_KEY
-from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import TunnelId
 from gdp.errors import LocalError
 from gdp.links import tunnels as tunnels_module
 from gdp.links.tunnels import Tunnel, Tunnels
 from gdp.names import Name
-from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.ports.tunnel.control import PeerState
+from gdp.ports.tunnel.wireguard import WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

@@ -7,8 +7,7 @@ from os import urandom
 from gdp.crypto.envelope import KeyContext, Opener, Sealer, Signer
 from gdp.crypto.keys import SigningKey
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.limits import JOIN_PATIENCE_S
 from gdp.message.reassembly import ReassembledMessage, Reassembler
 from gdp.message.reassembly_quota import ReassemblyQuota

@@ -6,8 +6,7 @@ from random import Random
 
 import pytest
 
-from gdp.frame.codec import Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Header, Kind, encode
 from gdp.message.acknack import FRAMES_MASK
 from gdp.message.frame_loss import FrameLoss
 

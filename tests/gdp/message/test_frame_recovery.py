@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from gdp.crypto.parity_seal import ParityOpener, ParitySealer
 from gdp.errors import DropReason, EnvelopeError
-from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, decode, encode
 from gdp.limits import HOPS_MAX, RECOVERY_BYTES
 from gdp.message import erasure
 from gdp.message.frame_recovery import WAIT_MAX_S, FrameRecovery

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.crypto.envelope import TAG_BYTES
+from gdp.burst.cipher import TAG_BYTES
 from gdp.errors import DropReason, FrameError
-from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Flag, Header, Kind, decode, encode
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S
 from gdp.message.reassembly import ALL_PARTS
 from gdp.message.reassembly_quota import ReassemblyQuota

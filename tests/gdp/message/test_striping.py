@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.frame.codec import HOPS_AT, SECOND_PATH, Header, encode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import HOPS_AT, SECOND_PATH, Header, Kind, encode
 from gdp.limits import HOPS_MAX
 from gdp.message.striping import SHARE_WHOLE, StripedPaths, Striper
 from gdp.names import Name

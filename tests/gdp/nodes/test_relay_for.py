@@ -10,9 +10,8 @@ from typing import cast
 import pytest
 
 from gdp.config.config import LinksConfig
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
-from gdp.control.settings import NodeSettings
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
+from gdp.control.hello import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.links.links import TunnelLinks

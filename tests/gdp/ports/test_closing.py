@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from gdp.ports.closing import Closing
+from gdp.ports.raw import Closing
 
 
 def test_who_opens_a_device_again_waits_for_its_end_and_for_no_other() -> None:

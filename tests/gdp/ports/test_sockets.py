@@ -13,7 +13,7 @@ from itertools import product
 
 import pytest
 
-from gdp.frame.kinds import CONTROL_FROM, Flag, Kind
+from gdp.frame.codec import CONTROL_FROM, Flag, Kind
 from gdp.ports import sockets
 from gdp.ports.sockets import TrafficClass, attach_ethertype_filter, steps_of
 from tests.fixtures_forwarding import ONE, frame

@@ -12,7 +12,7 @@ from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
-from gdp.links.relay_tls import tls_context
+from gdp.links.relay_context import tls_context
 from gdp.relay.admission import ClientAdmission, verified_border, verified_switch
 from gdp.relay.connection import ConnectionSettings, RelayConnection
 from gdp.sansio import Timestamps

@@ -11,9 +11,9 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
-from gdp.frame.kinds import Flag
+from gdp.frame.codec import Flag
 from gdp.intervals import CONNECT_S
-from gdp.links.relay_tls import tls_context
+from gdp.links.relay_context import tls_context
 from gdp.relay.connection import ConnectionState, RelayConnection
 from gdp.relay.framing import PREFIX, ControlMessage, ControlType
 from gdp.trust.domain import Policy

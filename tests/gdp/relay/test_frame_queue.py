@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Kind
 from gdp.relay.frame_queue import FrameQueue
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from statistics import median
 
-from gdp.control.query import Query
+from gdp.control.rib_statements import Query
 from gdp.metadata import Metadata
 from tests.gdp.rib.test_core import START, relay, rib
 from tests.gdp.trust.world import LAB, SWITCH, adcert, advertisement

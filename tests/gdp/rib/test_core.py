@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from gdp.control.advertise_ack import AdvertiseAck
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
@@ -23,11 +21,10 @@ from gdp.rib.route import Route
 from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
-from gdp.trust.advertisement import UnverifiedAdvertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement, Withdrawal
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.withdrawal import Withdrawal
 from tests.gdp.trust.world import (
     CAMERA,
     CLOUD,

@@ -6,10 +6,8 @@ from itertools import count
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINTS, item_of, record_in
-from gdp.control.endpoints import Endpoint
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.endpoints import ENDPOINTS, Candidate, CandidateType, Endpoint, EndpointRecord, item_of, record_in
+from gdp.control.rib_statements import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse
@@ -17,7 +15,7 @@ from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import DropReason, StatementError
 from gdp.exchange.sync_message import SyncMessage
 from gdp.exchange.sync_set import line_of, rank_in
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind
 from gdp.intervals import ENDPOINT
 from gdp.limits import ENDPOINT_RECORDS_RATE
 from gdp.names import Name

@@ -8,8 +8,7 @@ import pytest
 
 import gdp
 from gdp.errors import LocalError
-from gdp.frame.codec import ETHER_BYTES, decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.names import Name
 from gdp.service.replication import ALL, Mode
 from gdp.session.protocol.client_core import Call

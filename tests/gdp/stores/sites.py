@@ -6,9 +6,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gdp.control.advertise_ack import AdvertiseAck
-from gdp.control.query import Query, Response
-from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_statements import AdvertiseAck, Query, RelayedStatement, Response
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
@@ -24,11 +22,10 @@ from gdp.rib.state import RibSettings
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
 from gdp.stores.snapshot import Snapshot
-from gdp.trust.advertisement import UnverifiedAdvertisement
+from gdp.trust.advertisement import UnverifiedAdvertisement, Withdrawal
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
-from gdp.trust.withdrawal import Withdrawal
 
 EVIDENCE_S = 3_600  # for which advertisements can be proven: the RtCert ends before the memberships
 

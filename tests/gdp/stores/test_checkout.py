@@ -10,7 +10,7 @@ import pytest
 
 from gdp.cli.gdp import main
 from gdp.errors import LocalError
-from gdp.stores.checkout import ignore_folder, work_tree_of
+from gdp.stores.files import ignore_folder, work_tree_of
 from gdp.stores.issue import make_owner
 
 

@@ -14,8 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.names import Name
 from gdp.switch.direct_tunnels import Close, DirectTunnels, Silence
 

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import Candidate, CandidateType, Endpoint, EndpointRecord
 from gdp.names import Name
 from gdp.switch.direct_tunnels import Action, Close, DirectTunnels, Open, Retry, Silence, slots_between
 

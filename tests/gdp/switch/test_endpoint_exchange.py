@@ -6,9 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
-from gdp.control.endpoint_sync import ENDPOINT_NAMES_MAX, ENDPOINTS, item_of
-from gdp.control.endpoints import Endpoint
+from gdp.control.endpoints import (
+    ENDPOINT_NAMES_MAX,
+    ENDPOINTS,
+    Candidate,
+    CandidateType,
+    Endpoint,
+    EndpointRecord,
+    item_of,
+)
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse

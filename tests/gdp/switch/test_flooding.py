@@ -7,8 +7,7 @@ from dataclasses import replace
 from gdp.control.hello import DIGEST_BYTES
 from gdp.control.link_state import LinkState, Scope
 from gdp.errors import DropReason
-from gdp.frame.codec import HEADER_BYTES, Header, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Header, Kind, encode
 from gdp.intervals import LINK_STATE
 from gdp.limits import HOPS_MAX
 from gdp.names import ZERO

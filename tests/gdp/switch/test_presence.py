@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from unittest.mock import patch
 
 from gdp.control.presence import Presence
-from gdp.frame.codec import decode
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, decode
 from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.sansio import ReceivedFrame, Timestamps
 from lab.simulation import Simulation

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from unittest.mock import patch
 
 from gdp.errors import DropReason
-from gdp.frame.codec import Header, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import Flag, Header, Kind, decode, encode
 from gdp.intervals import NEGATIVE_LEASE_S
 from gdp.limits import HOPS_MAX
 from gdp.names import Name

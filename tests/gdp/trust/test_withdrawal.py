@@ -4,8 +4,8 @@ import pytest
 
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
+from gdp.trust.advertisement import Withdrawal
 from gdp.trust.right import Right
-from gdp.trust.withdrawal import Withdrawal
 from tests.gdp.trust.world import CAMERA, NOW, ROBOT
 
 BODY = {"n": CAMERA.name, "right": "publish", "s": 1}

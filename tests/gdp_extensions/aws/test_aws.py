@@ -13,7 +13,7 @@ import yaml
 
 from fog.hardware import Hardware, Offer
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
-from fog.providers.aws_config import AwsConfig, Ssh
+from fog.providers.cloud_config import AwsConfig, Ssh
 from fog.providers.cloud_init import Setup
 from gdp.errors import LocalError, StoreError
 from gdp_extensions.aws.provider import AwsProvider

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fog.providers.aws_config import AwsConfig
+from fog.providers.cloud_config import AwsConfig
 from gdp_extensions.aws.core.run_request import Ground, order
 from gdp_extensions.aws.provider import AwsProvider
 from tests.gdp_extensions.aws.test_aws import BOOT, EAST, Cloud, aws, cloud, spec

@@ -247,8 +247,7 @@ def _rclpy_peer() -> None:
 def _dds_peer(domain: int) -> None:
     from gdp_extensions.dds.endpoint import DdsEndpoint
     from proxy.endpoints.core.endpoint import CallFailed, RequestReceived, ResponseReceived
-    from proxy.serial.channel import Channel
-    from proxy.serial.service import Service
+    from proxy.serial.channel import Channel, Service
 
     endpoint = DdsEndpoint(domain, "robot")
     handles: dict[str, int] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.errors import LocalError
-from gdp_extensions.dds.discovery_range import with_discovery_range
+from gdp_extensions.dds.node import with_discovery_range
 
 _RANGE, _ONLY = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY"
 

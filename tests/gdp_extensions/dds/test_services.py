@@ -15,8 +15,7 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 from gdp.errors import LocalError
 from gdp_extensions.dds.endpoint import DdsEndpoint
 from proxy.endpoints.core.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, peer
 
 SET = "std_srvs/srv/SetBool"

@@ -23,8 +23,7 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.core.qos import default, unmatched
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 from tests.gdp_extensions.dds.peers import CYCLONE, Ears, Peer, digest, peer
 
 STRING = "std_msgs/msg/String"

@@ -15,8 +15,7 @@ from gdp.crypto.control_seal import ControlContext, ControlSealer, control_key
 from gdp.crypto.envelope import KeyContext, Sealer, seal_key
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.parity_seal import ParitySealer
-from gdp.frame.codec import HEADER_BYTES, decode, encode
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Kind, decode, encode
 from gdp.message import erasure
 from gdp.message.bundle import pack
 from gdp.message.heartbeat import Heartbeat

@@ -12,8 +12,7 @@ from gdp.cli.gdp import main
 from gdp.crypto.certificates import Role
 from gdp.crypto.envelope import KeyContext, Sealer
 from gdp.crypto.keys import SigningKey
-from gdp.frame.codec import ethernet
-from gdp.frame.kinds import Kind
+from gdp.frame.codec import Kind, ethernet
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner

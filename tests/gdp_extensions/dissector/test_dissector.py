@@ -14,8 +14,7 @@ from scapy.fields import StrField
 from scapy.packet import Raw
 
 from gdp.errors import FrameError, LocalError
-from gdp.frame.codec import HEADER_BYTES, decode, ethernet
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import HEADER_BYTES, Flag, Kind, decode, ethernet
 from gdp.frame.layers import GDP, PAYLOADS, STATEMENTS, Statement, least_bytes
 from gdp_extensions.dissector.dissector import _field, dissector
 from tests.draws import IS_LONG

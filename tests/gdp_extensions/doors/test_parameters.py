@@ -14,8 +14,8 @@ from gdp_extensions.doors.core.hub import Hub
 from gdp_extensions.doors.core.parameters import GET, LIST, SET, from_value, node_and_name, to_value
 from proxy.bridge.core.delegated_rules import DelegatedRules, rules_of
 from proxy.endpoints.core.endpoint import Event, RequestReceived
+from proxy.serial.channel import Service
 from proxy.serial.rosbridge_json import RosbridgeCodec
-from proxy.serial.service import Service
 from tests.gdp_extensions.doors.rights import Everything
 from tests.proxy.bridge import known
 

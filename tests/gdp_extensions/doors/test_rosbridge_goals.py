@@ -12,8 +12,8 @@ import pytest
 from gdp_extensions.doors.core.rosbridge_goals import GOALS_MAX
 from proxy.bridge.core.delegated_rules import rules_of
 from proxy.endpoints.core.endpoint import RequestReceived
+from proxy.serial.channel import Service
 from proxy.serial.rosbridge_json import RosbridgeCodec
-from proxy.serial.service import Service
 from tests.gdp_extensions.doors.fibonacci import FEEDBACK, FIBONACCI, ID, RULE, SERVICES, TIME
 from tests.gdp_extensions.doors.rights import goal_id
 from tests.gdp_extensions.doors.test_rosbridge import Site

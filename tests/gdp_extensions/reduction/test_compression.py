@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gdp.errors import LocalError, RemoteError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp_extensions.reduction.compression import BodyCompressor, BodyDecompressor, check_dictionary
-from gdp_extensions.reduction.expander import body_max_bytes
+from gdp_extensions.reduction.encoder import body_max_bytes
 from proxy.wire.message import DICTIONARY_MAX_BYTES
 
 if sys.version_info >= (3, 14):

@@ -21,7 +21,7 @@ from fog.bootstrap.bundles import machine_boot
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
 from fog.hardware import Hardware, Offer
 from fog.machine import MachineSpec
-from fog.providers.skypilot_config import SkyPilotConfig
+from fog.providers.cloud_config import SkyPilotConfig
 from gdp.errors import GdpError
 from gdp.trust.join_token import JoinRole, JoinToken
 from gdp_extensions.skypilot.provider import SkyPilotProvider

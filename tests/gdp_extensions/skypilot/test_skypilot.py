@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from fog.hardware import Hardware, Offer
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
-from fog.providers.skypilot_config import SkyPilotConfig
+from fog.providers.cloud_config import SkyPilotConfig
 from gdp.errors import LocalError, StoreError
 from gdp_extensions.skypilot.provider import SkyPilotProvider
 from gdp_extensions.skypilot.record import cluster_name, labels_of

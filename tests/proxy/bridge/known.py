@@ -8,8 +8,7 @@ from typing import Final
 
 from rosbags.typesys import Stores, get_typestore
 
-from proxy.serial.channel import Channel, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, RosVersion, Service
 from proxy.serial.service_converter import translated_service
 from proxy.serial.standard_types import type_hash
 

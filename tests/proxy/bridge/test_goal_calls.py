@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gdp.names import Name
 from gdp.service.serving import Asked
+from proxy.bridge.cancellation import GoalCalls
 from proxy.bridge.core.action_interface import GOAL, RESULT
-from proxy.bridge.goal_calls import GoalCalls
 
 ONE, TWO = (bytes([number]) * 16 for number in (1, 2))
 A, B = (Name(bytes([number]) * 32) for number in (1, 2))

@@ -6,7 +6,7 @@ from collections import deque
 
 import pytest
 
-from proxy.bridge.local_responses import LocalResponses
+from proxy.bridge.virtual_server import LocalResponses
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 
 QUEUE = 10  # rmw_qos_profile_services_default

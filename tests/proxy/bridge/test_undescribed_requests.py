@@ -5,7 +5,7 @@ from __future__ import annotations
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
 from gdp.names import Name
-from proxy.bridge.undescribed_requests import EARLY_MAX, UndescribedRequests
+from proxy.bridge.remote_clients import EARLY_MAX, UndescribedRequests
 
 A, B, C = (bytes([number]) * 32 for number in (1, 2, 3))
 

@@ -26,8 +26,7 @@ from proxy.endpoints.core.endpoint import (
     TypeResolved,
 )
 from proxy.endpoints.core.qos import default, depth_of
-from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 __all__ = ["FakeEndpoint", "FakeGraph", "Publication", "Server"]
 

@@ -10,8 +10,7 @@ import pytest
 
 from gdp.errors import LocalError
 from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
-from proxy.serial.channel import Channel
-from proxy.serial.service import Service
+from proxy.serial.channel import Channel, Service
 from tests.proxy.endpoints.ros1_net import Ear, Net, ros1_net
 
 SET_BOOL = "std_srvs/srv/SetBool"

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import RemoteError
-from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.channel import Channel, RosVersion, Service
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
-from proxy.serial.service import Service
 from proxy.serial.service_converter import translated_service
 
 LITTLE = b"\x00\x01\x00\x00"

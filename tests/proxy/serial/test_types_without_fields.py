@@ -7,10 +7,9 @@ from typing import Final
 import pytest
 
 from proxy.recordings.channels import from_ros2
-from proxy.serial.channel import EMPTY_MD5, Channel, ros1_format
+from proxy.serial.channel import EMPTY_MD5, Channel, Service, ros1_format
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.rosbridge_json import RosbridgeCodec
-from proxy.serial.service import Service
 from proxy.serial.service_converter import translated_service
 from proxy.serial.standard_types import known_channel
 from proxy.tools.message_text import MessageText, request_of

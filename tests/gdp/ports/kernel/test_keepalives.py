@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from gdp.control.keepalive import SUSPECT_AFTER, keepalive_header, open_keepalive, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.errors import FrameError, LocalError
-from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, NUMBER_AT, decode, encode, ethernet
-from gdp.frame.kinds import KeepaliveFlag
+from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, NUMBER_AT, KeepaliveFlag, decode, encode, ethernet
 from gdp.ports.kernel import syscall
 from gdp.ports.kernel.keepalive_program import FRAME_BYTES
 from gdp.ports.kernel.keepalives import KeepaliveSessions

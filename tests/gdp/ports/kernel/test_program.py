@@ -15,8 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gdp.errors import DropReason
-from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, SECOND_PATH, SOURCE_AT, second_path_key
-from gdp.frame.kinds import Flag, Kind
+from gdp.frame.codec import (
+    DESTINATION_AT,
+    ETHER_BYTES,
+    HEADER_BYTES,
+    HOPS_AT,
+    SECOND_PATH,
+    SOURCE_AT,
+    Flag,
+    Kind,
+    second_path_key,
+)
 from gdp.ports.kernel import syscall
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.loaded_program import LoadedProgram

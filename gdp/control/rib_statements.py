@@ -1,15 +1,19 @@
-"""Query to a RIB, and its responses: one for each advertiser of the name, one that there is none, or "unknown".
+"""Statements between nodes and RIBs: advertisements that are relayed and acknowledged, queries and their responses.
 
-Sans-I/O.
+Sans-I/O. A switch relays advertisements and revocations of its own domain. A RIB names the domain of each advertisement
+that it forwards to the tier above.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from gdp.crypto.schema import NAME, STATEMENT, Body, Keyed, many, number, octets, or_empty, uint
+from gdp.crypto.identity import Identity
+from gdp.crypto.schema import CERT, NAME, REASON, STATEMENT, Body, Keyed, many, number, octets, or_empty, uint
 from gdp.crypto.statements import StatementType
+from gdp.errors import DropReason
 from gdp.intervals import LEASE_MAX_S
 from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
@@ -67,3 +71,46 @@ class Response(Body):
     def is_unknown(self) -> bool:
         """Return whether the RIB could not ask those that would know."""
         return self.advertiser == self.name and not (self.advertisement or self.lease_s or self.sequence)
+
+
+@dataclass(frozen=True, slots=True)
+class RelayedStatement(Body):
+    """An advertisement, a withdrawal or a revocation that is forwarded.
+
+    Args:
+        statement: the forwarded statement, signed by its maker.
+        transit: domains through which the domain of the advertisement's switch lets its traffic pass.
+        membership: the signer's certificate, DER.
+        domain: domain of the advertisement's switch; None: the signer's domain.
+    """
+
+    TYPE = StatementType.RELAY
+    statement: Annotated[bytes, Keyed("q", STATEMENT)]
+    transit: Annotated[tuple[Name, ...], Keyed("x", many(NAME, TRANSIT_MAX))]
+    membership: Annotated[bytes, Keyed("c", CERT)]
+    domain: Annotated[Name | None, Keyed("d", or_empty(NAME, None))] = None
+
+
+def relayed(statement: bytes, switch: Identity, transit: Iterable[Name]) -> bytes:
+    """Return an advertisement or withdrawal, relayed by the switch to which its node is attached.
+
+    ``transit`` is that of the switch's domain.
+    """
+    return RelayedStatement(statement, tuple(sorted(transit)), switch.membership).to_wire(switch.name, switch.key)
+
+
+@dataclass(frozen=True, slots=True)
+class AdvertiseAck(Body):
+    """Reply of a RIB or a switch to an advertisement or a withdrawal: shorter than these, so it cannot amplify.
+
+    Args:
+        refused: None when it was accepted.
+        sequence: of the advertisement that the sender now holds; one refused as STALE must be resent with a higher
+            number.
+    """
+
+    TYPE = StatementType.ADVERTISE_ACK
+    name: Annotated[Name, Keyed("n", NAME)]
+    advertiser: Annotated[Name, Keyed("a", NAME)]
+    refused: Annotated[DropReason | None, Keyed("r", REASON)]
+    sequence: Annotated[int, Keyed("s", uint())]
