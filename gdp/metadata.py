@@ -15,7 +15,7 @@ from gdp.errors import LocalError
 from gdp.names import Name, name_of
 
 KINDS: Final = frozenset(
-    {"topic", "service", "action", "node", "domain", "switch", "leaf", "rib", "proxy", "door", "enrolment"}
+    {"topic", "service", "action", "node", "domain", "switch", "leaf", "rib", "proxy", "door", "enrolment", "capsule"}
 )
 SALT: Final = "salt"  # key of the unguessable part
 _VALUE_MAX_CHARS: Final = 4_096

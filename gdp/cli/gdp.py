@@ -74,6 +74,7 @@ _KNOWN: Final = {
     "audit": _own("audit:app", "Audit logs of switches, RIBs, domains and owners."),
     "incident": _own("incident:app", "What happened at a node: save its journal, show it, and run it again."),
     "topic": _own("topic:app", "List, measure and read topics."),
+    "store": _own("store:app", "Hold capsules, the history of topics, and read them back."),
     "unit": _own("unit:app", "systemd units of this machine's nodes."),
     "rib": _own("rib_lookup:app", "Ask RIBs what they know."),
 }

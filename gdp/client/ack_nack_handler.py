@@ -122,9 +122,17 @@ class AckNackHandler:
             trip_s: how long a reader's answer may take.
             paces: that readers are to state.
         """
+        return self._heartbeats.poll_heartbeat(self._place(paces), now_s, trip_s)
+
+    def describe_heartbeat(self) -> tuple[int, bytes]:
+        """Return number and wire form of a Heartbeat that brings the description, and starts no reader."""
+        return self._heartbeats.describe_apart(self._place(()))
+
+    def _place(self, paces: tuple[tuple[bytes, int], ...]) -> Heartbeat:
+        """Return what is cached, sent, renumbered and gone."""
         queue, oldest = self._queue, self._window.cache.oldest
         (sent_number, sent_part), sent_sequence = queue.sent, queue.sent_sequence
-        state = Heartbeat(
+        return Heartbeat(
             oldest=sent_number if oldest is None else oldest,
             sent_number=sent_number,
             sent_part=sent_part,
@@ -136,7 +144,6 @@ class AckNackHandler:
             gone=tuple(queue.ledger.gone),
             paces=paces,
         )
-        return self._heartbeats.poll_heartbeat(state, now_s, trip_s)
 
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""

@@ -90,3 +90,8 @@ class HeartbeatSchedule:
         self._at_s = now_s + max(REPORT_DELAY_S, len(wire) / _BYTES_PER_S)
         self._remind_s = max(self._at_s, now_s + min(trip_s, READER.refresh_s))
         return wire
+
+    def describe_apart(self, place: Heartbeat) -> tuple[int, bytes]:
+        """Return number and wire form of one that is for no reader, with the description; nothing else changes."""
+        self.number += 1
+        return self.number, place._replace(description=self._description).to_wire()

@@ -21,6 +21,7 @@ from gdp.client.governing_paths import GoverningPaths
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
+from gdp.client.message_recorder import MessageRecorder, OnSealed
 from gdp.client.protection import Protection
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.reader_proxies import ReaderProxies
@@ -193,8 +194,11 @@ class Publisher:
         Raises:
             LocalError: there is no secret.
         """
+        if self.queue.recorder is not None:
+            self.seal_recorded()  # under the epoch in which it was published
         if self._keys.renew(secrets, now_s):
             self._heartbeats.wanted = True
+            self._record_description()
             mtu = self.queue.mtu
             move = self.queue.refragment(mtu, is_forced=True) if self.queue.depth and mtu is not None else None
             if move is not None:
@@ -207,7 +211,25 @@ class Publisher:
         If the frame of the Heartbeat is lost, the next messages may arrive before it.
         """
         if self._heartbeats.describe(description):
+            self._record_description()
             self.published(self)
+
+    def record(self, on_sealed: OnSealed, on_described: OnSealed) -> None:
+        """Hand on each message as it is sealed, and each description before its messages; see ``MessageRecorder``."""
+        self.queue.recorder = MessageRecorder(self.queue, self._keys, on_sealed, on_described)
+        self._record_description()
+
+    def seal_recorded(self) -> None:
+        """Seal what waits, so that all that was published is recorded."""
+        if self.queue.mtu is not None:
+            self.queue.seal_gathered()
+        if self.queue.recorder is not None:
+            self.queue.recorder.seal_unsent()
+
+    def _record_description(self) -> None:
+        if self.queue.recorder is not None:
+            self.seal_recorded()
+            self.queue.recorder.record_description(*self.acknowledgements.describe_heartbeat())
 
     def probe(self) -> None:
         """Send a Heartbeat soon; each reader reports at once."""
@@ -283,18 +305,26 @@ class Publisher:
         if not self.is_wanted:
             if self.queue.kept:
                 self.queue.defer(head + message, now_s)
+                if self.queue.recorder is not None:
+                    self.queue.recorder.add(head + message, self.queue.ledger.last)
             else:
                 self.drops[DropReason.NO_READER] += 1
-                self.skip(LossReason.NO_READER, now_s)
+                self.skip(LossReason.NO_READER, now_s, head + message)
             return None
         gather_bytes = WINDOW_BYTES if self.matched.active else BUNDLE_BYTES
         self.queue.add(message, gather_bytes=gather_bytes, added_s=now_s, head=head)
         self.published(self)
         return self.queue.ledger.messages
 
-    def skip(self, reason: LossReason, now_s: float | None = None) -> None:
-        """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason."""
+    def skip(self, reason: LossReason, now_s: float | None = None, message: bytes = b"") -> None:
+        """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason.
+
+        Args:
+            message: for the recorder; empty: it lacks the message, too.
+        """
         self.queue.skip(reason, now_s)
+        if message and self.queue.recorder is not None:
+            self.queue.recorder.add(message, self.queue.ledger.last)
         if self.matched.active:
             self._heartbeats.wanted = True
             self.published(self)

@@ -20,6 +20,7 @@ from typing import Final
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
 from gdp.client.deferred_messages import DeferredMessages
 from gdp.client.key_epochs import KeyEpochs
+from gdp.client.message_recorder import MessageRecorder
 from gdp.client.parity_sender import PARITY_BYTES, is_protected
 from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.sequence_numbers import SequenceState
@@ -64,6 +65,7 @@ class SendQueue:
         bytes_s: bytes of frames per second that this topic may send now; None: unknown, or there is no deadline.
         pace_of: returns the pace of a best-effort message of so many bytes that begins to leave.
         has_parity: messages sealed from now on leave space for parity frames, and announce them.
+        recorder: gets what is sealed, for a capsule, and what is dropped unsealed; None: there is none.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class SendQueue:
         self.options = options = settings.options
         self.bytes_s: float | None = None
         self.has_parity = False
+        self.recorder: MessageRecorder | None = None
         self.pace_of: Callable[[int], int] = lambda _size: 0
         self._best_effort = BestEffortQueue(options.deadline_s)
         window.set_history_bounds(options.history_bytes, options.history_age_s)
@@ -213,7 +216,7 @@ class SendQueue:
         """Seal what waited for the first reader."""
         while self.deferred.waiting:
             sequence, message, added_s = self.deferred.pop()
-            self._seal_message(message, sequence, added_s=added_s)
+            self._seal_message(message, sequence, added_s=added_s, is_recorded=True)
 
     def seal_gathered(self) -> None:
         """Seal what waited to be bundled."""
@@ -235,6 +238,8 @@ class SendQueue:
             waited_s, has_newer = now_s - gathered.oldest_added_s(now_s), len(gathered.messages) > 1
             if not is_expired(waited_s, gathered.oldest_bytes, options.deadline_s, self.bytes_s, has_newer=has_newer):
                 break
+            if self.recorder is not None:
+                self.recorder.add(gathered.messages[0][0], gathered.first)
             self._lose(gathered.drop_oldest(), 1, DropReason.LIFESPAN, LossReason.LIFESPAN)
             dropped += 1
         return bool(dropped)
@@ -244,6 +249,8 @@ class SendQueue:
         for each in self._best_effort.drop_all():
             self._lose(each.sequence, each.messages, DropReason.NO_READER, LossReason.NO_READER)
         while self._gathered.messages and not self.is_acknowledged:
+            if self.recorder is not None:
+                self.recorder.add(self._gathered.messages[0][0], self._gathered.first)
             self._lose(self._gathered.drop_oldest(), 1, DropReason.NO_READER, LossReason.NO_READER)
 
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
@@ -269,7 +276,7 @@ class SendQueue:
         """Seal unsent best-effort messages again if one is too large for the path; return whether any was."""
         requeued = self._best_effort.requeue(mtu)
         for body, carried in requeued:
-            self._seal_message(body, carried.sequence, carried.messages, carried.added_s)
+            self._seal_message(body, carried.sequence, carried.messages, carried.added_s, is_recorded=True)
         return bool(requeued)
 
     def refragment(self, mtu: int, *, is_forced: bool = False) -> Renumbering | None:
@@ -316,14 +323,25 @@ class SendQueue:
         self._seal_message(together[0] if count == 1 else pack(together), first, count, added_s)
 
     def _seal_message(
-        self, body: bytes, sequence: int, messages: int = 1, added_s: float | None = None, head: bytes = b""
+        self,
+        body: bytes,
+        sequence: int,
+        messages: int = 1,
+        added_s: float | None = None,
+        head: bytes = b"",
+        *,
+        is_recorded: bool = False,
     ) -> None:
         """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
         assert self.mtu is not None
+        if self.recorder is not None:
+            self.recorder.seal_unsent()
         number, ledger = self.next_number, self.ledger
         prefix = sequence.to_bytes(SEQUENCE_BYTES, "big") + head
         frames = self._seal(number, body, self.mtu, is_bundle=messages > 1, prefix=prefix)
         self.next_number += 1
+        if self.recorder is not None and not is_recorded:
+            self.recorder.on_sealed(frames, sequence, messages)
         if not self.is_acknowledged:
             for dropped in self._best_effort.add(frames, new_tuple(Carried, (number, sequence, messages, added_s))):
                 self._lose(dropped.sequence, dropped.messages, DropReason.MEMORY_FULL, LossReason.QUEUE_OVERFLOW)

@@ -249,7 +249,9 @@ class Sealed(Sequence[bytes]):
         return self._frames[at]
 
     def set_pace(self, pace: int) -> None:
-        """Set the pace in the headers, before any frame is sealed."""
+        """Set the pace in the headers, if no frame is sealed yet."""
+        if self._frames:
+            return
         self._head = self._head[:PACE_AT] + bytes([pace]) + self._head[PACE_AT + 1 :]
         self._running = None if self._signer is None else digest_of(self._head)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
@@ -20,6 +21,7 @@ from gdp.errors import LocalError
 from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
+from gdp.sansio import Timestamps
 from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_node, sign
@@ -321,6 +323,8 @@ class Bridge:
         for dispatcher in self._dispatchers:
             dispatcher.deliver_faults(self._context, now_s)
         self._close_finished(now_s)
+        if self._context.keeper is not None:
+            self._context.keeper.handle(Timestamps(now_s, time.time()))
         is_tick = now_s >= self._tick_at_s
         for flow, local in self._timed.items():
             due_s = flow.get_timer()
@@ -352,11 +356,15 @@ class Bridge:
             return 0.0
         has_ticks = bool(self._timed or self._probes or self._since or self._finishing)
         times = [each.get_timer() for each in (*self._timed, *self._probes.values(), *self._timed_topics)]
+        if self._context.keeper is not None:
+            times.append(self._context.keeper.get_timer())
         return earliest(*times, self._tick_at_s if has_ticks else None)
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""
         self.rules, self.held = config, held
+        if self._context.keeper is not None:
+            self._context.keeper.renew(held)
         for key, (flow_spec, flow) in list(self._flows.items()):
             topic = held.find(flow_spec.name, _right(flow_spec))
             if topic is None:
@@ -400,8 +408,10 @@ class Bridge:
         self._status_topics = []
 
     def _receive(self, message: Message, now_s: float) -> None:
-        flow = self._inbound.get(message.topic)
-        if flow is None or isinstance(flow, ExposedTopic):
+        flow, keeper = self._inbound.get(message.topic), self._context.keeper
+        if flow is None and keeper is not None and keeper.capsules.is_asked(message.topic):
+            self._context.contain("a holder", message.delivered.publisher, now_s, keeper.receive, message, now_s)
+        elif flow is None or isinstance(flow, ExposedTopic):
             self._context.traffic.unread += 1  # its flow ended a moment ago
         else:
             flow.receive(message, now_s)

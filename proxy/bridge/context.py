@@ -20,6 +20,7 @@ from gdp.sansio import Timestamps
 from proxy.bridge.call_tracer import CallTracer
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
+from proxy.bridge.keeping import TopicKeeper
 from proxy.endpoints.core.endpoint import EndpointError
 
 log = logging.getLogger(__name__)
@@ -30,11 +31,12 @@ _FAULTS: Final = {DropReason.INTERNAL: Fault.INTERNAL, DropReason.QUARANTINED: F
 
 @dataclass(frozen=True, slots=True)
 class BridgeContext:
-    """One proxy: its participant in the overlay, its counters, its fault reports, and who traces its calls."""
+    """One proxy: its participant in the overlay, counters, fault reports, the keeper of its topics, and its tracer."""
 
     member: Participant
     traffic: Traffic
     faults: Faults
+    keeper: TopicKeeper | None = None
     tracer: CallTracer = field(default_factory=CallTracer)
     boundary: ErrorBoundary = field(default_factory=ErrorBoundary)
 

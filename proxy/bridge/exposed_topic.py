@@ -5,6 +5,7 @@ I/O through endpoint and participant. The publishers are live nodes, or those of
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 
@@ -135,6 +136,8 @@ class ExposedTopic:
         """Close the subscription and the publisher; unconfirmed messages are lost."""
         self.finish(now_s)
         if self.publisher is not None:
+            if self._context.keeper is not None:
+                self._context.keeper.release(self._topic.name, time.time())
             self._context.member.withdraw(self._topic.name)
 
     def parties(self, now_s: float) -> list[Party]:
@@ -182,6 +185,11 @@ class ExposedTopic:
             paths=paths_value(rule.paths),
             options=self.qos.options,
         )
+        keeper = self._context.keeper
+        if rule.keep is None or keeper is None:
+            return
+        if obstacle := keeper.keep(self._topic, self.publisher, rule.keep, time.time()):
+            self._context.faults.report(self._flow_spec.local, Fault.REFUSED, obstacle)
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
         rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._context.traffic
@@ -205,7 +213,7 @@ class ExposedTopic:
             self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE, now_s)
             return
-        if not publisher.is_wanted and not publisher.queue.kept:
+        if not publisher.is_wanted and not publisher.queue.kept and publisher.queue.recorder is None:
             traffic.unread += 1
             publisher.skip(LossReason.NO_READER, now_s)
             self._count(event)
@@ -215,15 +223,20 @@ class ExposedTopic:
         if not adaptation.may_send(publisher.losses, acknowledged, path.bytes_s, now_s):
             traffic.thinned += 1
             return
-        if not publisher.has_space():
+        has_space = publisher.has_space()
+        if not has_space:
             adaptation.handle_refused(now_s)
             self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
-            publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
-            return
+            if publisher.queue.recorder is None:
+                publisher.skip(LossReason.WINDOW_OVERFLOW, now_s)
+                return
         body, steps = self._encoders[event.channel].encode(event.raw, adaptation.quality)
         head = RosMessage(event.channel, event.stamp_ns, body, steps).head
+        if not has_space:
+            publisher.skip(LossReason.WINDOW_OVERFLOW, now_s, head + body)
+            return
         size = len(head) + len(body)
         try:
             count = publisher.publish(body, now_s, head)

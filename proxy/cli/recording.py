@@ -7,17 +7,30 @@ from __future__ import annotations
 
 import fcntl
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+from typer.core import TyperGroup
 
 from gdp.cli.node import Json, failing_clearly
+from gdp.cli.program import ungrouped
 from gdp.errors import LocalError
+from proxy.cli.history import export, replay
 from proxy.cli.tool_options import print_json, print_text
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import PARTIAL, BagWriter
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+
+class _Recording(TyperGroup):
+    """Group that lists its own commands; it also has those that ``gdp store`` lists."""
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+        """Return the names of the commands, for the help."""
+        return [name for name in super().list_commands(ctx) if name not in _OF_STORE]
+
+
+_OF_STORE: Final = ("export", "replay")
+app = typer.Typer(cls=_Recording, add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help=f"The recording, such as rec.mcap{PARTIAL}.", exists=True)]
 Output = Annotated[
@@ -54,6 +67,12 @@ def finish(file: File, output: Output = None, json: Json = False) -> None:
         print_json({"file": str(whole), "messages": count, "unread": unread or None})
     else:
         print_text(f"{count} messages are in {whole}" + (f"; {unread}" if unread else ""))
+
+
+app.command(epilog="Example: gdp store export /camera/image --node investigator -o incident.mcap")(export)
+app.command(epilog="Example: gdp store replay /scan --node investigator --config proxy.yaml --rate 2")(
+    ungrouped(replay)
+)
 
 
 def _refuse_used(file: Path, descriptor: int) -> None:

@@ -114,7 +114,7 @@ def _replay(
                 said_s = now_s
                 log.info("progress sent=%d of=%s confirmed=%d", replay.sent, total or "?", replay.confirmed)
 
-        replay = Replay(node, bridge, endpoint, rate, report, skip_empty)
+        replay = Replay(node, bridge, endpoint, rate, report, skip_empty, node.state.context.keeper)
         total = _exposed_total(reader, endpoint)
         if not replay.topics:
             raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")

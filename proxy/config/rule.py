@@ -53,6 +53,7 @@ from gdp.stores.files import read_private
 from proxy.config.control import SomeControl
 from proxy.config.frames import Frames
 from proxy.config.history import SomeHistory
+from proxy.config.keep import Keep
 from proxy.config.readiness import Readiness
 from proxy.config.reduction import CLOUD, IMAGE, QUALITY, Region, SomeAdapt, SomeCompress
 from proxy.serial.serializer import Encoding
@@ -74,6 +75,7 @@ _OF_KINDS: Final = {  # keys that only the rules of these kinds have
         "latched",
         "offered",
         "history",
+        "keep",
         "max_hz",
         "deadline_ms",
         "repair",
@@ -260,6 +262,9 @@ class Rule(Section):
     )
     history: SomeHistory = Field(
         default=None, description="Exposed topics: what is kept for late joiners; a number: messages."
+    )
+    keep: Keep | None = Field(
+        default=None, description="Exposed topics: a capsule of all messages, here and at a holder; needs `state`."
     )
     max_hz: float | None = Field(
         default=None, gt=0, le=RATE_MAX_HZ, description="Topics: most messages a second; others are counted."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             held = DelegationStore(settings.delegations, node.identity)
             tracer = open_tracer(settings.traces, node.identity.name, node.identity.label)
             look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
-            state.context = replace(state.context, tracer=tracer)
+            state.context = replace(state.context, tracer=tracer, keeper=node.open_keeper(settings, held))
             state.bridge = bridge = Bridge(
                 state.context, settings, endpoints, held, look_s=look_s, status_topic=settings.status
             )
@@ -69,6 +70,8 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                 for endpoint in endpoints:
                     node.runtime.unwatch(endpoint)
                 tracer.close()
+                if state.context.keeper is not None:
+                    state.context.keeper.capsules.close(time.time())
             best_effort = bridge.best_effort
             node.say_goodbye(bridge)
         if json:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import FrameType
+from typing import Final
 
 from gdp.client.clock_exchange import ClockExchange
 from gdp.client.participant import Participant, Topic
@@ -24,10 +25,13 @@ from gdp.nodes.node_log import OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.runtime.runtime import Runtime, now
 from proxy.bridge.bridge import Bridge
+from proxy.bridge.keeping import TopicKeeper
 from proxy.config.config import ProxyConfig
 from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 
 log = logging.getLogger(__name__)
+
+CAPSULES: Final = "capsules"  # folder of rings, within that of the state
 
 
 class ProxyNode(Node):
@@ -77,6 +81,12 @@ class ProxyNode(Node):
         if not self.drains:
             self.has_drained = True  # received messages are written
             self.runtime.stop()
+
+    def open_keeper(self, settings: ProxyConfig, held: DelegationStore) -> TopicKeeper | None:
+        """Return the keeper of the rules' topics; None: no rule has one."""
+        if settings.state is None or not any(rule.keep for rule in settings.expose):
+            return None
+        return TopicKeeper(self.member, self.identity, settings.state / CAPSULES, held)
 
     def leave_soon(self, number: int, frame: FrameType | None) -> None:
         """Handle a SIGUSR1, which wakes the loop."""

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
@@ -31,12 +33,13 @@ def open_recording_bridge(
     """
     held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
+    node.state.context = replace(node.state.context, keeper=node.open_keeper(settings, held))
     node.state.bridge = bridge = Bridge(node.state.context, rules, [endpoint], held)
     answer_for_proxy(node.state, bridge)
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
     node.runtime.watch(endpoint)
     try:
-        while bridge.get_timer() is not None:  # the first pass reads the graph, later ones the descriptions
+        while not bridge.is_settled:  # the first pass reads the graph, later ones the descriptions
             node.work(bridge)
         node.work(bridge)
         yield bridge
@@ -44,6 +47,8 @@ def open_recording_bridge(
         node.on_reload = None
         node.runtime.unwatch(endpoint)
         endpoint.shut_down()
+        if node.state.context.keeper is not None:
+            node.state.context.keeper.capsules.close(time.time())
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:

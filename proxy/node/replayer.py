@@ -16,6 +16,7 @@ from gdp.intervals import REPORT_S, TICK_S
 from gdp.message.loss import LossReason
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.keeping import TopicKeeper
 from proxy.bridge.sent_stats import SentStats
 from proxy.node.node import ProxyNode
 from proxy.recordings.endpoint import ReplayEndpoint
@@ -108,6 +109,7 @@ class Replay:
     Args:
         rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
         empty_max_s: of a longer time without a message, the rest is skipped; None: it is waited for.
+        keeper: of topics that are kept; their holders confirm what was replayed.
     """
 
     def __init__(
@@ -118,8 +120,10 @@ class Replay:
         rate: float,
         report: Callable[[], None],
         empty_max_s: float | None = None,
+        keeper: TopicKeeper | None = None,
     ) -> None:
         self._node = node
+        self._keeper = keeper
         self._bridge = bridge
         self._endpoint = endpoint
         self._pace = Pace(rate, empty_max_s)
@@ -201,16 +205,19 @@ class Replay:
         return not runtime.is_stopped
 
     def finish(self) -> bool:
-        """Wait until readers have confirmed all possible messages; return False when they stop, or when stopped.
+        """Wait until readers and holders have confirmed all that they can; return False when they or the node stop.
 
         Readers of best-effort topics have ``REPORT_S`` to report what they lost.
         """
-        progress, stalled_s = (self.confirmed, self.sent_best_effort), time.monotonic()
-        while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics):
+        progress, stalled_s = (self.confirmed, self.sent_best_effort, 0), time.monotonic()
+        kept = None if self._keeper is None else self._keeper.capsules
+        while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics) or (
+            kept is not None and not kept.is_uploaded
+        ):
             if self._node.runtime.is_stopped:
                 return False
             self._step(TICK_S)
-            now = self.confirmed, self.sent_best_effort
+            now = self.confirmed, self.sent_best_effort, 0 if kept is None else kept.confirmed
             if now != progress:
                 progress, stalled_s = now, time.monotonic()
             elif time.monotonic() - stalled_s > STALL_S:
@@ -233,8 +240,9 @@ class Replay:
         """Run the node and the bridge once, for at most this many seconds."""
         now_s = time.monotonic()
         wait_s = TICK_S if at_most_s is None else min(max(at_most_s, 0.0), TICK_S)
-        self._node.runtime.step(now_s + wait_s)
-        if self._bridge.get_timer() is not None:  # delegations were read again
+        due_s = self._bridge.get_timer()
+        self._node.runtime.step(now_s + wait_s if due_s is None else min(now_s + wait_s, max(due_s, now_s)))
+        if self._bridge.get_timer() is not None:  # delegations were read again, or topics are kept
             self._bridge.work(now_s)
         if now_s >= self._tick_at_s:
             self._tick_at_s = now_s + TICK_S

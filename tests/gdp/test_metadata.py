@@ -44,7 +44,7 @@ def test_every_kind_is_accepted(kind: str) -> None:
     [
         {},
         {"kind": "planet"},
-        {"kind": "capsule"},
+        {"kind": "chapter"},
         {"kind": "replica"},
         {"kind": "topic", "": "x"},
         {"kind": "topic", 1: "x"},

@@ -1,0 +1,109 @@
+"""Reading of a capsule from its holder: the next request, and the messages of a span of time, audited and opened.
+
+Sans-I/O. Records of another time are skipped; what is damaged or missing is named, and the rest is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from gdp.capsule.audit import Audit
+from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
+from gdp.capsule.opening import CapsuleOpener, Kept
+from gdp.capsule.record import RECORD_MAX_BYTES, RECORD_MIN_BYTES, Record, find, size_of
+from gdp.client.key_epochs import Secrets
+from gdp.errors import RemoteError
+
+_END_NS: Final = (1 << 63) - 1
+
+
+class Lost(NamedTuple):
+    """Messages of one incarnation of the writer that no record has, by sequence number, both included."""
+
+    incarnation: int
+    first: int
+    last: int
+
+
+class CapsuleReader:
+    """Reader of one capsule.
+
+    Args:
+        secrets: of the topic, by epoch; messages of other epochs stay closed.
+        from_ns: read records from the last checkpoint at or before this time on; 0: from the first.
+        to_ns: read records up to this time, by the writer's clock.
+
+    Attributes:
+        audit: of what was read.
+        opener: counts what stays closed.
+        lost: messages that are missing between two others.
+        is_done: nothing is left to be read.
+    """
+
+    def __init__(self, descriptor: Descriptor, secrets: Secrets, *, from_ns: int = 0, to_ns: int = _END_NS) -> None:
+        self.descriptor = descriptor
+        self._from_ns, self._to_ns = from_ns, to_ns
+        self.audit = Audit(descriptor.name, descriptor.key)
+        self.opener = CapsuleOpener(descriptor.topic.name, descriptor.writer.name, secrets, descriptor.key)
+        self.lost: list[Lost] = []
+        self.is_done = False
+        self._offset: int | None = None
+        self._rest = b""
+        self._next: tuple[int, int] | None = None  # incarnation and sequence number of the next message
+
+    def next_request(self) -> HolderRequest:
+        """Return the next request."""
+        if self._offset is None:
+            return HolderRequest(ask=Ask.READ, capsule=self.descriptor.name, time_ns=self._from_ns)
+        return HolderRequest(ask=Ask.READ, capsule=self.descriptor.name, offset=self._offset)
+
+    def handle_response(self, answer: HolderAnswer) -> Iterator[Kept]:
+        """Yield the messages that an answer brings."""
+        if self._offset not in (None, answer.offset) and self._rest:
+            self._rest = b""  # a record without its end, before a gap
+            self.audit.skip()
+        self._offset = answer.offset + len(answer.data)
+        data, at = self._rest + answer.data, 0
+        while at + RECORD_MIN_BYTES <= len(data):
+            size = size_of(data, at)
+            if size <= RECORD_MAX_BYTES and at + size > len(data) and answer.data:
+                break  # its end is in the next answer
+            begin = find(data, at)
+            if begin is None and answer.data:
+                break  # the next whole record is in the next answer
+            if begin != at:
+                self.audit.skip()
+            if begin is None:
+                break
+            at = begin + size_of(data, begin)
+            yield from self._messages(data[begin:at])
+        self._rest = data[at:]
+        if not answer.data or self.is_done:
+            self.is_done = True
+            self.audit.finish()
+
+    def _messages(self, wire: bytes) -> Iterator[Kept]:
+        record = Record.from_wire(wire)
+        if record.time_ns > self._to_ns:
+            self.is_done = True
+            return
+        before = self.audit.records
+        self.audit.handle_record(wire)
+        if self.audit.records == before:
+            return  # a second one of this number, or late
+        try:
+            kept = self.opener.open(record)
+        except RemoteError:
+            self.audit.skip()
+            return
+        for each in kept:
+            self._count(each)
+            if record.time_ns >= self._from_ns:
+                yield each
+
+    def _count(self, kept: Kept) -> None:
+        if self._next is not None and self._next[0] == kept.incarnation and self._next[1] < kept.sequence:
+            self.lost.append(Lost(kept.incarnation, self._next[1], kept.sequence - 1))
+        self._next = kept.incarnation, kept.sequence + 1

@@ -1,0 +1,98 @@
+"""Upload of a capsule: one bounded batch of records at a time, from where the holder's head is.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The holder confirms what is on its disk. A head that goes
+back, or is ahead of all records, is a lie or a loss, and is reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.holder import BATCH_BYTES, Ask, HolderAnswer, HolderRequest
+from gdp.errors import RemoteError
+from gdp.intervals import NEVER_S, RETRY_S
+from gdp.names import Name
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Bytes of records that are to be read from the disk here."""
+
+    offset: int
+    size: int
+
+
+class Uploader:
+    """Upload of one capsule to one holder.
+
+    Attributes:
+        confirmed: behind the last byte that the holder has confirmed.
+        faults: what the holder did wrong, or refused, as texts; the latest last.
+        gaps: bytes that were dropped here before they could be uploaded, as offsets.
+    """
+
+    def __init__(self, name: Name, descriptor: Descriptor) -> None:
+        self._name = name
+        self._descriptor = descriptor
+        self._head: int | None = None  # None: it is to be asked for
+        self._is_under_way = False
+        self._retry_s = -NEVER_S
+        self.confirmed = 0
+        self.faults: list[str] = []
+        self.gaps: list[tuple[int, int]] = []
+
+    def next_step(self, begin: int, end: int, now_s: float) -> HolderRequest | Span | None:
+        """Return a request to send, or what to read for the next one, or None.
+
+        Args:
+            begin: offset of the first byte here.
+            end: behind the last byte on the disk here.
+        """
+        if self._is_under_way or now_s < self._retry_s:
+            return None
+        if self._head is None:
+            self._is_under_way = True
+            return HolderRequest(ask=Ask.HEAD, capsule=self._name)
+        if self._head < begin:
+            self.gaps.append((self._head, begin))
+            self._head = begin
+        if self._head >= end:
+            return None
+        self._is_under_way = True
+        return Span(self._head, min(end - self._head, BATCH_BYTES))
+
+    def append(self, offset: int, data: bytes) -> HolderRequest:
+        """Return the request with records that were read."""
+        descriptor = None if self.confirmed else self._descriptor
+        return HolderRequest(ask=Ask.APPEND, capsule=self._name, offset=offset, data=data, descriptor=descriptor)
+
+    def handle_response(self, wire: bytes, end: int, now_s: float) -> None:
+        """Process an answer."""
+        try:
+            answer = HolderAnswer.from_cbor(wire)
+        except RemoteError as error:
+            self.handle_failure(f"an answer that cannot be read: {error}", now_s)
+            return
+        self._is_under_way, head = False, answer.head
+        if head < self.confirmed:
+            self._note(f"the holder has rolled back: {self.confirmed} bytes were confirmed, now it has {head}")
+        elif head > end:
+            self._note(f"the holder has {head} bytes, which is more than the {end} that were written here")
+            self._retry_s = now_s + RETRY_S
+            self._head = None
+            return
+        self.confirmed, self._head = head, max(head, answer.offset)
+
+    def handle_failure(self, reason: str, now_s: float) -> None:
+        """Note that a request failed: the holder is asked for its head again after a while."""
+        self._note(reason)
+        self._is_under_way, self._head, self._retry_s = False, None, now_s + RETRY_S
+
+    def get_timer(self) -> float:
+        """Return the monotonic second from which ``next_step`` may return something again."""
+        return NEVER_S if self._is_under_way else self._retry_s
+
+    def _note(self, reason: str) -> None:
+        if not self.faults or self.faults[-1] != reason:
+            self.faults = [*self.faults[-15:], reason]

@@ -1,0 +1,169 @@
+"""``gdp store``: hold capsules of others, and look at those that are held here.
+
+I/O. ``export`` and ``replay`` are commands of the package ``proxy``.
+"""
+
+from __future__ import annotations
+
+import json as json_text
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import typer
+
+from gdp.capsule.record import Record, RecordType, split
+from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
+from gdp.cli.node import Json, Logs, failing_clearly, report, running
+from gdp.cli.program import ungrouped
+from gdp.errors import LocalError
+from gdp.intervals import DAY_S
+from gdp.names import Name
+from gdp.session.protocol.messages import Request
+from gdp.session.session import open_session
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, remove, stored
+from gdp.terminal import echo
+
+
+class _Store(ExtendedGroup):
+    extensions: ClassVar[Mapping[str, str]] = dict.fromkeys(("export", "replay"), "recording")
+
+
+app = typer.Typer(cls=_Store, no_args_is_help=True, help="Hold capsules, the history of topics, and read them back.")
+
+Folder = Annotated[Path, typer.Option("--store", metavar="FOLDER", help="Where the holder has its capsules.")]
+Which = Annotated[str, typer.Argument(metavar="NAME", help="The capsule: its first hex digits suffice.")]
+_DAMAGED = 1
+
+
+@app.command(epilog="Example: gdp store serve holder --service store --store /var/lib/gdp/capsules --quota 100")
+@ungrouped
+def serve(
+    node: Annotated[Path, typer.Argument(help="The holder's node: its directory, or its configuration file.")],
+    store: Folder,
+    service: Annotated[str, typer.Option(help="Name of the service, as the owner delegated it.")] = "store",
+    quota: Annotated[float, typer.Option(min=0.001, metavar="GB", help="Of all topics of one owner.")] = 100.0,
+    days: Annotated[float | None, typer.Option(min=0.001, help="Older segments go. Default: none.")] = None,
+    most: Annotated[
+        float | None, typer.Option(min=0.001, metavar="GB", help="Of one capsule, whose oldest segments go.")
+    ] = None,
+    json: Json = False,
+    *,
+    logs: Logs,
+) -> None:
+    """Hold capsules until Ctrl-C. What is confirmed to a writer is on the disk; a full disk and a quota refuse."""
+    limits = StoreLimits(
+        owner_bytes=int(quota * 1e9),
+        capsule_bytes=None if most is None else int(most * 1e9),
+        age_s=None if days is None else days * DAY_S,
+    )
+    with running(logs), CapsuleStore(store, limits) as capsules, open_session(node) as session:
+
+        def answer(request: Request) -> bytes:
+            return capsules.handle(request.payload, request.client)
+
+        server = session.serve(service, answer, workers=2, priority="background")
+        text = f"holder {session.name.short} serves {service}; Ctrl-C ends it"
+        report("ready", text, json=json, name=str(server.name))
+        server.serve_forever()
+
+
+@app.command("ls", epilog="Example: gdp store ls --store /var/lib/gdp/capsules")
+def list_capsules(store: Folder, json: Json = False) -> None:
+    """List the capsules in a folder, with their topic, writer, bytes and records."""
+    with failing_clearly():
+        for capsule in stored(store):
+            _print(_row(capsule), json=json)
+
+
+@app.command(epilog="Example: gdp store show 75e1 --store /var/lib/gdp/capsules")
+def show(name: Which, store: Folder, json: Json = False) -> None:
+    """Show a capsule: who writes it, since when, and each segment."""
+    with failing_clearly():
+        capsule = _find(store, name)
+        segments = [
+            {"offset": offset, "bytes": capsule.segments.size_of(offset)} for offset in capsule.segments.offsets
+        ]
+        _print({**_row(capsule), "metadata": dict(capsule.descriptor.metadata), "segments": segments}, json=json)
+
+
+@app.command(epilog="Example: gdp store verify 75e1 --store /var/lib/gdp/capsules --known last.checkpoint")
+def verify(
+    name: Which,
+    store: Folder,
+    known: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A checkpoint from elsewhere, as --checkpoint wrote it.")
+    ] = None,
+    checkpoint: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the last checkpoint here.")] = None,
+    json: Json = False,
+) -> None:
+    """Verify a capsule: chain, checkpoints and the writer's signature of each message. No secret is needed.
+
+    Exit 1: something is damaged; each damage is named by the numbers of its records.
+    """
+    with failing_clearly():
+        capsule = _find(store, name)
+        audit = capsule.audit(known=None if known is None else known.read_bytes(), is_deep=True)
+        signer = capsule.descriptor.writer.name.to_text()
+        about = {"capsule": capsule.name.to_text(), "signer": signer, "records": audit.records, "begin": audit.begin}
+        found = [each._asdict() | {"damage": each.damage.value} for each in audit.findings]
+        if json:
+            _print({**about, "proven": audit.proven, "findings": found}, json=True)
+        else:
+            echo(f"{audit.records} records from {audit.begin} on, signed by {signer}")
+            for finding in audit.findings:
+                echo(finding.words())
+        if checkpoint is not None:
+            checkpoint.write_bytes(_last_checkpoint(capsule))
+    raise typer.Exit(_DAMAGED if found else 0)
+
+
+@app.command(epilog="Example: gdp store rm 75e1 --store /var/lib/gdp/capsules")
+def rm(name: Which, store: Folder, json: Json = False) -> None:
+    """Remove a capsule from a folder whose holder does not run."""
+    with failing_clearly():
+        found = _find(store, name).name
+        remove(store, found)
+        report("removed", f"capsule {found.short} is removed", json=json, capsule=found.to_text())
+
+
+for _name in _Store.extensions:
+    app.command(_name, context_settings=ANY_ARGUMENTS)(placeholder)
+
+
+def _find(store: Path, digits: str) -> StoredCapsule:
+    found = [each for each in stored(store) if each.name.to_text().startswith(digits.lower())]
+    if len(found) != 1:
+        raise LocalError(f"{store}: {len(found)} capsules begin with {digits!r}; gdp store ls lists them")
+    return found[0]
+
+
+def _row(capsule: StoredCapsule) -> dict[str, object]:
+    segments, descriptor = capsule.segments, capsule.descriptor
+    begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(descriptor.begun_ms / 1e3))
+    return {
+        "capsule": capsule.name.to_text(),
+        "topic": descriptor.topic.name.to_text(),
+        "writer": descriptor.writer.name.to_text(),
+        "begun": begun,
+        "bytes": segments.held_bytes,
+        "begin": segments.begin,
+        "head": segments.end,
+    }
+
+
+def _last_checkpoint(capsule: StoredCapsule) -> bytes:
+    last = capsule.segments.last
+    wires = split(capsule.segments.read(last, capsule.segments.size_of(last))[1])
+    found = [wire for wire in wires if Record.from_wire(wire).type is RecordType.CHECKPOINT]
+    return found[-1]
+
+
+def _print(row: Mapping[str, object], *, json: bool) -> None:
+    if json:
+        echo(json_text.dumps(row))
+        return
+    names = ("topic", "writer")
+    shown = {key: Name.from_text(str(value)).short if key in names else value for key, value in row.items()}
+    echo("  ".join(f"{key} {value}" for key, value in shown.items()))

@@ -1,0 +1,260 @@
+"""Keeping of published topics in capsules: what a publisher seals goes to the ring on the disk, and on to a holder.
+
+I/O, by its ring; the loop that drives the member calls ``handle``. Requests to the holder have the lowest priority, so
+live traffic goes first, and one batch is under way for each capsule.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from gdp.capsule.chain import ChainWriter
+from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.holder import HolderRequest
+from gdp.capsule.record import RecordType
+from gdp.capsule.upload import Uploader
+from gdp.client.participant import Message, Participant, Topic
+from gdp.client.publisher import Publisher
+from gdp.client.send_options import SendOptions
+from gdp.crypto.envelope import Sealed
+from gdp.crypto.identity import Identity
+from gdp.due_queue import earliest
+from gdp.errors import GdpError
+from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
+from gdp.limits import WINDOW_BYTES
+from gdp.names import Name
+from gdp.sansio import Timestamps
+from gdp.service.replication import Mode, Replication
+from gdp.session.protocol.client_core import Call, ClientCore
+from gdp.session.session import CALL_TIMEOUT_S
+from gdp.stores.capsule_ring import CapsuleRing
+
+log = logging.getLogger(__name__)
+
+_ONE: Final = Replication(Mode.SOME, copies=1)
+_BACKGROUND: Final = SendOptions(priority="background")
+
+
+class _Waiting(NamedTuple):
+    type: RecordType
+    frames: Sealed
+    sequence: int
+    messages: int
+
+
+class KeptTopic:
+    """One topic that is kept.
+
+    Attributes:
+        ring: on the disk here.
+        uploader: to the holder.
+        lost: messages that the disk here did not take in time.
+    """
+
+    def __init__(self, publisher: Publisher, ring: CapsuleRing, key: Identity, holder: Name) -> None:
+        self._publisher = publisher
+        self.ring = ring
+        self.holder = holder
+        self.name = ring.descriptor.name
+        self._writer = ChainWriter(ring.chain, key.key)
+        self.uploader = Uploader(self.name, ring.descriptor)
+        self._waiting = deque[_Waiting]()
+        self._waiting_bytes = 0
+        self.lost = 0
+        self._reading: Future[tuple[int, bytes]] | None = None
+        self._call: Call | None = None
+        publisher.record(self._record, self._describe)
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether something waits for the disk or the holder."""
+        return bool(self._waiting or self._reading or self._call)
+
+    def flush(self, time_ns: int) -> None:
+        """Append what was sealed to the ring, with checkpoints where they are due."""
+        self._publisher.seal_recorded()
+        pieces, begins_file = list[bytes](), False
+        while self.ring.is_ready and (self._waiting or self._writer.is_due(time_ns)):
+            if self._writer.is_due(time_ns):
+                if self.ring.wants_file:
+                    self._append(pieces, begins_file=begins_file)
+                    pieces, begins_file = [], True
+                pieces.append(self._writer.checkpoint(time_ns))
+                if begins_file:
+                    self._append(pieces, begins_file=True)
+                    pieces, begins_file = [], False
+                continue
+            each = self._waiting.popleft()
+            self._waiting_bytes -= each.frames.size_bytes
+            pieces.append(self._writer.append(each.type, time_ns, each.frames[:], each.sequence, each.messages))
+        self._append(pieces, begins_file=begins_file)
+
+    def _append(self, pieces: list[bytes], *, begins_file: bool) -> None:
+        if pieces:
+            self.ring.append(b"".join(pieces), begins_file=begins_file)
+
+    def upload(self, client: ClientCore, now_s: float) -> None:
+        """Send the next request if none is under way."""
+        call, reading, uploader = self._call, self._reading, self.uploader
+        if call is not None and call.is_done:
+            self._call = None
+            if call.response is not None:
+                uploader.handle_response(call.response.payload, self.ring.end, now_s)
+            else:
+                uploader.handle_failure(str(call.error), now_s)
+        if reading is not None and reading.done():
+            self._reading = None
+            try:
+                offset, data = reading.result()
+            except GdpError as error:
+                uploader.handle_failure(str(error), now_s)
+            else:
+                self._ask(uploader.append(offset, data), client, now_s)
+        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s)
+        if isinstance(wanted, HolderRequest):
+            self._ask(wanted, client, now_s)
+        elif wanted is not None:
+            self._reading = self.ring.read(wanted.offset, wanted.size)
+            if self._reading.done():
+                self.upload(client, now_s)
+
+    @property
+    def is_reading(self) -> bool:
+        """Return whether the disk is read for the next request."""
+        return self._reading is not None
+
+    @property
+    def is_uploaded(self) -> bool:
+        """Return whether the holder has confirmed all that is here."""
+        return not self.is_busy and self.uploader.confirmed == self.ring.end
+
+    def finish(self, time_ns: int) -> None:
+        """Append what was published so far, with a checkpoint over it; the publisher ends."""
+        self.flush(time_ns)
+        if self._writer.has_new and self.ring.is_ready:
+            self._append([self._writer.checkpoint(time_ns)], begins_file=False)
+
+    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
+        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+        client.begin(self._call, now_s)
+
+    def _record(self, frames: Sealed, sequence: int, messages: int) -> None:
+        if self._waiting_bytes + frames.size_bytes > WINDOW_BYTES:
+            self.lost += messages
+            return
+        self._waiting_bytes += frames.size_bytes
+        self._waiting.append(_Waiting(RecordType.MESSAGE, frames, sequence, messages))
+
+    def _describe(self, frames: Sealed, _sequence: int, _messages: int) -> None:
+        self._waiting_bytes += frames.size_bytes
+        self._waiting.append(_Waiting(RecordType.DESCRIPTION, frames, 0, 0))
+
+
+class CapsuleKeeper:
+    """Keeper of the topics of one node.
+
+    Args:
+        folder: of the rings.
+        start: number of the first call, random in 64 bits.
+        pool: one thread; None: of its own.
+
+    Attributes:
+        topics: what is kept, by topic.
+        ended: what is kept no more and not yet uploaded, by topic.
+    """
+
+    def __init__(
+        self, member: Participant, identity: Identity, folder: Path, *, start: int, pool: Executor | None = None
+    ) -> None:
+        self._member = member
+        self._identity = identity
+        self._folder = folder
+        self._start = start
+        self._pool = ThreadPoolExecutor(1, "capsules") if pool is None else pool
+        self._clients: dict[Name, ClientCore] = {}
+        self.topics: dict[Name, KeptTopic] = {}
+        self.ended: dict[Name, KeptTopic] = {}
+        self._due_s = 0.0
+
+    def keep(self, topic: Topic, publisher: Publisher, holder: Topic, most_bytes: int, unix_s: float) -> KeptTopic:
+        """Keep what a publisher publishes from now on.
+
+        Args:
+            holder: the delegation to call the holder's service.
+            most_bytes: of the ring.
+
+        Raises:
+            GdpError: no delegation, or the folder cannot be read or written.
+        """
+        delegation = topic.delegation
+        if (before := self.ended.pop(topic.name, None)) is not None:
+            before.ring.close()
+        descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
+        ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
+        if holder.name not in self._clients:
+            label = f"holder {holder.name.short}"
+            self._clients[holder.name] = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
+        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name)
+        log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
+        return kept
+
+    def release(self, topic: Name, unix_s: float) -> None:
+        """Keep a topic no more; what waits is uploaded. Its capsule is continued when it is kept again."""
+        kept = self.topics.pop(topic, None)
+        if kept is not None:
+            kept.finish(int(unix_s * 1e9))
+            self.ended[topic] = kept
+
+    def is_asked(self, name: Name) -> bool:
+        """Return whether a name is the service of a holder."""
+        return name in self._clients
+
+    def receive(self, message: Message, now_s: float) -> None:
+        """Process a message of a holder. Raises ``RemoteError``: it is malformed."""
+        self._clients[message.topic].receive(message, now_s)
+
+    def handle(self, now: Timestamps) -> None:
+        """Write and upload what is there, and handle the timers that are due."""
+        if now.mono_s >= self._due_s:
+            for kept in self.topics.values():
+                kept.flush(int(now.unix_s * 1e9))
+            is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
+            self._due_s = now.mono_s + (PACE_S if is_busy else TICK_S)
+        for client in self._clients.values():
+            due_s = client.get_timer()
+            if due_s is not None and now.mono_s >= due_s:
+                client.handle_timer(now.mono_s)
+        for kept in (*self.topics.values(), *self.ended.values()):
+            kept.upload(self._clients[kept.holder], now.mono_s)
+            if kept.is_reading:
+                self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
+        for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
+            self.ended.pop(name).ring.close()
+
+    @property
+    def is_uploaded(self) -> bool:
+        """Return whether the holders have confirmed all that was published."""
+        return all(each.is_uploaded for each in (*self.topics.values(), *self.ended.values()))
+
+    @property
+    def confirmed(self) -> int:
+        """Return how many bytes the holders have confirmed."""
+        return sum(each.uploader.confirmed for each in (*self.topics.values(), *self.ended.values()))
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        if not self.topics and not self.ended:
+            return None
+        return earliest(self._due_s, *[each.get_timer() for each in self._clients.values()])
+
+    def close(self, unix_s: float) -> None:
+        """Put everything on the disk."""
+        for topic in list(self.topics):
+            self.release(topic, unix_s)
+        for kept in self.ended.values():
+            kept.ring.close()
+        self._pool.shutdown()

@@ -1,0 +1,140 @@
+"""Ring of a capsule at its writer: records wait on the disk here until a holder has them; the oldest give way.
+
+I/O. One thread writes and reads, so a slow disk delays no frame. After a crash the ring continues behind the last whole
+record. What was confirmed to no holder may be lost with the disk; then another capsule begins.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Final
+
+from gdp.capsule.chain import Chain
+from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.record import find, split
+from gdp.errors import GdpError, RemoteError, StoreError
+from gdp.stores.files import private, read_private, write_all
+from gdp.stores.segments import SEGMENT_BYTES, Segments
+
+log = logging.getLogger(__name__)
+
+DESCRIPTOR: Final = "descriptor.cbor"
+_PARTS: Final = 8  # of the ring, at least: so much is dropped at once
+_WAITING_MAX_BYTES: Final = 32 << 20
+
+
+class CapsuleRing:
+    """Ring of one capsule.
+
+    Args:
+        folder: of the capsules of one topic; the newest is continued.
+        descriptor: of a capsule that begins now.
+        most_bytes: of all records here.
+        pool: one thread.
+
+    Attributes:
+        chain: state after the records here, for the one that continues it.
+        descriptor: of the capsule.
+        end: behind the last byte that is on the disk.
+        begin: of the first byte here.
+        failure: why the disk does not take records; empty while it does.
+
+    Raises:
+        GdpError: the folder cannot be read or written.
+    """
+
+    def __init__(self, folder: Path, descriptor: Descriptor, most_bytes: int, pool: Executor) -> None:
+        self._pool = pool
+        self._most_bytes = most_bytes
+        self.segment_bytes = min(SEGMENT_BYTES, most_bytes // _PARTS)
+        self.descriptor, self.chain, self._segments = _continued(folder, descriptor)
+        self.begin, self.end = self._segments.begin, self._segments.end
+        self._file_bytes = self.end - self._segments.last  # of the last file, what is under way included
+        self._next = self.end
+        self._waiting_bytes = 0
+        self.failure = ""
+
+    @property
+    def is_ready(self) -> bool:
+        """Return whether the disk keeps up."""
+        return self._waiting_bytes < _WAITING_MAX_BYTES and not self.failure
+
+    @property
+    def wants_file(self) -> bool:
+        """Return whether the next checkpoint is to begin a file."""
+        return self._file_bytes >= self.segment_bytes or not self._next
+
+    def append(self, data: bytes, *, begins_file: bool) -> None:
+        """Append whole records; ``begins_file``: the first one is a checkpoint that begins a file."""
+        at = self._next if begins_file else None
+        self._file_bytes = len(data) if begins_file else self._file_bytes + len(data)
+        self._next += len(data)
+        self._waiting_bytes += len(data)
+        self._pool.submit(self._append, data, at)
+
+    def read(self, offset: int, most: int) -> Future[tuple[int, bytes]]:
+        """Return what will be the bytes at an offset."""
+        return self._pool.submit(self._segments.read, offset, most)
+
+    def close(self) -> None:
+        """Put everything on the disk; returns when that is done."""
+        self._pool.submit(self._segments.close).result()
+
+    def _append(self, data: bytes, at: int | None) -> None:
+        """Append in the thread of the pool."""
+        segments = self._segments
+        try:
+            if not self.failure:
+                segments.append(data, at=at)
+                while segments.held_bytes > self._most_bytes and len(segments.offsets) > 1:
+                    segments.drop_first()
+                self.begin, self.end = segments.begin, segments.end
+        except (StoreError, OSError) as error:
+            # a record is missing from now on, so nothing may follow it: a new run continues behind the last one
+            self.failure = str(error)
+            log.error("capsule not written reason=%s; what follows is lost until this node starts again", error)
+        finally:
+            self._waiting_bytes -= len(data)
+
+
+def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:
+    """Return the newest capsule in a folder, cut behind its last whole record, or a new one."""
+    known = sorted(folder.iterdir()) if folder.is_dir() else []
+    for place in reversed(known):
+        try:
+            before = Descriptor.from_cbor(read_private(place / DESCRIPTOR))
+            if (before.topic, before.writer) != (descriptor.topic, descriptor.writer):
+                continue
+            segments = Segments(place)
+            chain = replayed(before, segments)
+        except GdpError as error:
+            log.warning("capsule cannot be continued, another begins path=%s reason=%s", place, error)
+            continue
+        return before, chain, segments
+    place = folder / f"{descriptor.begun_ms:016x}"
+    write_all(place, {DESCRIPTOR: private(descriptor.to_cbor())})
+    return descriptor, Chain(descriptor.name, descriptor.key), Segments(place)
+
+
+def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
+    """Return the chain behind the last whole record; a torn write behind it is cut.
+
+    Raises:
+        RemoteError: the last file is damaged before its end.
+    """
+    chain = Chain(descriptor.name, descriptor.key)
+    if not segments.offsets:
+        return chain
+    data, at = segments.read(segments.last, segments.size_of(segments.last))[1], 0
+    try:
+        for wire in split(data):
+            chain.handle_record(wire, may_skip=True)
+            at += len(wire)
+    except RemoteError:
+        if not at or find(data, at + 1) is not None:
+            raise
+    if at < len(data):
+        segments.cut(segments.last + at)
+    return chain

@@ -1,0 +1,308 @@
+"""Store of a holder: capsules of others, which it verifies and cannot open.
+
+I/O. A folder for each capsule has its descriptor and its segments. ``index.db`` (SQLite) finds times, and is rebuilt
+from the segments where it lacks some. Bytes are confirmed after they are on the disk, so a power cut loses nothing that
+was confirmed. Records are verified before they are written: they extend the chain, and each checkpoint has the writer's
+signature. The client that appends is the writer, whom the topic's owner lets publish.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+from gdp.capsule.audit import Audit
+from gdp.capsule.chain import Chain
+from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.holder import BATCH_BYTES, LISTED_MAX, Ask, HolderAnswer, HolderRequest
+from gdp.capsule.record import RECORD_MAX_BYTES, Record, RecordType, split
+from gdp.closing import ClosedOnExit
+from gdp.errors import GdpError, LocalError, RemoteError, StoreError
+from gdp.names import ZERO, Name
+from gdp.stores.capsule_ring import DESCRIPTOR, replayed
+from gdp.stores.files import private, read_private, write_all
+from gdp.stores.segments import SEGMENT_BYTES, Segments
+from gdp.stores.transactions import TransactionFile
+
+log = logging.getLogger(__name__)
+
+_RESTS_MAX_BYTES: Final = 4 * RECORD_MAX_BYTES
+SPARE_BYTES: Final = 256 << 20  # of the disk, for what others write
+_TABLE: Final = """
+CREATE TABLE IF NOT EXISTS checkpoints (
+    capsule BLOB, offset INTEGER, number INTEGER, time_ns INTEGER, PRIMARY KEY (capsule, offset)
+) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS times ON checkpoints (capsule, time_ns);
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class StoreLimits:
+    """Limits of a holder.
+
+    Attributes:
+        owner_bytes: of all capsules of one owner's topics.
+        capsule_bytes: beyond it the oldest segments of a capsule go; None: no limit.
+        age_s: older segments go; None: no limit.
+        spare_bytes: free space of the disk below which appends are refused.
+    """
+
+    owner_bytes: int
+    capsule_bytes: int | None = None
+    age_s: float | None = None
+    spare_bytes: int = SPARE_BYTES
+
+
+class StoredCapsule:
+    """One capsule on the disk.
+
+    Attributes:
+        chain: state after the last whole record.
+        rest: bytes of a record whose end has not come; in memory alone, and not confirmed.
+        damage: of its last segment, which takes no records then; empty: none.
+    """
+
+    def __init__(self, folder: Path, spare_bytes: int = 0) -> None:
+        self.descriptor = Descriptor.from_cbor(read_private(folder / DESCRIPTOR))
+        self.name, self.owner = self.descriptor.name, self.descriptor.topic.owner_key
+        self.segments = Segments(folder, spare_bytes)
+        self.chain = Chain(self.name, self.descriptor.key)
+        self.rest = b""
+        self.damage = ""
+
+    @property
+    def next(self) -> int:
+        """Return the offset that is expected next."""
+        return self.segments.end + len(self.rest)
+
+    def resume(self) -> None:
+        """Read the last segment, so that records can be appended. Raises ``RemoteError``: it is damaged."""
+        self.chain = replayed(self.descriptor, self.segments)
+
+    def audit(self, *, known: bytes | None = None, is_deep: bool = False) -> Audit:
+        """Return the finished audit of all segments."""
+        audit, end = Audit(self.name, self.descriptor.key, known=known, is_deep=is_deep), None
+        for offset in self.segments.offsets:
+            if end not in (None, offset):
+                log.info("capsule has a gap name=%s offset=%d", self.name.short, offset)
+            audit.add(self.segments.read(offset, self.segments.size_of(offset))[1])
+            end = offset + self.segments.size_of(offset)
+        audit.finish()
+        return audit
+
+
+def stored(folder: Path) -> Iterator[StoredCapsule]:
+    """Yield the capsules of a store; a damaged descriptor is logged."""
+    for place in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if (place / DESCRIPTOR).exists():
+            try:
+                yield StoredCapsule(place)
+            except GdpError as error:
+                log.error("capsule cannot be read path=%s reason=%s", place, error)
+
+
+class CapsuleStore(ClosedOnExit):
+    """Capsules in a folder, and the answers to requests.
+
+    Args:
+        unix_s: returns the present Unix second.
+
+    Raises:
+        GdpError: the folder cannot be read or written.
+    """
+
+    def __init__(self, folder: Path, limits: StoreLimits, unix_s: Callable[[], float] = time.time) -> None:
+        self.folder = folder
+        self._limits = limits
+        self._unix_s = unix_s
+        self._lock = threading.Lock()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._index = TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
+        self._capsules: dict[Name, StoredCapsule] = {}
+        for capsule in stored(folder):
+            capsule.segments = Segments(capsule.segments.folder, limits.spare_bytes)
+            self._capsules[capsule.name] = capsule
+            try:
+                capsule.resume()
+                self._index_missing(capsule)
+            except RemoteError as error:
+                capsule.damage = str(error)
+                log.error("capsule damaged, takes no records name=%s reason=%s", capsule.name.short, error)
+
+    def handle(self, wire: bytes, client: Name) -> bytes:
+        """Return the answer to a request.
+
+        Raises:
+            GdpError: it is refused; the text says why.
+        """
+        request = HolderRequest.from_cbor(wire)
+        with self._lock:
+            if request.ask is Ask.LIST:
+                return self._list(request.topic).to_cbor()
+            if request.ask is Ask.APPEND:
+                return self._append(request, client).to_cbor()
+            capsule = self._capsules.get(request.capsule)
+            if capsule is None:
+                return HolderAnswer().to_cbor()
+            if request.ask is Ask.HEAD:
+                return HolderAnswer(head=capsule.segments.end, offset=capsule.segments.end).to_cbor()
+            return self._read(capsule, request).to_cbor()
+
+    def close(self) -> None:
+        """Close all files."""
+        for capsule in self._capsules.values():
+            capsule.segments.close()
+        self._index.close()
+
+    def _list(self, topic: Name) -> HolderAnswer:
+        found = [each.descriptor for each in self._capsules.values() if topic in (ZERO, each.descriptor.topic.name)]
+        return HolderAnswer(descriptors=tuple(found[:LISTED_MAX]))
+
+    def _read(self, capsule: StoredCapsule, request: HolderRequest) -> HolderAnswer:
+        offset, segments = request.offset, capsule.segments
+        if request.time_ns:
+            with self._index.reading() as index:
+                found = index.execute(
+                    "SELECT offset FROM checkpoints WHERE capsule = ? AND time_ns <= ? AND offset >= ?"
+                    " ORDER BY time_ns DESC, offset DESC LIMIT 1",
+                    (capsule.name, request.time_ns, segments.begin),
+                ).fetchone()
+            offset = segments.begin if found is None else found[0]
+        offset, data = segments.read(offset, BATCH_BYTES)
+        return HolderAnswer(head=segments.end, offset=offset, data=data)
+
+    def _append(self, request: HolderRequest, client: Name) -> HolderAnswer:
+        capsule = self._capsules.get(request.capsule) or self._create(request, client)
+        _refuse_others(capsule.descriptor, client)
+        if capsule.damage:
+            raise LocalError(f"{capsule.name.short}: damaged here ({capsule.damage}); see gdp store verify")
+        segments, data = capsule.segments, request.data
+        behind = request.offset - capsule.next
+        if behind < 0:  # it came before, at least in part
+            in_rest = request.offset - segments.end
+            known = capsule.rest[in_rest:] if in_rest >= 0 else segments.read(request.offset, len(data))[1]
+            if not data.startswith(known[: len(data)]):
+                raise LocalError(f"{capsule.name.short}: other bytes are at {request.offset} here: a fork")
+            data = data[-behind:]
+        if data:
+            self._refuse_above_quota(capsule, len(data))
+            self._extend(capsule, data, request.offset if behind > 0 else None)
+            self._retire(capsule)
+        return HolderAnswer(head=segments.end, offset=capsule.next)
+
+    def _extend(self, capsule: StoredCapsule, data: bytes, gap_end: int | None) -> None:
+        """Verify and write the records that are complete with these bytes.
+
+        Args:
+            gap_end: where the bytes begin, if records before them never came.
+        """
+        segments, chain = capsule.segments, copy(capsule.chain)
+        chain.leaves = list(chain.leaves)
+        come = data if gap_end is not None else capsule.rest + data
+        begin = segments.end if gap_end is None else gap_end
+        files, at = [0], 0  # where files begin in ``come``
+        rows = list[tuple[Name, int, int, int]]()
+        file_at = segments.last - begin if gap_end is None and segments.offsets else 0
+        for wire in split(come):
+            record = chain.handle_record(wire, may_skip=gap_end is not None and not at)
+            if record.type is RecordType.CHECKPOINT:
+                rows.append((capsule.name, begin + at, record.number, record.time_ns))
+                if at - file_at >= SEGMENT_BYTES:
+                    files.append(at)
+                    file_at = at
+            at += len(wire)
+        if gap_end is not None and not at:
+            raise LocalError(f"{capsule.name.short}: a gap ends with a whole checkpoint")
+        for index, (first, end) in enumerate(pairwise([*files, at])):
+            is_new = index > 0 or gap_end is not None
+            if end > first:
+                segments.append(come[first:end], at=begin + first if is_new else None)
+        capsule.chain, capsule.rest = chain, come[at:]
+        self._put(rows)
+
+    def _create(self, request: HolderRequest, client: Name) -> StoredCapsule:
+        descriptor = request.descriptor
+        if descriptor is None or descriptor.name != request.capsule:
+            raise LocalError(f"{request.capsule.short}: not held here, and not described")
+        _refuse_others(descriptor, client)
+        descriptor.check_right(self._unix_s())
+        place = self.folder / descriptor.name.to_text()
+        write_all(place, {DESCRIPTOR: private(descriptor.to_cbor())}, force=True)
+        capsule = self._capsules[descriptor.name] = StoredCapsule(place, self._limits.spare_bytes)
+        log.info("capsule begun name=%s topic=%s", capsule.name.short, descriptor.topic.name.short)
+        return capsule
+
+    def _refuse_above_quota(self, capsule: StoredCapsule, more: int) -> None:
+        if sum(len(each.rest) for each in self._capsules.values()) > _RESTS_MAX_BYTES:
+            raise StoreError("too many records are incomplete here; try again")
+        used = sum(each.segments.held_bytes for each in self._capsules.values() if each.owner == capsule.owner)
+        if used + more > self._limits.owner_bytes:
+            most = self._limits.owner_bytes
+            raise StoreError(f"the topics' owner has {used} bytes here, of {most}: remove capsules, or raise the quota")
+
+    def _retire(self, capsule: StoredCapsule) -> None:
+        """Drop the oldest segments beyond the limits; the last one stays."""
+        segments, limits = capsule.segments, self._limits
+        before = segments.begin
+        while len(segments.offsets) > 1:
+            is_above = limits.capsule_bytes is not None and segments.held_bytes > limits.capsule_bytes
+            if not is_above and not self._is_aged(capsule, segments.offsets[1]):
+                break
+            segments.drop_first()
+        if segments.begin != before:
+            with self._index.writing() as index:
+                index.execute(
+                    "DELETE FROM checkpoints WHERE capsule = ? AND offset < ?", (capsule.name, segments.begin)
+                )
+
+    def _is_aged(self, capsule: StoredCapsule, next_offset: int) -> bool:
+        """Return whether all records before an offset, where a segment begins, are too old."""
+        if self._limits.age_s is None:
+            return False
+        with self._index.reading() as index:
+            row = index.execute(
+                "SELECT time_ns FROM checkpoints WHERE capsule = ? AND offset = ?", (capsule.name, next_offset)
+            ).fetchone()
+        return row is not None and row[0] < (self._unix_s() - self._limits.age_s) * 1e9
+
+    def _index_missing(self, capsule: StoredCapsule) -> None:
+        """Index the segments from the last one that is indexed on."""
+        with self._index.reading() as index:
+            (last,) = index.execute("SELECT max(offset) FROM checkpoints WHERE capsule = ?", (capsule.name,)).fetchone()
+        for offset in capsule.segments.offsets:
+            size = capsule.segments.size_of(offset)
+            if last is not None and offset + size <= last:
+                continue
+            rows, at = list[tuple[Name, int, int, int]](), offset
+            for wire in split(capsule.segments.read(offset, size)[1]):
+                record = Record.from_wire(wire)
+                if record.type is RecordType.CHECKPOINT:
+                    rows.append((capsule.name, at, record.number, record.time_ns))
+                at += len(wire)
+            self._put(rows)
+
+    def _put(self, rows: list[tuple[Name, int, int, int]]) -> None:
+        if rows:
+            with self._index.writing() as index:
+                index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", rows)
+
+
+def _refuse_others(descriptor: Descriptor, client: Name) -> None:
+    if descriptor.writer.name != client:
+        raise LocalError(f"{descriptor.name.short}: another node is its writer")
+
+
+def remove(folder: Path, name: Name) -> None:
+    """Remove a capsule from a store whose holder does not run. Raises ``LocalError``: it is not there."""
+    place = folder / name.to_text()
+    if not (place / DESCRIPTOR).exists():
+        raise LocalError(f"{place}: no capsule")
+    shutil.rmtree(place)

@@ -1,0 +1,158 @@
+"""Segment files of one capsule: bytes by offset, of which the oldest files may be dropped.
+
+I/O. Each file is named by the offset of its first byte, in hex, and begins with a checkpoint. What ``append`` has
+returned from is on the disk (fdatasync; a new file's name too). A write that fails leaves no byte behind.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from bisect import bisect_right
+from pathlib import Path
+from typing import Final
+
+from gdp.closing import ClosedOnExit
+from gdp.errors import StoreError
+
+SEGMENT_BYTES: Final = 64 << 20  # after which the next checkpoint begins a file
+_SUFFIX: Final = ".records"
+
+
+class Segments(ClosedOnExit):
+    """The files of one capsule.
+
+    Args:
+        folder: is made if it is missing.
+        spare_bytes: free space of the disk below which nothing is appended.
+
+    Raises:
+        StoreError: the system refuses; every method may raise this.
+    """
+
+    def __init__(self, folder: Path, spare_bytes: int = 0) -> None:
+        self.folder = folder
+        self._spare_bytes = spare_bytes
+        self._sizes: dict[int, int] = {}  # by offset, rising
+        self._last: int | None = None  # descriptor of the last file
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for path in sorted(folder.glob("*" + _SUFFIX)):
+                if size := path.stat().st_size:  # an empty one was begun before a crash
+                    self._sizes[int(path.stem, 16)] = size
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{folder}: {error}") from error
+
+    @property
+    def begin(self) -> int:
+        """Return the offset of the first byte."""
+        return next(iter(self._sizes), 0)
+
+    @property
+    def end(self) -> int:
+        """Return the offset behind the last byte."""
+        return self.last + self._sizes.get(self.last, 0)
+
+    @property
+    def last(self) -> int:
+        """Return the offset at which the last file begins."""
+        return next(reversed(self._sizes), 0)
+
+    @property
+    def offsets(self) -> list[int]:
+        """Return where each file begins."""
+        return list(self._sizes)
+
+    @property
+    def held_bytes(self) -> int:
+        """Return the bytes of all files."""
+        return sum(self._sizes.values())
+
+    def size_of(self, offset: int) -> int:
+        """Return the bytes of the file that begins at an offset."""
+        return self._sizes[offset]
+
+    def append(self, data: bytes, *, at: int | None = None) -> None:
+        """Append bytes, and put them on the disk.
+
+        Args:
+            at: begin a file at this offset, which is not below the end; None: continue the last one.
+
+        Raises:
+            StoreError: the disk is full, or the system refuses.
+        """
+        try:
+            free = os.statvfs(self.folder)
+            if free.f_bavail * free.f_frsize < self._spare_bytes + len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if at is not None or not self._sizes:
+                self._begin_file(at or 0)
+            handle, size = self._handle(), self._sizes[self.last]
+            try:
+                written = 0
+                while written < len(data):
+                    written += os.pwrite(handle, data[written:], size + written)
+                os.fdatasync(handle)
+            except OSError:
+                os.ftruncate(handle, size)
+                raise
+            self._sizes[self.last] = size + len(data)
+        except OSError as error:
+            raise StoreError(f"{self.folder}: {error.strerror}") from error
+
+    def read(self, offset: int, most: int) -> tuple[int, bytes]:
+        """Return up to ``most`` bytes of one file, with their offset: as asked, or behind the gap that is there."""
+        begins = list(self._sizes)
+        index = max(bisect_right(begins, offset) - 1, 0)
+        if not begins:
+            return offset, b""
+        if offset >= begins[index] + self._sizes[begins[index]] and index + 1 < len(begins):
+            index += 1
+        offset = max(offset, begins[index])
+        try:
+            with self._path(begins[index]).open("rb") as file:
+                file.seek(offset - begins[index])
+                return offset, file.read(most)
+        except OSError as error:
+            raise StoreError(f"{self.folder}: {error.strerror}") from error
+
+    def cut(self, end: int) -> None:
+        """Drop what lies behind an offset within the last file."""
+        try:
+            os.ftruncate(self._handle(), end - self.last)
+        except OSError as error:
+            raise StoreError(f"{self.folder}: {error.strerror}") from error
+        self._sizes[self.last] = end - self.last
+
+    def drop_first(self) -> int:
+        """Remove the first file; return its bytes."""
+        offset = self.begin
+        if offset == self.last:
+            self.close()
+        self._path(offset).unlink(missing_ok=True)
+        return self._sizes.pop(offset)
+
+    def close(self) -> None:
+        """Close the last file."""
+        if self._last is not None:
+            os.close(self._last)
+            self._last = None
+
+    def _begin_file(self, offset: int) -> None:
+        self.close()
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+        self._last = os.open(self._path(offset), flags, 0o600)
+        self._sizes[offset] = 0
+        folder = os.open(self.folder, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def _handle(self) -> int:
+        if self._last is None:
+            self._last = os.open(self._path(self.last), os.O_RDWR | os.O_CLOEXEC)
+        return self._last
+
+    def _path(self, offset: int) -> Path:
+        return self.folder / f"{offset:016x}{_SUFFIX}"

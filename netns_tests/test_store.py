@@ -1,0 +1,80 @@
+"""History of a topic on real processes: replayed without a reader, held by a holder, exported byte for byte."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Collection
+from pathlib import Path
+
+import pytest
+
+from gdp.stores.keyring import OWNER_PUBLIC
+from gdp.trust.right import Right
+from netns_tests.session_lab import SessionLab, lines_of, session_lab
+from proxy.recordings.reader import BagReader
+from tests.pages import ROOT
+
+pytestmark = pytest.mark.netns
+
+TOPICS = {
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/camera/image": "sensor_msgs/msg/Image",
+}
+RIGHTS: dict[str, dict[str, Collection[Right]]] = {
+    "robot": {**dict.fromkeys(TOPICS, (Right.PUBLISH,)), "store": [Right.CALL]},
+    "holder": {"store": [Right.SERVE]},
+    "investigator": {**dict.fromkeys(TOPICS, (Right.READ,)), "store": [Right.CALL]},
+}
+
+
+def content(path: Path) -> dict[str, list[bytes]]:
+    """Return the messages of each topic of a recording, in order; a replay gives them stamps of its own."""
+    found: dict[str, list[bytes]] = {}
+    with BagReader(path) as reader:
+        for each in reader.messages():
+            found.setdefault(reader.channels[each.channel].topic, []).append(each.raw)
+        assert reader.unread == ""
+    return {topic: found[topic] for topic in TOPICS}
+
+
+def robot(lab: SessionLab) -> Path:
+    """Write the robot's configuration; return it."""
+    (lab.folder / "state").mkdir()
+    owner = str(lab.folder / "owner" / OWNER_PUBLIC)
+    rules = [
+        {"name": name, "type": type_name, "owner": owner, "keep": {"disk": "200MB", "to": "store"}}
+        for name, type_name in TOPICS.items()
+    ]
+    return lab.write(
+        "robot", "robot", iface="robot0", delegations="robot/delegations", state="state", expose=rules, sandbox=False
+    )
+
+
+def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None:
+    with session_lab(RIGHTS, TOPICS) as lab:
+        drive, store, incident = lab.folder / "drive.mcap", lab.folder / "capsules", lab.folder / "incident.mcap"
+        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
+        assert '"ready"' in lines_of(holder, 1)[0]
+        config = robot(lab)
+        done = lab.run(
+            "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
+        )
+        assert '"done"' in done.stdout, done.stderr
+        exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
+        assert exported.returncode == 0, exported.stdout + exported.stderr
+        assert content(incident) == content(drive)
+        lines = lab.output("gdp", "store", "ls", "--store", str(store), "--json").splitlines()
+        listed = [json.loads(line) for line in lines]
+        assert len(listed) == len(TOPICS)
+        for each in listed:
+            lab.output("gdp", "store", "verify", each["capsule"], "--store", str(store))
+        holder.finish(signal.SIGTERM)
+        data = bytearray((segment := next(store.rglob("*.records"))).read_bytes())
+        data[len(data) // 2] ^= 1
+        segment.write_bytes(data)
+        verified = lab.run("gdp", "store", "verify", segment.parent.name, "--store", str(store))
+        assert verified.returncode == 1
+        assert "altered" in verified.stdout

@@ -1,0 +1,172 @@
+"""A robot that keeps a topic, and a holder of its capsule, in a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
+from gdp.capsule.opening import CapsuleOpener, Kept
+from gdp.capsule.record import Record, split
+from gdp.client.participant import Participant
+from gdp.errors import GdpError
+from gdp.names import Name
+from gdp.session.keeping import CapsuleKeeper, KeptTopic
+from gdp.session.protocol.server_core import ServerCore
+from gdp.stores.capsule_store import CapsuleStore, StoreLimits
+from gdp.trust.right import Right
+from lab.simulation import Simulation
+from tests.journeys.flows import ROBOT, SERVER, Flow
+
+STORE = "/store"
+_STEP_S = 0.005  # between two turns of work, as a busy loop would have
+LIMITS = StoreLimits(owner_bytes=1 << 30, spare_bytes=0)
+
+
+class Inline(Executor):
+    """Pool whose work is done at once."""
+
+    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        future = Future[Any]()
+        try:
+            future.set_result(work(*given, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@dataclass
+class Holder:
+    """Member that holds capsules.
+
+    Attributes:
+        lie: changes each answer; None: it tells the truth.
+    """
+
+    world: Simulation
+    folder: Path
+    label: str = SERVER
+    limits: StoreLimits = LIMITS
+    lie: Callable[[HolderRequest, HolderAnswer], HolderAnswer] | None = None
+    refusals: list[str] = field(default_factory=list)
+    store: CapsuleStore = field(init=False)
+    core: ServerCore = field(init=False)
+
+    def __post_init__(self) -> None:
+        topic = self.world.topic(STORE, self.member, [Right.SERVE], kind="service")
+        self.core = ServerCore(self.member, topic, start=1, at_once=1)
+        self.open()
+
+    @property
+    def member(self) -> Participant:
+        return self.world.members[self.label]
+
+    def open(self) -> None:
+        """Open the store, as after a restart."""
+        self.store = CapsuleStore(self.folder, self.limits, lambda: self.world.network.now.unix_s)
+
+    def work(self) -> None:
+        """Answer the requests that have come."""
+        now_s = self.world.network.now.mono_s
+        for message in self.member.poll_messages():
+            self.core.receive(message, now_s)
+        due_s = self.core.get_timer()
+        if due_s is not None and now_s >= due_s:
+            self.core.handle_timer(now_s)
+        while self.core.turns:
+            turn = self.core.turns.popleft()
+            self.core.finish(turn.number, self._outcome(turn.request, turn.asked.client), now_s)
+        self.member.flush(now_s)
+        self.world.network.send_pending(self.label)
+
+    def _outcome(self, wire: bytes, client: Name) -> bytes | str:
+        try:
+            answer = self.store.handle(wire, client)
+        except GdpError as error:
+            self.refusals.append(str(error))
+            return str(error)
+        if self.lie is not None:
+            answer = self.lie(HolderRequest.from_cbor(wire), HolderAnswer.from_cbor(answer)).to_cbor()
+        return answer
+
+
+@dataclass
+class Keeping:
+    """Robot that keeps the topic of a flow."""
+
+    flow: Flow
+    folder: Path
+    most_bytes: int = 1 << 24
+    keeper: CapsuleKeeper = field(init=False)
+    kept: KeptTopic = field(init=False)
+    worked_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        world, member = self.flow.world, self.flow.member
+        identity = next(each for each in world.identities.values() if each.name == member.name)
+        self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
+        service = world.topic(STORE, member, [Right.CALL], kind="service")
+        unix_s = world.network.now.unix_s
+        self.kept = self.keeper.keep(self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s)
+
+    def work(self) -> None:
+        """Write and upload."""
+        now = self.flow.world.network.now
+        for message in self.flow.member.poll_messages():
+            self.keeper.receive(message, now.mono_s)
+        self.keeper.handle(now)
+        self.flow.member.flush(now.mono_s)
+        self.flow.world.network.send_pending(ROBOT)
+
+    def run(self, duration_s: float, *holders: Holder, until: Callable[[], bool] = lambda: False) -> bool:
+        """Advance time while robot and holders work; return whether ``until`` came true."""
+
+        world, tick_s = self.flow.world, 0.05
+
+        def step() -> bool:
+            now_s = world.network.now.mono_s
+            if now_s - self.worked_s < _STEP_S:
+                return False
+            self.worked_s = now_s
+            self.work()
+            for holder in holders:
+                holder.work()
+            return until()
+
+        for number in range(int(duration_s / tick_s)):
+            world.network.call(number * tick_s, lambda: None)  # its own timers are not those of the member
+        return world.network.run(duration_s, step)
+
+    def is_uploaded(self) -> bool:
+        """Return whether the holder has confirmed all that is on the disk here."""
+        return self.kept.is_uploaded and self.kept.ring.end > 0
+
+    def publish_at(self, times_s: list[float], message: Callable[[int], bytes]) -> list[bytes]:
+        """Publish numbered messages at these seconds from now on; return them."""
+        messages = [message(number) for number in range(len(times_s))]
+        for at_s, each in zip(times_s, messages, strict=True):
+            self.flow.world.network.call(at_s, partial(self.flow.publish, each))
+        return messages
+
+
+def records_at(store: CapsuleStore, capsule: Name, *, time_ns: int = 0) -> bytes:
+    """Return what a holder gives to a reader, from a time on."""
+    pieces, offset, reader = list[bytes](), 0, Name(b"r" * 32)
+    while True:
+        request = HolderRequest(ask=Ask.READ, capsule=capsule, offset=offset, time_ns=0 if pieces else time_ns)
+        answer = HolderAnswer.from_cbor(store.handle(request.to_cbor(), reader))
+        if not answer.data:
+            return b"".join(pieces)
+        pieces.append(answer.data)
+        offset = answer.offset + len(answer.data)
+
+
+def opened(data: bytes, keeping: Keeping) -> list[Kept]:
+    """Return the messages in records, opened with the secrets of the flow's topic."""
+    descriptor, topic = keeping.kept.ring.descriptor, keeping.flow.topic
+    opener = CapsuleOpener(topic.name, descriptor.writer.name, topic.secrets, descriptor.key)
+    return [each for wire in split(data) for each in opener.open(Record.from_wire(wire))]
