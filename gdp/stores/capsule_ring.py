@@ -89,7 +89,7 @@ class CapsuleRing:
             if not self.failure:
                 segments.append(data, at=at)
                 while segments.held_bytes > self._most_bytes and len(segments.offsets) > 1:
-                    segments.drop_first()
+                    segments.drop(segments.begin)
                 self.begin, self.end = segments.begin, segments.end
         except (StoreError, OSError) as error:
             # a record is missing from now on, so nothing may follow it: a new run continues behind the last one
@@ -119,22 +119,20 @@ def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain,
 
 
 def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
-    """Return the chain behind the last whole record; a torn write behind it is cut.
-
-    Raises:
-        RemoteError: the last file is damaged before its end.
-    """
-    chain = Chain(descriptor.name, descriptor.key)
-    if not segments.offsets:
-        return chain
-    data, at = segments.read(segments.last, segments.size_of(segments.last))[1], 0
-    try:
-        for wire in split(data):
-            chain.handle_record(wire, may_skip=True)
-            at += len(wire)
-    except RemoteError:
-        if not at or find(data, at + 1) is not None:
-            raise
-    if at < len(data):
-        segments.cut(segments.last + at)
-    return chain
+    """Return the chain behind the last whole record; a torn write is cut. Raises ``RemoteError``: damage before it."""
+    while segments.offsets:
+        chain, last, at = Chain(descriptor.name, descriptor.key), segments.last, 0
+        data = segments.read(last, segments.size_of(last))[1]
+        try:
+            for wire in split(data):
+                chain.handle_record(wire, may_skip=True)
+                at += len(wire)
+        except RemoteError:
+            if find(data, at) is not None:
+                raise
+        if at:
+            if at < len(data):
+                segments.cut(last + at)
+            return chain
+        segments.drop(last)
+    return Chain(descriptor.name, descriptor.key)

@@ -256,7 +256,7 @@ class CapsuleStore(ClosedOnExit):
             is_above = limits.capsule_bytes is not None and segments.held_bytes > limits.capsule_bytes
             if not is_above and not self._is_aged(capsule, segments.offsets[1]):
                 break
-            segments.drop_first()
+            segments.drop(segments.begin)
         if segments.begin != before:
             with self._index.writing() as index:
                 index.execute(

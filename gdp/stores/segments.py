@@ -124,13 +124,12 @@ class Segments(ClosedOnExit):
             raise StoreError(f"{self.folder}: {error.strerror}") from error
         self._sizes[self.last] = end - self.last
 
-    def drop_first(self) -> int:
-        """Remove the first file; return its bytes."""
-        offset = self.begin
+    def drop(self, offset: int) -> None:
+        """Remove the file that begins at an offset."""
         if offset == self.last:
             self.close()
         self._path(offset).unlink(missing_ok=True)
-        return self._sizes.pop(offset)
+        del self._sizes[offset]
 
     def close(self) -> None:
         """Close the last file."""
