@@ -126,7 +126,7 @@ def test_the_name_is_that_of_the_single_command(gdp: Run) -> None:
         ("{name: a, read: [owner]}", "4:22: rights[0].read[0]: expected a node's directory or its card: owner/node"),
         ("{name: a, serve: [robot]}", "4:22: rights[0].serve: only services and actions have this"),
         ("{kind: action, name: a, read: [robot]}", "4:35: rights[0].read: only topics have this"),
-        ("{kind: topi, name: a}", "4:12: rights[0].kind: expected 'topic', 'service' or 'action', not 'topi'"),
+        ("{kind: topi, name: a}", "4:12: rights[0].kind: expected 'topic', 'service', 'action' or 'node', not 'topi'"),
         ("{name: a}", "4:5: rights[0]: a: state nodes under publish, read, serve or call"),
         ("{name: a, read: [robot], days: 0}", "4:36: rights[0].days: expected greater than 0, not 0"),
         ("{name: a, read: [robot], epochs: [-1]}", "4:39: rights[0].epochs[0]: expected greater than or equal to 0"),

@@ -208,7 +208,10 @@ def test_a_machine_without_an_owner_makes_one_unless_the_command_fails(
     [
         (["expose", "robot", "/x"], "error: expose: state --to NODE, or --from NODE for a name"),
         (["expose", "robot", "/x", "--to", "nowhere"], "error: 'nowhere': no such node or group in the domain; there"),
-        (["expose", "robot", "/x", "--to", "server", "--kind", "param"], "error: 'param': expected topic, service or"),
+        (
+            ["expose", "robot", "/x", "--to", "server", "--kind", "param"],
+            "error: 'param': expected topic, service, action or node",
+        ),
         (["expose", "robot", "/x", "--remove"], "error: /x is not exposed by 'gdp expose'"),
         (["expose", "nowhere", "/x", "--to", "server"], "error: nowhere: no proxy.yaml is here; name the machine's"),
         (["import", "robot"], "error: import: state a NAME, or --list"),

@@ -200,7 +200,7 @@ def test_a_key_that_never_existed_is_still_refused_with_the_known_keys(tmp_path:
     ("values", "fault"),
     [
         ({"name": "nope"}, "name: expected a full ROS name, such as /camera/image"),
-        ({"kind": "param", "name": "/x"}, "kind: Input should be 'topic', 'service' or 'action'"),
+        ({"kind": "param", "name": "/x"}, "kind: Input should be 'topic', 'service', 'action' or 'node'"),
     ],
 )
 def test_a_fault_of_data_without_lines_has_its_key_and_no_word_of_the_validator(
