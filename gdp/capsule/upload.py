@@ -7,12 +7,15 @@ back, or is ahead of all records, is a lie or a loss, and is reported.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import BATCH_BYTES, Ask, HolderAnswer, HolderRequest
 from gdp.errors import RemoteError
 from gdp.intervals import NEVER_S, RETRY_S
 from gdp.names import Name
+
+_FAULTS_MAX: Final = 15  # of those that nothing has read
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +31,7 @@ class Uploader:
 
     Attributes:
         confirmed: behind the last byte that the holder has confirmed.
-        faults: what the holder did wrong, or refused, as texts; the latest last.
-        gaps: bytes that were dropped here before they could be uploaded, as offsets.
+        is_refused: the latest request failed.
     """
 
     def __init__(self, name: Name, descriptor: Descriptor) -> None:
@@ -39,8 +41,8 @@ class Uploader:
         self._is_under_way = False
         self._retry_s = -NEVER_S
         self.confirmed = 0
-        self.faults: list[str] = []
-        self.gaps: list[tuple[int, int]] = []
+        self.is_refused = False
+        self._faults: list[str] = []
 
     def next_step(self, begin: int, end: int, now_s: float) -> HolderRequest | Span | None:
         """Return a request to send, or what to read for the next one, or None.
@@ -55,7 +57,7 @@ class Uploader:
             self._is_under_way = True
             return HolderRequest(ask=Ask.HEAD, capsule=self._name)
         if self._head < begin:
-            self.gaps.append((self._head, begin))
+            self._note(f"the holder never had bytes {self._head} to {begin}: the ring here was full")
             self._head = begin
         if self._head >= end:
             return None
@@ -74,7 +76,7 @@ class Uploader:
         except RemoteError as error:
             self.handle_failure(f"an answer that cannot be read: {error}", now_s)
             return
-        self._is_under_way, head = False, answer.head
+        self._is_under_way, self.is_refused, head = False, False, answer.head
         if head < self.confirmed:
             self._note(f"the holder has rolled back: {self.confirmed} bytes were confirmed, now it has {head}")
         elif head > end:
@@ -87,12 +89,17 @@ class Uploader:
     def handle_failure(self, reason: str, now_s: float) -> None:
         """Note that a request failed: the holder is asked for its head again after a while."""
         self._note(reason)
+        self.is_refused = True
         self._is_under_way, self._head, self._retry_s = False, None, now_s + RETRY_S
 
     def get_timer(self) -> float:
         """Return the monotonic second from which ``next_step`` may return something again."""
         return NEVER_S if self._is_under_way else self._retry_s
 
+    def poll_faults(self) -> list[str]:
+        """Return, once, what the holder did wrong, refused or never had, as texts; the latest last."""
+        faults, self._faults = self._faults, []
+        return faults
+
     def _note(self, reason: str) -> None:
-        if not self.faults or self.faults[-1] != reason:
-            self.faults = [*self.faults[-15:], reason]
+        self._faults = [*self._faults[-_FAULTS_MAX:], reason]

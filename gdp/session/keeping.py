@@ -64,7 +64,7 @@ class KeptTopic:
         self.uploader = Uploader(self.name, ring.descriptor)
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
-        self.lost = 0
+        self.lost = self._reported = 0
         self._reading: Future[tuple[int, bytes]] | None = None
         self._call: Call | None = None
         publisher.record(self._record, self._describe)
@@ -131,6 +131,13 @@ class KeptTopic:
     def is_uploaded(self) -> bool:
         """Return whether the holder has confirmed all that is here."""
         return not self.is_busy and self.uploader.confirmed == self.ring.end
+
+    def poll_faults(self) -> list[str]:
+        """Return, once, what went wrong: what the holder refused or never had, and messages that are not kept."""
+        faults, lost = self.uploader.poll_faults(), self.lost - self._reported
+        self._reported = self.lost
+        why = self.ring.failure or "the disk is too slow"
+        return [*faults, f"{lost} messages are not kept: {why}"] if lost else faults
 
     def finish(self, time_ns: int) -> None:
         """Append what was published so far, with a checkpoint over it; the publisher ends."""

@@ -324,7 +324,7 @@ class Bridge:
             dispatcher.deliver_faults(self._context, now_s)
         self._close_finished(now_s)
         if self._context.keeper is not None:
-            self._context.keeper.handle(Timestamps(now_s, time.time()))
+            self._context.keeper.handle(Timestamps(now_s, time.time()), self._context.faults)
         is_tick = now_s >= self._tick_at_s
         for flow, local in self._timed.items():
             due_s = flow.get_timer()

@@ -188,8 +188,8 @@ class ExposedTopic:
         keeper = self._context.keeper
         if rule.keep is None or keeper is None:
             return
-        if obstacle := keeper.keep(self._topic, self.publisher, rule.keep, time.time()):
-            self._context.faults.report(self._flow_spec.local, Fault.REFUSED, obstacle)
+        if obstacle := keeper.keep(self._flow_spec.local, self._topic, self.publisher, rule.keep, time.time()):
+            self._context.faults.report(self._flow_spec.local, Fault.NOT_KEPT, obstacle)
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
         rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._context.traffic

@@ -39,6 +39,7 @@ class Fault(str, Enum):
     NO_LIBRARY = "no-library"  # a reduction needs one that this machine lacks
     OTHER_BRIDGE = "other-bridge"  # another proxy of this graph carries it already
     NOT_IN_CONTROL = "not-in-control"  # messages of a publisher that does not hold the control of its topic
+    NOT_KEPT = "not-kept"  # a topic's history has a gap, or its holder does not take it
     CLOCK = "clock"  # another machine's clock differs so much that transforms are extrapolated
     INTERNAL = "internal"  # a far party's input provoked an error of this program's own
     QUARANTINED = "quarantined"  # input of a party that did so repeatedly

@@ -17,6 +17,7 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.session.keeping import CapsuleKeeper
 from gdp.trust.right import Right
+from proxy.bridge.faults import Fault, Faults
 from proxy.config.keep import Keep
 
 
@@ -34,10 +35,13 @@ class TopicKeeper:
     def __init__(self, member: Participant, identity: Identity, folder: Path, held: DelegationStore) -> None:
         self._member = member
         self._held = held
+        self._local: dict[Name, str] = {}  # names of the topics that are kept
+        self._failing: set[Name] = set()
         self.capsules = CapsuleKeeper(member, identity, folder, start=secrets.randbits(63))
 
-    def keep(self, topic: Topic, publisher: Publisher, keep: Keep, unix_s: float) -> str:
-        """Keep what a publisher publishes; return why that is not possible, empty if it is."""
+    def keep(self, local: str, topic: Topic, publisher: Publisher, keep: Keep, unix_s: float) -> str:
+        """Keep what the publisher of a local name publishes; return why that is not possible, empty if it is."""
+        self._local[topic.name] = local
         try:
             self.capsules.keep(topic, publisher, self._holder(keep.to), keep.disk, unix_s)
         except GdpError as error:
@@ -52,9 +56,16 @@ class TopicKeeper:
         """Process a message of a holder. Raises ``RemoteError``: it is malformed."""
         self.capsules.receive(message, now_s)
 
-    def handle(self, now: Timestamps) -> None:
-        """Write and upload what is there."""
+    def handle(self, now: Timestamps, faults: Faults) -> None:
+        """Write and upload what is there, and report what is not kept or not taken by its holder."""
         self.capsules.handle(now)
+        for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
+            for detail in kept.poll_faults():
+                self._failing.add(name)
+                faults.report(self._local[name], Fault.NOT_KEPT, detail)
+            if name in self._failing and not kept.uploader.is_refused and kept.is_uploaded:
+                self._failing.remove(name)
+                faults.clear(self._local[name], Fault.NOT_KEPT)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
