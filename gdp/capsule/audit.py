@@ -1,7 +1,7 @@
 """Audit of a capsule: each damage of the stored bytes is found, and named by the numbers of its records.
 
-Sans-I/O. An audit needs the writer's key alone. It goes on behind a damage: a checkpoint states first bytes of the hash
-of each record that it covers, so the records around the damaged one stay proven.
+Sans-I/O. An audit needs the writer's key alone. It continues behind a damage: a checkpoint states first bytes of the
+hash of each record that it covers, so the records around the damaged one stay proven.
 """
 
 from __future__ import annotations

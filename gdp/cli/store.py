@@ -71,7 +71,7 @@ def serve(
 
 @app.command("ls", epilog="Example: gdp store ls --store /var/lib/gdp/capsules")
 def list_capsules(store: Folder, json: Json = False) -> None:
-    """List the capsules in a folder, with their topic, writer, bytes and records."""
+    """List the capsules in a folder, with their topic, writer and bytes."""
     with failing_clearly():
         for capsule in stored(store):
             _print(_row(capsule), json=json)

@@ -18,6 +18,7 @@ from gdp.intervals import NEIGHBOUR, NEVER_S
 from gdp.limits import COST_UNREACHABLE
 from gdp.names import Name
 from gdp.service.nearest import ServerPath
+from gdp.service.replication import Mode, Replication
 from gdp.trust.right import Right
 
 
@@ -119,8 +120,13 @@ class Services:
         with suppress(LocalError):
             self._publications.stream_to(service, server, self._clock.now_s).probe()
 
-    def paths_of(self, service: Name) -> ServicePaths:
-        """Return the paths to the servers of a name that is called here; the switch states their costs from now on."""
+    def paths_for(self, service: Name, replication: Replication) -> ServicePaths | None:
+        """Return the paths to the servers of a name that is called here, whose costs the switch states from now on.
+
+        None: requests do not go to the nearest server.
+        """
+        if replication.mode is not Mode.NEAREST:
+            return None
         self._request_costs(service)
         return ServicePaths(service, self._publications, self._subscriptions, self._clock)
 

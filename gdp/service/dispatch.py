@@ -107,7 +107,7 @@ class Dispatch(Generic[A]):
         start: the first call's number, random in 64 bits.
         stops: whether servers that still owe a response receive a stop when a call has ended.
         unicasts: a request to all servers goes to a server by its own stream while it is the only one.
-        paths: to the servers; for ``Mode.NEAREST`` alone, which needs them.
+        paths: to the servers, with ``Mode.NEAREST``; None with the others.
 
     Attributes:
         late: responses that came for a call that had ended.
@@ -134,9 +134,7 @@ class Dispatch(Generic[A]):
         self.held_bytes = 0
         self._servers: dict[Name, bool] = {}  # whether it is leaving
         self._latencies = Latencies()
-        self._nearest: NearestServers | None = None
-        if paths is not None and replication.mode is Mode.NEAREST:
-            self._nearest = NearestServers(paths)
+        self._nearest = None if paths is None else NearestServers(paths)
         self._budget = HedgeBudget(replication.budget)
         self._hedges = DueQueue[int]()
         self._late: dict[int, None] = {}  # calls whose second copy waits for the budget, the oldest first

@@ -77,25 +77,23 @@ class KeptTopic:
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
         self._publisher.seal_recorded()
-        pieces, begins_file = list[bytes](), False
+        pieces = list[bytes]()
         while self.ring.is_ready and (self._waiting or self._writer.is_due(time_ns)):
-            if self._writer.is_due(time_ns):
-                if self.ring.wants_file:
-                    self._append(pieces, begins_file=begins_file)
-                    pieces, begins_file = [], True
+            if not self._writer.is_due(time_ns):
+                each = self._waiting.popleft()
+                self._waiting_bytes -= each.frames.size_bytes
+                pieces.append(self._writer.append(each.type, time_ns, each.frames[:], each.sequence, each.messages))
+            elif self.ring.wants_file:
+                self._append(pieces)
+                pieces = []
+                self.ring.append(self._writer.checkpoint(time_ns), begins_file=True)
+            else:
                 pieces.append(self._writer.checkpoint(time_ns))
-                if begins_file:
-                    self._append(pieces, begins_file=True)
-                    pieces, begins_file = [], False
-                continue
-            each = self._waiting.popleft()
-            self._waiting_bytes -= each.frames.size_bytes
-            pieces.append(self._writer.append(each.type, time_ns, each.frames[:], each.sequence, each.messages))
-        self._append(pieces, begins_file=begins_file)
+        self._append(pieces)
 
-    def _append(self, pieces: list[bytes], *, begins_file: bool) -> None:
+    def _append(self, pieces: list[bytes]) -> None:
         if pieces:
-            self.ring.append(b"".join(pieces), begins_file=begins_file)
+            self.ring.append(b"".join(pieces), begins_file=False)
 
     def upload(self, client: ClientCore, now_s: float) -> None:
         """Send the next request if none is under way."""
@@ -143,7 +141,7 @@ class KeptTopic:
         """Append what was published so far, with a checkpoint over it; the publisher ends."""
         self.flush(time_ns)
         if self._writer.has_new and self.ring.is_ready:
-            self._append([self._writer.checkpoint(time_ns)], begins_file=False)
+            self._append([self._writer.checkpoint(time_ns)])
 
     def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
         self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)

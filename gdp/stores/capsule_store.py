@@ -99,12 +99,12 @@ class StoredCapsule:
         return audit
 
 
-def stored(folder: Path) -> Iterator[StoredCapsule]:
-    """Yield the capsules of a store; a damaged descriptor is logged."""
+def stored(folder: Path, spare_bytes: int = 0) -> Iterator[StoredCapsule]:
+    """Yield the capsules of a store; a damaged descriptor is logged. ``spare_bytes``: as for ``Segments``."""
     for place in sorted(folder.iterdir()) if folder.is_dir() else ():
         if (place / DESCRIPTOR).exists():
             try:
-                yield StoredCapsule(place)
+                yield StoredCapsule(place, spare_bytes)
             except GdpError as error:
                 log.error("capsule cannot be read path=%s reason=%s", place, error)
 
@@ -127,8 +127,7 @@ class CapsuleStore(ClosedOnExit):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._index = TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
         self._capsules: dict[Name, StoredCapsule] = {}
-        for capsule in stored(folder):
-            capsule.segments = Segments(capsule.segments.folder, limits.spare_bytes)
+        for capsule in stored(folder, limits.spare_bytes):
             self._capsules[capsule.name] = capsule
             try:
                 capsule.resume()

@@ -89,19 +89,21 @@ class ImportedService(ServiceFlow):
         if flow_spec.rule.is_ordered:
             self._sequencer = Sequencer(incarnation_id=lambda: secrets.randbits(INCARNATION_BITS))
         self._publisher = context.member.call(topic, self._description(), **self.options())
-        is_nearest = flow_spec.rule.spread.mode is Mode.NEAREST
-        paths = context.member.services.paths_of(topic.name) if is_nearest else None
+        spreads = [
+            ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread
+            for part in range(len(self.parts.services))
+        ]
         self._calls: tuple[ServerCalls, ...] = tuple(
             self._sequencer
             if self._sequencer is not None
             else Dispatch[Response](
-                ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread,
+                spread,
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # every server has the goal, until one has its result
                 unicasts=session_value(flow_spec.rule.sign),
-                paths=paths,
+                paths=context.member.services.paths_for(topic.name, spread),
             )
-            for part in range(len(self.parts.services))
+            for part, spread in enumerate(spreads)
         )
         self._now_s = 0.0  # of the last event
         self.failed = 0

@@ -13,10 +13,10 @@ from collections import deque
 from collections.abc import Callable, Sequence, Set
 from typing import NamedTuple
 
+from gdp.client.delivery import Delivered
 from gdp.client.participant import Message, Topic
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.extras import MissingExtraError
-from gdp.message.clock_offset import ClockEstimate
 from gdp.message.loss import Losses
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
@@ -223,20 +223,20 @@ class ImportedTopic:
         if channels is None or not self._output.is_open:
             self.stats.refused += 1
             return
-        ros_message = RosMessage.from_wire(delivered.message, delivered.head)
-        clock = self._context.clock_of(publisher, now_s)
-        if self.control is not None and not self._has_control(self.control, publisher, ros_message, clock, now_s):
+        if self.control is not None and not self._has_control(self.control, delivered, now_s):
             return
         self.last_s = now_s
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             self.thinned += 1
             return
+        ros_message = RosMessage.from_wire(delivered.message, delivered.head)
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
         expander, incoming, headers, handle = channels[ros_message.channel]
         raw = incoming.decode(*expander.expand(ros_message))
+        clock = self._context.clock_of(publisher, now_s)
         ahead_ns = 0 if clock is None else round(1e9 * clock.offset_s)
         if headers is not None:
             by_ns = -ahead_ns if rule.stamps == "local" else 0
@@ -253,19 +253,13 @@ class ImportedTopic:
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.head) + len(delivered.message))
 
-    def _has_control(
-        self,
-        control: ExclusiveControl,
-        publisher: bytes,
-        message: RosMessage,
-        clock: ClockEstimate | None,
-        now_s: float,
-    ) -> bool:
+    def _has_control(self, control: ExclusiveControl, delivered: Delivered, now_s: float) -> bool:
         """Return whether a message may steer: its publisher holds control, and sent it a short time ago."""
-        least_s = 0.0
-        if clock is not None:
-            least_s = (time.time_ns() - message.stamp_ns) / 1e9 + clock.offset_s - clock.bound_s
-        reason = control.refusal(publisher, message.stamp_ns, least_s, now_s)
+        publisher, least_s = delivered.publisher, 0.0
+        stamp_ns = RosMessage.from_wire(delivered.message, delivered.head).stamp_ns
+        if (clock := self._context.clock_of(publisher, now_s)) is not None:
+            least_s = (time.time_ns() - stamp_ns) / 1e9 + clock.offset_s - clock.bound_s
+        reason = control.refusal(publisher, stamp_ns, least_s, now_s)
         if reason is None:
             return True
         self._context.member.subscriptions.drops[reason] += 1

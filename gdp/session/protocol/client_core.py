@@ -18,7 +18,7 @@ from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Probe, Stop
 from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
-from gdp.service.replication import Mode, Replication
+from gdp.service.replication import Replication
 from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.protocol.messages import Response
 from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, stop_to_wire
@@ -216,8 +216,7 @@ class ClientCore:
             return known
         # so that no two dispatches use the same numbers
         start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)
-        is_nearest = replication.mode is Mode.NEAREST
-        paths = self._member.services.paths_of(self._name) if is_nearest else None
+        paths = self._member.services.paths_for(self._name, replication)
         dispatch = self._dispatches[replication] = Dispatch(
             replication, start=start, unicasts=self._is_session, paths=paths
         )
