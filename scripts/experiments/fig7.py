@@ -12,7 +12,7 @@ from typing import Final
 from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
-from image_request import TYPE
+from frames import TYPE
 from page_text import text_of
 from pictures import save_distributions
 from samples import Sample, Series

@@ -130,7 +130,7 @@ def test_a_mask_with_a_region_too_many_or_too_few_or_a_part_of_each_is_wrong() -
 def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
     needs("scipy", "rcl_interfaces")
     import numpy as np
-    from image_request import answer_of, text_of
+    from frames import answer_of, text_of
     from tasks import TASKS
     from vision import SHAPE, Scene
 
@@ -181,7 +181,7 @@ def test_the_waits_of_figure_six_are_recorded_runs_of_the_network() -> None:
 
 def test_a_frame_comes_through_its_carrier_unchanged() -> None:
     needs("scipy", "rcl_interfaces")
-    from image_request import answer_of, frame_of, mask_in, request_of, said_in, text_of
+    from frames import answer_of, frame_of, mask_in, request_of, said_in, text_of
     from vision import Scene
 
     frame = Scene.draw(2).frame
