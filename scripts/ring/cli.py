@@ -32,10 +32,10 @@ from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
 from ring.options import LIVE_S, Live, Options, RingPlane
 from ring.overlay import Overlay
-from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import DEMO_S, Ring, make_demo
 from ring.table import summary, table
+from ring.traffic import ProgressReporter
 
 
 def hints(ring: Ring | LiveRing) -> list[tuple[str, str]]:

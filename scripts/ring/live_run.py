@@ -23,9 +23,8 @@ from ring.live_plan import MASTER_PORT, Graph, calls_in, carried_in, graphs_of, 
 from ring.nodes.content import LAMP
 from ring.options import Live, Options
 from ring.overlay import Injection, Overlay
-from ring.progress import ProgressReporter, Traffic
 from ring.result import Heard, Result, rows
-from ring.silence import Silence
+from ring.traffic import ProgressReporter, Traffic
 
 MEET_S: Final = 60.0
 ENDING_S: Final = 30.0
@@ -55,13 +54,7 @@ class LiveSession:
         self._supervisor = supervisor
         self._live_nodes = live_nodes
         self._reporter = reporter
-        self._sent: dict[LabProcess, int] = {}
-        self._received: dict[str, int] = {}
-        self._asked = 0
-        self._answered = 0
-        self.silence = Silence()
-        self._latency_ms: float | None = None
-        self._has_moved = False
+        self.traffic = Traffic(live_nodes.messages + live_nodes.calls)
         for node in (*live_nodes.talkers, live_nodes.listener, live_nodes.caller):
             supervisor.hear(node, self._note)
 
@@ -73,14 +66,14 @@ class LiveSession:
     def talk(self, seconds: float) -> Heard:
         """Run the traffic for this long, wait for messages under way, and return each node's report."""
         nodes, done = self._live_nodes, partial(self._supervisor.wait_for, name="done")
-        self._reporter.begin_traffic(nodes.messages + nodes.calls)
+        self._reporter.begin_traffic(self.traffic.total)
         try:
             for node in (*nodes.talkers, nodes.caller):
                 node.send(signal.SIGUSR1)
             said = [done(node, patience_s=seconds + ENDING_S) for node in nodes.talkers]
             called = done(nodes.caller, patience_s=ENDING_S)
-            self._answered = called["answered"]
-            self._await_quiet()
+            self.traffic.note_received(LAMP, called["answered"], time.monotonic())
+            self._await_quiet(nodes.messages + called["answered"])
             for node in (nodes.lamp, nodes.listener):
                 node.send(signal.SIGINT)
             served, heard = (done(node, patience_s=ENDING_S) for node in (nodes.lamp, nodes.listener))
@@ -88,41 +81,26 @@ class LiveSession:
             self._reporter.close()
         return Heard(tuple(said), served, heard, called)
 
-    def _await_quiet(self) -> None:
+    def _await_quiet(self, wanted: int) -> None:
         """Wait until everything arrived, or nothing arrived for a while."""
-        while sum(self._received.values()) < self._live_nodes.messages:
-            self._has_moved = False
-            if not self._supervisor.follow(lambda: self._has_moved, QUIET_S):
-                return
+        moved = True
+        while moved and (before := self.traffic.received) < wanted:
+            moved = self._supervisor.follow(lambda: self.traffic.received != before, QUIET_S)
 
     def _note(self, child: LabProcess, event: Event) -> None:
         if event["event"] != "progress":
             return
-        now_s, silence = time.monotonic(), self.silence
+        now_s, traffic = time.monotonic(), self.traffic
         if child is self._live_nodes.listener:
-            received = {each["topic"]: each["received"] for each in event["topics"]}
-            self._has_moved |= received != self._received
-            for topic, count in received.items():
-                silence.received(topic, count, now_s)
-            self._received = received
-            self._latency_ms = event.get("latency_ms")
+            for each in event["topics"]:
+                traffic.note_received(each["topic"], each["received"], now_s)
+            traffic.latency_ms = event.get("latency_ms")
         elif child is self._live_nodes.caller:
-            self._asked, self._answered = event["asked"], event["answered"]
-            silence.sent(LAMP, self._asked, now_s)
-            silence.received(LAMP, self._answered, now_s)
+            traffic.note_sent(LAMP, event["asked"], now_s)
+            traffic.note_received(LAMP, event["answered"], now_s)
         else:
-            self._sent[child] = event["sent"]
-            silence.sent(event["topic"], event["sent"], now_s)
-        self._reporter.traffic(
-            Traffic(
-                total=self._live_nodes.messages + self._live_nodes.calls,
-                sent=sum(self._sent.values()) + self._asked,
-                received=sum(self._received.values()) + self._answered,
-                behind=silence.behind,
-                silent=tuple(silence.silent(now_s)),
-                latency_ms=self._latency_ms,
-            )
-        )
+            traffic.note_sent(event["topic"], event["sent"], now_s)
+        self._reporter.traffic(traffic)
 
 
 _ROS2: Final = ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs")
@@ -167,7 +145,7 @@ class LiveRing:
         traffic_s = time.monotonic() - begun_s
         self._reporter.step("comparing what was published with what was heard")
         result = self._compare(heard, complaints)
-        return replace(result, traffic_s=traffic_s, silent_s=session.silence.longest_s)
+        return replace(result, traffic_s=traffic_s, silent_s=session.traffic.longest_s)
 
     def go_on(self) -> None:
         """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""

@@ -21,7 +21,7 @@ from lab.process import LabProcess
 from lab.supervisor import READY_S, Supervisor
 from ring.faults import CUT, ROAM, roamers, text_of, victims
 from ring.options import Options
-from ring.progress import ProgressReporter
+from ring.traffic import ProgressReporter
 
 _MIDDLE: Final = "nuc3"
 _RIB_WORDS: Final = ("--await-iface", f"{READY_S:g}")

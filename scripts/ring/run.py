@@ -22,9 +22,8 @@ from proxy.serial.channel import Channel, RosVersion
 from ring.live_plan import AUTHOR
 from ring.options import Options
 from ring.overlay import Injection, Overlay
-from ring.progress import ProgressReporter, Traffic
 from ring.result import Result, put_together
-from ring.silence import Silence
+from ring.traffic import ProgressReporter, Traffic
 
 ENDING_S: Final = 30.0  # to close a recording, or to get the last acknowledgements
 STALL_S: Final = 30.0
@@ -45,10 +44,7 @@ class Replay:
         self._sender = sender
         self._receiver = receiver
         self._reporter = reporter
-        self._traffic = Traffic(total=total)
-        self._silence = Silence()
-        self._unconfirmed = ""  # names of topics
-        self._has_moved = False
+        self._traffic = Traffic(total)
         self.topics: tuple[Event, ...] = ()
         for each in (sender, receiver):
             supervisor.hear(each, self._follow)
@@ -59,9 +55,8 @@ class Replay:
         begun_s = time.monotonic()
         try:
             while not self._sender.is_silent:
-                self._has_moved = False
-                if not self._supervisor.follow(lambda: self._has_moved or self._sender.is_silent, STALL_S):
-                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
+                if not self._moves():
+                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0, time.monotonic())}")
             traffic_s = time.monotonic() - begun_s
             sender_code = exit_code(self._sender, ENDING_S)
             sent = self._supervisor.said(self._sender, "done")
@@ -79,27 +74,25 @@ class Replay:
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
         unread = sent.get("unread") or None
         self.topics = tuple(received["topics"])
-        longest_s = self._silence.longest_s
+        longest_s = self._traffic.longest_s
         return Result((), {}, unread=unread, complaints=tuple(complaints), traffic_s=traffic_s, silent_s=longest_s)
+
+    def _moves(self) -> bool:
+        before = self._traffic.changes
+        return self._supervisor.follow(lambda: self._traffic.changes != before or self._sender.is_silent, STALL_S)
 
     def _follow(self, _: LabProcess, event: Event) -> None:
         if event["event"] != "progress":
             return
-        before, now_s = self._traffic, time.monotonic()
+        traffic, now_s = self._traffic, time.monotonic()
         if "sent" in event:
-            self._silence.sent(_ALL, event["sent"], now_s)
-            self._unconfirmed = ", ".join(event.get("unconfirmed", {}))
-            self._traffic = replace(before, sent=event["sent"])
-            waiting = before.sent < before.total  # for the next stamp of the recording, which may have long pauses
+            traffic.changes += traffic.sent < traffic.total  # it waits for the next stamp; a recording may have pauses
+            traffic.label = ", ".join(event.get("unconfirmed", {}))
+            traffic.note_sent(_ALL, event["sent"], now_s)
         else:
-            received, lost = event["received"], event["lost"]
-            latency_ms = event.get("latency_ms")
-            self._silence.received(_ALL, received + lost, now_s)
-            self._traffic = replace(before, received=received, lost=lost, latency_ms=latency_ms)
-            waiting = False
-        self._has_moved |= waiting or self._traffic != before
-        silent = tuple((self._unconfirmed or flow, seconds) for flow, seconds in self._silence.silent(now_s))
-        self._reporter.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
+            traffic.lost, traffic.latency_ms = event["lost"], event.get("latency_ms")
+            traffic.note_received(_ALL, event["received"] + event["lost"], now_s)
+        self._reporter.traffic(traffic)
 
 
 def _not_confirmed(topic: Event) -> str:

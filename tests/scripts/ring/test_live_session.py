@@ -16,8 +16,8 @@ from lab.process import FailedError, LabProcess
 from lab.supervisor import Supervisor
 from ring import live_run
 from ring.live_run import LiveNodes, LiveSession
-from ring.progress import ProgressReporter
 from ring.result import Heard
+from ring.traffic import ProgressReporter
 
 HEAD = """
 import json, signal, sys

@@ -16,9 +16,9 @@ from lab.supervisor import Supervisor
 from ring import run as replay_module
 from ring.faults import cut_from_text, text_of
 from ring.overlay import Injection
-from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import Replay
+from ring.traffic import ProgressReporter
 
 HEAD = """
 import json, signal, sys
