@@ -228,7 +228,7 @@ class Pair:
         """Start the ROS 1 master, if it does not run."""
         if self._master is None:
             need_ros1()
-            argv = [sys.executable, "-m", "ring.nodes.master", _MASTER.rpartition(":")[2]]
+            argv = [sys.executable, "-m", "ring.nodes", "1", "master", _MASTER.rpartition(":")[2]]
             self._master = self.machines["b"].launch(argv, "master")
             self._master.read_until("ready", patience_s=PATIENCE_S)
 

@@ -108,7 +108,7 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
         token = stage.create_domain()
         stage.start(stage.cloud_b)
         list(pool.map(stage.admit, (stage.drone, stage.cloud), (token, stage.make_token())))
-        _said(_launch(stage.cloud, "ring.nodes.master", str(MASTER_PORT)), "ready")
+        _said(_launch(stage.cloud, "ring.nodes", "1", "master", str(MASTER_PORT)), "ready")
         stage.start(stage.drone, stage.cloud)
         nodes = {flow.topic: _start(stage, pace, flow) for flow in stage.flows}
         stage.wait_until_joined()

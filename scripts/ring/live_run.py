@@ -130,7 +130,7 @@ class LiveRing:
         """Run the traffic between robot and server, and compare."""
         overlay, supervisor = self.overlay, self.overlay.supervisor
         overlay.stand_up()
-        argv = ["-m", "ring.nodes.master", str(MASTER_PORT)]
+        argv = ["-m", "ring.nodes", "1", "master", str(MASTER_PORT)]
         supervisor.ready(*(self._start(at, graph, "master", argv) for at, graph, _ in self._ends if graph.ros == 1))
         self._proxies = [self._start_proxy(*end) for end in self._ends]
         supervisor.ready(*self._proxies)

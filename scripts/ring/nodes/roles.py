@@ -7,11 +7,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
 from proxy.bridge.core.topic_stats import percentile
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
-from ring.nodes.node import Call, Node, Order, Orders, load_type, say
+from ring.nodes.node import Call, Order, Orders, load_type, say
+
+if TYPE_CHECKING:
+    from ring.nodes.ros1 import Ros1Node
+    from ring.nodes.ros2 import Ros2Node
+
+Node: TypeAlias = "Ros1Node | Ros2Node"
 
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25
