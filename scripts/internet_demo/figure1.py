@@ -20,7 +20,7 @@ from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from internet_demo.scenario import Display, Event, Outcome, Pace
 from internet_demo.stage import Stage
-from lab.dds import UDP_PROFILE
+from lab.dds import udp_profile
 from lab.internet.access import Access
 from lab.internet.host import Host
 from lab.internet.laboratory import Laboratory
@@ -53,11 +53,11 @@ class _Stage(Stage):
             _Flow("/images", "camera", "/camera/image", self.drone, self.cloud),
             _Flow("/commands", "talker", "/chatter", self.cloud, self.drone),
         )
-        profiles = self._folder / "fast_dds.xml"
-        profiles.write_text(UDP_PROFILE.replace("<type>UDPv4</type>", _ON_LOOPBACK))
         self.graphs = {self.drone.label: Graph(2, _DOMAIN), self.cloud.label: Graph(1, 0)}
         for label, graph in self.graphs.items():
-            self._laboratory.hosts[label].environment = dict(graph.environment(self._folder / "ros-logs", profiles))
+            self._laboratory.hosts[label].environment = graph.environment(self._folder)
+        profile = udp_profile(self._folder)
+        profile.write_text(profile.read_text().replace("<type>UDPv4</type>", _ON_LOOPBACK))
 
     def admit(self, host: Host, token: str) -> None:
         """Let a machine join, and write its ROS into its proxy.yaml."""

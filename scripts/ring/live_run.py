@@ -14,7 +14,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.credentials import Side
-from lab.dds import UDP_PROFILE
 from lab.process import Event, LabProcess
 from lab.supervisor import Supervisor
 from lab.topology import Attachment
@@ -119,8 +118,6 @@ class LiveRing:
         self._options = options
         self._run = run
         self._reporter = reporter
-        self._profiles = run.directory / "fast-dds.xml"
-        self._profiles.write_text(UDP_PROFILE, encoding="utf-8")
         self.overlay = Overlay(options, run, reporter)
         self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
         self._proxies: list[LabProcess] = []
@@ -161,7 +158,7 @@ class LiveRing:
 
     def environment(self, graph: Graph) -> Mapping[str, str]:
         """Return the environment of the processes in a graph."""
-        return graph.environment(self._run.directory / "ros-logs", self._profiles)
+        return graph.environment(self._run.directory)
 
     def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""
