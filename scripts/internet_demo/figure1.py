@@ -55,7 +55,8 @@ class _Stage(Stage):
         )
         self.graphs = {self.drone.label: Graph(2, _DOMAIN), self.cloud.label: Graph(1, 0)}
         for label, graph in self.graphs.items():
-            self._laboratory.hosts[label].environment = graph.environment(self._folder)
+            variables = graph.environment(self._folder)
+            self._laboratory.hosts[label].environment = dict(each.split("=", 1) for each in variables)
         profile = udp_profile(self._folder)
         profile.write_text(profile.read_text().replace("<type>UDPv4</type>", _ON_LOOPBACK))
 

@@ -27,7 +27,7 @@ from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.faults import cut_from_text, kill_from_text, roam_from_text
+from ring.faults import fault_from_text
 from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
 from ring.options import LIVE_S, Live, Options, RingPlane
@@ -57,7 +57,7 @@ def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
             found.append((f"the topics at {at}", inside(ring.overlay, at, "rostopic list")))
             found.append((f"what is said at {at}", inside(ring.overlay, at, "rostopic echo -n 5 /chatter")))
         else:
-            variables = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
+            variables = " ".join(graph.environment(ring.directory))
             listener = f"env {variables} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
             found.append((f"one more listener at {at}, for five seconds", inside(ring.overlay, at, listener)))
     proxy = inside(ring.overlay, "nuc5", _metrics("proxy"))
@@ -176,10 +176,10 @@ def ring(
             out=_absolute(out),
             json=_absolute(json_file),
             pcap=_absolute(pcap),
-            faults=(
-                *map(cut_from_text, cut or ()),
-                *map(roam_from_text, roam or ()),
-                *map(kill_from_text, kill or ()),
+            faults=tuple(
+                fault_from_text(option, each)
+                for option, given in (("cut", cut), ("roam", roam), ("kill", kill))
+                for each in given or ()
             ),
             lease_s=lease,
             keep=keep,

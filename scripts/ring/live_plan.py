@@ -38,11 +38,16 @@ class Graph:
             return {"endpoint": "ros1", "master": self._master}
         return {"endpoint": "ros2", "domain": self.domain}
 
-    def environment(self, folder: Path) -> dict[str, str]:
-        """Return the environment of its nodes and its proxy; ``folder``: for a profile, and for ROS's logs."""
-        ros1 = {"ROS_MASTER_URI": self._master, "ROS_HOSTNAME": "127.0.0.1"}
-        own = ros1 if self.ros == 1 else dict(each.split("=", 1) for each in ros_environment(folder, self.domain))
-        return {**own, "ROS_LOG_DIR": str(folder / "ros-logs")}
+    def environment(self, folder: Path) -> list[str]:
+        """Return the environment of its nodes and its proxy, as ``KEY=value``.
+
+        ``folder``: for a profile, and for ROS's logs.
+        """
+        ros1 = [f"ROS_MASTER_URI={self._master}", "ROS_HOSTNAME=127.0.0.1"]
+        return [
+            *(ros1 if self.ros == 1 else ros_environment(folder, self.domain)),
+            f"ROS_LOG_DIR={folder / 'ros-logs'}",
+        ]
 
     @property
     def _master(self) -> str:

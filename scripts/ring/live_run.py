@@ -6,7 +6,7 @@ import importlib.util
 import signal
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -28,54 +28,55 @@ from ring.traffic import ProgressReporter, Traffic
 MEET_S: Final = 60.0
 ENDING_S: Final = 30.0
 QUIET_S: Final = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class LiveNodes:
-    """The nodes of a live run, all ready. ``talkers``: number of messages that each will publish."""
-
-    talkers: Mapping[LabProcess, int]
-    lamp: LabProcess
-    listener: LabProcess
-    caller: LabProcess
-    calls: int
-
-    @property
-    def messages(self) -> int:
-        """Return the total number of messages to be published."""
-        return sum(self.talkers.values())
+_FIXED: Final = ("lamp", "listener", "caller")  # nodes that are no talkers
 
 
 class LiveSession:
-    """One run's traffic. ``supervisor`` watches the nodes."""
+    """One run's traffic, between nodes that are ready.
 
-    def __init__(self, supervisor: Supervisor, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
+    Args:
+        supervisor: watches the nodes.
+        nodes: by name: ``lamp``, ``listener``, ``caller``, and the talkers.
+        messages: that the talkers will publish.
+        calls: that the caller will make.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        nodes: Mapping[str, LabProcess],
+        messages: int,
+        calls: int,
+        reporter: ProgressReporter,
+    ) -> None:
         self._supervisor = supervisor
-        self._live_nodes = live_nodes
+        self._lamp, self._listener, self._caller = (nodes[name] for name in _FIXED)
+        self._talkers = [node for name, node in nodes.items() if name not in _FIXED]
+        self._messages = messages
         self._reporter = reporter
-        self.traffic = Traffic(live_nodes.messages + live_nodes.calls)
-        for node in (*live_nodes.talkers, live_nodes.listener, live_nodes.caller):
+        self.traffic = Traffic(messages + calls)
+        for node in (*self._talkers, self._listener, self._caller):
             supervisor.hear(node, self._note)
 
     def meet(self) -> None:
         """Wait until the remote side receives every topic and discovers the service."""
-        for node in (self._live_nodes.listener, self._live_nodes.caller):
+        for node in (self._listener, self._caller):
             self._supervisor.wait_for(node, "hears", MEET_S)
 
     def talk(self, seconds: float) -> Heard:
         """Run the traffic for this long, wait for messages under way, and return each node's report."""
-        nodes, done = self._live_nodes, partial(self._supervisor.wait_for, name="done")
+        done = partial(self._supervisor.wait_for, name="done")
         self._reporter.begin_traffic(self.traffic.total)
         try:
-            for node in (*nodes.talkers, nodes.caller):
+            for node in (*self._talkers, self._caller):
                 node.send(signal.SIGUSR1)
-            said = [done(node, patience_s=seconds + ENDING_S) for node in nodes.talkers]
-            called = done(nodes.caller, patience_s=ENDING_S)
+            said = [done(node, patience_s=seconds + ENDING_S) for node in self._talkers]
+            called = done(self._caller, patience_s=ENDING_S)
             self.traffic.note_received(LAMP, called["answered"], time.monotonic())
-            self._await_quiet(nodes.messages + called["answered"])
-            for node in (nodes.lamp, nodes.listener):
+            self._await_quiet(self._messages + called["answered"])
+            for node in (self._lamp, self._listener):
                 node.send(signal.SIGINT)
-            served, heard = (done(node, patience_s=ENDING_S) for node in (nodes.lamp, nodes.listener))
+            served, heard = (done(node, patience_s=ENDING_S) for node in (self._lamp, self._listener))
         finally:
             self._reporter.close()
         return Heard(tuple(said), served, heard, called)
@@ -90,11 +91,11 @@ class LiveSession:
         if event["event"] != "progress":
             return
         now_s, traffic = time.monotonic(), self.traffic
-        if child is self._live_nodes.listener:
+        if child is self._listener:
             for each in event["topics"]:
                 traffic.note_received(each["topic"], each["received"], now_s)
             traffic.latency_ms = event.get("latency_ms")
-        elif child is self._live_nodes.caller:
+        elif child is self._caller:
             traffic.note_sent(LAMP, event["asked"], now_s)
             traffic.note_received(LAMP, event["answered"], now_s)
         else:
@@ -121,7 +122,7 @@ class LiveRing:
         self.overlay = Overlay(options, run, reporter)
         self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
         self._proxies: list[LabProcess] = []
-        self._nodes: list[LabProcess] = []
+        self._nodes: dict[str, LabProcess] = {}
 
     def result(self) -> Result:
         """Run the traffic between robot and server, and compare."""
@@ -131,7 +132,7 @@ class LiveRing:
         supervisor.ready(*(self._start(at, graph, "master", argv) for at, graph, _ in self._ends if graph.ros == 1))
         self._proxies = [self._start_proxy(*end) for end in self._ends]
         supervisor.ready(*self._proxies)
-        session = LiveSession(supervisor, self._live_nodes(), self._reporter)
+        session = self._start_nodes()
         session.meet()
         self._reporter.step(f"they hear each other; {self._options.live_s:g} s of traffic")
         injection, begun_s = Injection(supervisor, self._options.faults, overlay.inject), time.monotonic()
@@ -148,7 +149,7 @@ class LiveRing:
         """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
         for end in self._ends:
             self._start_proxy(*end, heard=False)
-        for node in self._nodes:
+        for node in self._nodes.values():
             node.send(signal.SIGUSR1)
 
     @property
@@ -156,27 +157,21 @@ class LiveRing:
         """Return the directory of the processes' logs."""
         return self._run.directory
 
-    def environment(self, graph: Graph) -> Mapping[str, str]:
-        """Return the environment of the processes in a graph."""
-        return graph.environment(self._run.directory)
-
-    def _live_nodes(self) -> LiveNodes:
+    def _start_nodes(self) -> LiveSession:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
         seconds, talking = self._options.live_s, paces(self._options.camera_hz)
+        counts = {name: messages_in(seconds, hz) for name, hz in talking.items()}
         calls = calls_in(seconds)
         self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
         self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
-        talkers = dict[LabProcess, int]()
-        for name, hz in talking.items():
-            count = messages_in(seconds, hz)
-            talkers[self._start_node(robot, at_robot, name, count, hz)] = count
-        lamp = self._start_node(robot, at_robot, "lamp", 0)
-        listener = self._start_node(server, at_server, "listener", 0)
-        caller = self._start_node(server, at_server, "caller", calls)
-        self._nodes = [*talkers, lamp, listener, caller]
-        self.overlay.supervisor.ready(*self._nodes)
-        return LiveNodes(talkers, lamp, listener, caller, calls)
+        words = {name: [str(counts[name]), str(hz)] for name, hz in talking.items()}
+        words |= {"lamp": ["0"], "listener": ["0"], "caller": [str(calls)]}
+        for name, more in words.items():
+            at, graph = (server, at_server) if name in ("listener", "caller") else (robot, at_robot)
+            self._nodes[name] = self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, *more])
+        self.overlay.supervisor.ready(*self._nodes.values())
+        return LiveSession(self.overlay.supervisor, self._nodes, sum(counts.values()), calls, self._reporter)
 
     def _compare(self, heard: Heard, complaints: list[str]) -> Result:
         said = [self._finish(proxy) for proxy in self._proxies]
@@ -199,12 +194,8 @@ class LiveRing:
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self._start(at, graph, "proxy", argv, heard=heard)
 
-    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int, hz: float | None = None) -> LabProcess:
-        pace = [] if hz is None else [str(hz)]
-        return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count), *pace])
-
     def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> LabProcess:
-        return self.overlay.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
+        return self.overlay.lab.start(at.switch, role, argv, graph.environment(self.directory), heard=heard)
 
 
 def _require(versions: set[int]) -> None:

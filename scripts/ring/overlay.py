@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 from gdp.errors import LocalError
@@ -17,7 +17,6 @@ from lab.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from lab.credentials import OverlayCredentials
 from lab.faults import Fault, FaultKind, moments
 from lab.machines import Lab, OverlayNodes
-from lab.process import LabProcess
 from lab.supervisor import READY_S, Supervisor
 from ring.faults import CUT, ROAM, roamers, text_of, victims
 from ring.options import Options
@@ -67,7 +66,7 @@ class Overlay:
         """Start switches and RIBs; return when all are ready."""
         if self.options.pcap is not None:
             argv = ["-m", "ring.capture", str(self.options.pcap), *self.topology.neighbours(_MIDDLE)]
-            self.supervisor.ready(self.start(_MIDDLE, "capture", argv))
+            self.supervisor.ready(self.lab.start(_MIDDLE, "capture", argv))
         self.reporter.step("starting a switch in each")
         for node in self.topology.nodes:
             self.credentials.switch(node, self.options.data_plane)
@@ -82,19 +81,6 @@ class Overlay:
         self.nodes.start_all("rib", [at.switch for at in ribs], *_RIB_WORDS)
         self.supervisor.require(*self.nodes.running.values())
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
-
-    def start(
-        self,
-        node: str,
-        role: str,
-        arguments: Sequence[str],
-        environment: Mapping[str, str] | None = None,
-        *,
-        heard: bool = True,
-    ) -> LabProcess:
-        """Start Python with these arguments at a switch; ``environment`` extends the present one."""
-        variables = [f"{name}={value}" for name, value in (environment or {}).items()]
-        return self.lab.start(node, role, arguments, variables, heard=heard)
 
     def inject(self, fault: Fault, *, begins: bool) -> None:
         """Begin a fault, or end it. Raises ``LocalError``: the kernel refuses."""

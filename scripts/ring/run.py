@@ -159,13 +159,13 @@ class Ring:
         at, recorded = self.overlay.server, {"path": str(record), "format": "ros1" if self._ros == 1 else "mcap"}
         config = self.overlay.credentials.proxy(at, {"import": self._topics}, record=recorded)
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
-        return self.overlay.start(at.switch, "proxy", argv, heard=heard)
+        return self.overlay.lab.start(at.switch, "proxy", argv, heard=heard)
 
     def _start_sender(self) -> LabProcess:
         at = self.overlay.robot
         config = self.overlay.credentials.proxy(at, {"expose": self._topics})
         argv = ["-m", "proxy.cli.replay", str(self.bag), "--config", str(config), "--json"]
-        return self.overlay.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
+        return self.overlay.lab.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
 
 
 def topics_of(channels: Iterable[Channel], encoding: Encoding) -> tuple[Carried, ...]:
