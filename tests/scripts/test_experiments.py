@@ -193,7 +193,7 @@ def test_a_frame_comes_through_its_carrier_unchanged() -> None:
 
 
 def test_a_drawn_tag_is_found_where_it_is() -> None:
-    needs("pupil_apriltags", "scipy")
+    needs("cv2", "scipy")
     from tag import Pose, TagCamera
 
     camera = TagCamera()
