@@ -152,11 +152,6 @@ class LiveRing:
         for node in self._nodes.values():
             node.send(signal.SIGUSR1)
 
-    @property
-    def directory(self) -> Path:
-        """Return the directory of the processes' logs."""
-        return self._run.directory
-
     def _start_nodes(self) -> LiveSession:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
@@ -191,11 +186,10 @@ class LiveRing:
     def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> LabProcess:
         carried = {side: carried_in(self._options.encoding)}
         config = self.overlay.credentials.proxy(at, carried, ros=graph.to_yaml())
-        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
-        return self._start(at, graph, "proxy", argv, heard=heard)
+        return self.overlay.start_proxy(at.switch, config, graph.environment(self._run.directory), heard=heard)
 
-    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> LabProcess:
-        return self.overlay.lab.start(at.switch, role, argv, graph.environment(self.directory), heard=heard)
+    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str]) -> LabProcess:
+        return self.overlay.lab.start(at.switch, role, argv, graph.environment(self._run.directory))
 
 
 def _require(versions: set[int]) -> None:

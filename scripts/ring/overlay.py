@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
@@ -17,6 +18,7 @@ from lab.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from lab.credentials import OverlayCredentials
 from lab.faults import Fault, FaultKind, moments
 from lab.machines import Lab, OverlayNodes
+from lab.process import LabProcess
 from lab.supervisor import READY_S, Supervisor
 from ring.faults import CUT, ROAM, roamers, text_of, victims
 from ring.options import Options
@@ -81,6 +83,13 @@ class Overlay:
         self.nodes.start_all("rib", [at.switch for at in ribs], *_RIB_WORDS)
         self.supervisor.require(*self.nodes.running.values())
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
+
+    def start_proxy(
+        self, node: str, config: Path, environment: Sequence[str] = (), *, heard: bool = True
+    ) -> LabProcess:
+        """Start a proxy at a switch; one that is not heard outlives this process."""
+        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
+        return self.lab.start(node, "proxy", argv, environment, heard=heard)
 
     def inject(self, fault: Fault, *, begins: bool) -> None:
         """Begin a fault, or end it. Raises ``LocalError``: the kernel refuses."""

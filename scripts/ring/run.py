@@ -138,7 +138,7 @@ class Ring:
         """Send the recording through the ring, and compare."""
         overlay, supervisor = self.overlay, self.overlay.supervisor
         overlay.stand_up()
-        receiver = self._start_receiver(self.recording)
+        receiver = self._start_receiver()
         supervisor.ready(receiver)
         self._reporter.step(f"replaying {self._total} messages at {overlay.robot.switch}")
         sender = self._start_sender()
@@ -149,17 +149,13 @@ class Ring:
         comparisons = compare(self.bag, self.recording, exact=self.options.encoding == "cdr")
         return replace(report, topics=put_together(comparisons, replay.topics), settings=overlay.settings)
 
-    def start_again(self) -> Path:
-        """Start a receiver that outlives this process, in place of the ended one; return the path of its recording."""
-        path = self.recording.with_name(f"again-{self.recording.name}")
-        self._start_receiver(path, heard=False)
-        return path
-
-    def _start_receiver(self, record: Path, *, heard: bool = True) -> LabProcess:
-        at, recorded = self.overlay.server, {"path": str(record), "format": "ros1" if self._ros == 1 else "mcap"}
+    def _start_receiver(self) -> LabProcess:
+        at, recorded = (
+            self.overlay.server,
+            {"path": str(self.recording), "format": "ros1" if self._ros == 1 else "mcap"},
+        )
         config = self.overlay.credentials.proxy(at, {"import": self._topics}, record=recorded)
-        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
-        return self.overlay.lab.start(at.switch, "proxy", argv, heard=heard)
+        return self.overlay.start_proxy(at.switch, config)
 
     def _start_sender(self) -> LabProcess:
         at = self.overlay.robot
