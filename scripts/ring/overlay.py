@@ -69,18 +69,11 @@ class Overlay:
         if self.options.pcap is not None:
             argv = ["-m", "ring.capture", str(self.options.pcap), *self.topology.neighbours(_MIDDLE)]
             self.supervisor.ready(self.lab.start(_MIDDLE, "capture", argv))
-        self.reporter.step("starting a switch in each")
-        for node in self.topology.nodes:
-            self.credentials.switch(node, self.options.data_plane)
-        said = self.nodes.start_all("switch", self.topology.nodes)
+        self.reporter.step("starting a switch in each, and the RIB of each domain")
+        said = self.nodes.stand_up(self.topology.nodes, self.options.data_plane, *_RIB_WORDS)
         self._planes = sorted({str(each["data_plane"]) for each in said})
         for reason in sorted({str(each["reason"]) for each in said} - {""}):
             self.reporter.step(f"data plane {', '.join(self._planes)}: {reason}")
-        self.reporter.step("starting the RIB of each domain")
-        ribs = self.topology.attached("rib")
-        for at in ribs:
-            self.credentials.rib(at)
-        self.nodes.start_all("rib", [at.switch for at in ribs], *_RIB_WORDS)
         self.supervisor.require(*self.nodes.running.values())
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
 
