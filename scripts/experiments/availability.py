@@ -68,7 +68,6 @@ def measure(options: Options) -> Computed:
     cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
     return Computed(
         "availability",
-        "Availability, by replaying preemptions",
         {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]},
         page(cases),
         lambda: print_table(_HEAD, map(_cells, cases), words=2),

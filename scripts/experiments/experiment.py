@@ -15,13 +15,14 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
 from field import REPLICA, Field, Served, Work
 from machine import MachineState, machine_state, require_trust, require_writable
+from page_text import text_of
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit
@@ -70,17 +71,21 @@ class Report:
     Args:
         name: of its files, such as ``fig5``.
         groups: samples by their label in the table.
-        text: the method, and after it as a list the differences from the paper.
         draw: writes the picture to a path, under a title.
+        figures: in the text of the page, which has a title, the method, and as a list the differences from the paper.
     """
 
     name: str
-    title: str
     groups: Mapping[str, Sequence[Sample]]
     findings: Sequence[Finding]
-    text: str
     settings: Mapping[str, str | int | float]
     draw: Callable[[Path, str], None]
+    figures: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Return the title of the page."""
+        return self._parts()[0]
 
     def rows(self, state: MachineState) -> list[tuple[str, ...]]:
         """Return the table's rows, name first; the machine's load marks each where it is high."""
@@ -104,8 +109,8 @@ class Report:
     def to_page(self, state: MachineState) -> str:
         """Return the page in Markdown."""
         command = f"```bash\nsudo .venv/bin/python scripts/experiments/{self.name}.py\n```"
-        method, notes = self._parts()
-        parts = [f"# {self.title}", method, command, f"![{self.title}]({self.name}.png)"]
+        title, method, notes = self._parts()
+        parts = [f"# {title}", method, command, f"![{title}]({self.name}.png)"]
         parts += [markdown_table(("", *_COLUMNS), self.rows(state))]
         parts += [markdown_table(_FIGURES, [each.cells(state) for each in self.findings])]
         stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
@@ -113,15 +118,17 @@ class Report:
 
     def show(self, state: MachineState) -> None:
         """Print the tables and the notes."""
-        print(f"{self.title}\n{state}")
+        title, _, notes = self._parts()
+        print(f"{title}\n{state}")
         print_table(("", *_COLUMNS), self.rows(state), title="latency at the robot's node")
         print_table(_FIGURES, [each.cells(state) for each in self.findings], title="figures")
-        print(self._parts()[1])
+        print(notes)
 
-    def _parts(self) -> tuple[str, str]:
-        """Return the method and the list of differences."""
-        method, _, notes = self.text.partition("\n\n- ")
-        return method, f"- {notes}"
+    def _parts(self) -> tuple[str, str, str]:
+        """Return the title, the method and the list of differences."""
+        title, _, text = text_of(self.name, **self.figures).partition("\n\n")
+        method, _, notes = text.partition("\n\n- ")
+        return title.removeprefix("# "), method, f"- {notes}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +140,15 @@ class Computed:
     """
 
     name: str
-    title: str
     document: Mapping[str, object]
     page: str
     print_tables: Callable[[], None]
     draw: Callable[[Path, str], None]
+
+    @property
+    def title(self) -> str:
+        """Return the title of the page."""
+        return self.page.partition("\n")[0].removeprefix("# ")
 
     def to_dict(self, state: MachineState) -> dict[str, object]:
         """Return the document, with the machine."""

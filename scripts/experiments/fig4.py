@@ -12,7 +12,6 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
-from page_text import text_of
 from plot import Bar, Panel, save_bars
 from samples import Sample, Series
 from skeleton import Options
@@ -41,10 +40,8 @@ def measure(options: Options) -> Report:
         findings.append(Finding(f"{form}: share of direct, from the robot", share, most, True, one))
     return Report(
         "fig4",
-        "Figure 4: bytes on the robot's uplink",
         {form: samples for form, (samples, _) in found.items()},
         findings,
-        text_of("fig4"),
         {"replicas": options.replicas, "requests": count},
         lambda path, title: save_bars(path, title, "", _panels(figures)),
     )

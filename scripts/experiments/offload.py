@@ -94,7 +94,7 @@ def measure(options: Options) -> Computed:
     def draw(path: Path, title: str) -> None:
         save_bars(path, title, "", panels_of(document))
 
-    return Computed("offload", "FogROS G: Table I and Figure 5", document, page, lambda: print(page), draw)
+    return Computed("offload", document, page, lambda: print(page), draw)
 
 
 def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:

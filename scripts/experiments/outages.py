@@ -19,7 +19,6 @@ from typing import Final
 from asking import Asking
 from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
-from page_text import text_of
 from pictures import Span, save_timeline
 from samples import Sample, Series
 from skeleton import Options
@@ -102,12 +101,11 @@ def measure(options: Options) -> Report:
     measured = {label: [Outage(s.from_s, s.to_s) for s in stopper.spans if s.machine == label] for label in _MACHINES}
     return Report(
         "outages",
-        "Availability, measured: machines that stop and go on",
         groups,
         _findings(groups, measured, seconds),
-        text_of("outages", up_s=UP_S, down_s=DOWN_S, patience_s=_PATIENCE_S),
         {"seconds": seconds, "outages": sum(map(len, measured.values())), "switches": plane},
         lambda path, title: save_timeline(path, title, groups["two machines"], stopper.spans, begun_s),
+        {"up_s": UP_S, "down_s": DOWN_S, "patience_s": _PATIENCE_S},
     )
 
 

@@ -98,13 +98,11 @@ def measure(options: Options) -> Computed:
         "applications": [asdict(each) for each in needed],
         "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
     }
-    title = "Table I: the price of a replica"
 
     def draw(path: Path, title: str) -> None:
         save_bars(path, title, f"AWS {region}", [_panel(rows)])
 
-    pictured = page(region, rows, needed)
-    return Computed("table1", title, document, pictured, print_tables, draw)
+    return Computed("table1", document, page(region, rows, needed), print_tables, draw)
 
 
 def bills(region: str) -> list[Row]:

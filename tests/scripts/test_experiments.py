@@ -320,7 +320,7 @@ def test_the_table_of_both_papers_is_of_the_shipped_figures() -> None:
 def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> None:
     from page_text import text_of
 
-    lines = text_of("outages", up_s=9.0, down_s=3.0, patience_s=0.5).splitlines()
+    _, _, *lines = text_of("outages", up_s=9.0, down_s=3.0, patience_s=0.5).splitlines()
     assert [line[:12] for line in lines] == ["A robot asks", "", "*By the list", "", "- The paper'", "- The machin"]
     assert "means of 9 s and 3 s, drawn before" in lines[0]
 
@@ -332,6 +332,6 @@ def test_the_page_of_table_one_and_figure_five_is_of_the_shipped_figures() -> No
 
     pages = ROOT / "docs" / "experiments"
     document = json.loads((pages / "offload.json").read_text(encoding="utf-8"))
-    shipped = Computed("offload", "", document, page_of(document), lambda: None, lambda *_: None)
+    shipped = Computed("offload", document, page_of(document), lambda: None, lambda *_: None)
     assert set(document["tasks"]) == set(PAPER)
     assert (pages / "offload.md").read_text(encoding="utf-8") == shipped.to_page(MachineState(**document["machine"]))
