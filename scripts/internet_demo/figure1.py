@@ -18,8 +18,7 @@ from typing import Any, Final, NamedTuple
 
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
-from internet_demo.scenario import Display, Event, Outcome, Pace
-from internet_demo.stage import Stage
+from internet_demo.scenario import Display, Event, Outcome, Pace, Stage
 from lab.dds import udp_profile
 from lab.internet.access import Access
 from lab.internet.host import Host
