@@ -92,7 +92,7 @@ def measure(options: Options) -> Report:
     shown = [each for each in _samples(sites, begun_s) if each.begun_s < 3 * _PHASE_S * _SHOWN]
     spans = [Span(each.machine, each.from_s - begun_s, each.to_s - begun_s) for each in roaming.spans[:_SHOWN]]
     moves = [each - begun_s for each in roaming.moved[:_SHOWN]]
-    return Report(
+    return Report.of(
         "anycast",
         {"all requests": _samples(sites, begun_s)},
         [

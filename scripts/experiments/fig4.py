@@ -38,7 +38,7 @@ def measure(options: Options) -> Report:
     for form in list(FORMS)[1:]:
         share = figures[form][0] / figures[DIRECT][0]
         findings.append(Finding(f"{form}: share of direct, from the robot", share, most, True, one))
-    return Report(
+    return Report.of(
         "fig4",
         {form: samples for form, (samples, _) in found.items()},
         findings,

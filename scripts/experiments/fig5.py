@@ -78,7 +78,7 @@ def measure(options: Options) -> Report:
                 groups |= _named(name, found)
                 findings += _waiting_findings(name, found, both)
     panels = latencies_of(groups, "{name}, {case}", [*(f"{each}, computed" for each in counts), *lists], 1.0)
-    return Report(
+    return Report.of(
         "fig5",
         groups,
         findings,

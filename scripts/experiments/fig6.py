@@ -80,7 +80,7 @@ def measure(options: Options) -> Report:
         findings += gains(f"{{}} gain, {what}", found[_ONE], found[_TWO], setting.paper)
     findings.append(Finding("p99 gain offline, least of any two recorded runs", _OFFLINE, paper="1.3"))
     panels = latencies_of(groups, "{name}, {case}", counts, 1e3)
-    return Report(
+    return Report.of(
         "fig6",
         groups,
         findings,

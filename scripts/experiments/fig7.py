@@ -53,7 +53,7 @@ def measure(options: Options) -> Report:
         found, plane = asking.by_service("requests"), here.data_plane
     groups, findings = _compared(found, has_target=not options.compute)
     panels = latencies_of(groups, "{case}, {name}", [link for link, _ in _LINKS.values()], 1e3)
-    return Report(
+    return Report.of(
         "fig7",
         groups,
         findings,

@@ -74,7 +74,7 @@ def measure(options: Options) -> Report:
     end_s = max(each.begun_s for each in samples) - from_s
     spans = [replace(each, to_s=min(each.to_s, end_s)) for each in fault_injector.spans]
     drawn = [replace(each, machine=labels.get(each.machine, each.machine)) for each in samples]
-    return Report(
+    return Report.of(
         "fig9",
         _groups(samples, spans, from_s),
         _findings(samples, asking, spans),

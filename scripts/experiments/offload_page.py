@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from machine import MachineState
-from page_text import text_of
 from plot import Bar, Panel
 from report import markdown_table, percentile
 
@@ -57,28 +56,26 @@ def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, 
     return statistics.median(gaps), min(gaps), max(gaps)
 
 
-def page_of(document: Document) -> str:
-    """Return the page, in Markdown, of the measured tasks."""
+def figures_of(document: Document) -> dict[str, object]:
+    """Return the figures and tables in the page's text, of the measured tasks."""
     tasks: Document = document["tasks"]
     networks = {name: task["network"] for name, task in tasks.items()}
-    text = text_of(
-        "offload",
-        table1=markdown_table(
+    return {
+        "table1": markdown_table(
             ("scenario", "", "robot only", *(f"{who} {what}" for who in ("ROS 2", JSON, CDR) for what in _CELLS)),
             [row for name in PAPER if name in tasks for row in _rows(name, tasks[name])],
         ),
-        figure5=_figure5(networks),
-        details=_details(networks),
-        trials="; ".join(_trials(name, each) for name, each in networks.items()),
-        computes="\n- ".join(f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks),
-        ratios=", ".join(f"{name} {each:.2f}" for name, each in document["slower"].items()),
-        machines="\n- ".join(
+        "figure5": _figure5(networks),
+        "details": _details(networks),
+        "trials": "; ".join(_trials(name, each) for name, each in networks.items()),
+        "computes": "\n- ".join(f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks),
+        "ratios": ", ".join(f"{name} {each:.2f}" for name, each in document["slower"].items()),
+        "machines": "\n- ".join(
             f"{name}, {part}: measured on {MachineState(**each['machine'])}."
             for name, task in tasks.items()
             for part, each in task.items()
         ),
-    )
-    return f"{text}\n"
+    }
 
 
 def panels_of(document: Document) -> list[Panel]:

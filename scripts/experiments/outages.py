@@ -99,7 +99,7 @@ def measure(options: Options) -> Report:
         plane = here.data_plane
     groups = {what: [each for each in samples if each.service == name] for what, name in _CASES.items()}
     measured = {label: [Outage(s.from_s, s.to_s) for s in stopper.spans if s.machine == label] for label in _MACHINES}
-    return Report(
+    return Report.of(
         "outages",
         groups,
         _findings(groups, measured, seconds),

@@ -326,12 +326,12 @@ def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> Non
 
 
 def test_the_page_of_table_one_and_figure_five_is_of_the_shipped_figures() -> None:
-    from experiment import Computed
+    from experiment import Report
     from machine import MachineState
-    from offload_page import PAPER, page_of
+    from offload_page import PAPER, figures_of
 
     pages = ROOT / "docs" / "experiments"
     document = json.loads((pages / "offload.json").read_text(encoding="utf-8"))
-    shipped = Computed("offload", document, page_of(document), lambda: None, lambda *_: None)
+    shipped = Report("offload", document, {}, lambda *_: None, figures_of(document))
     assert set(document["tasks"]) == set(PAPER)
     assert (pages / "offload.md").read_text(encoding="utf-8") == shipped.to_page(MachineState(**document["machine"]))
