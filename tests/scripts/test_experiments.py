@@ -320,9 +320,13 @@ def test_the_table_of_both_papers_is_of_the_shipped_figures() -> None:
 def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> None:
     from page_text import text_of
 
-    _, _, *lines = text_of("outages", up_s=9.0, down_s=3.0, patience_s=0.5).splitlines()
-    assert [line[:12] for line in lines] == ["A robot asks", "", "*By the list", "", "- The paper'", "- The machin"]
-    assert "means of 9 s and 3 s, drawn before" in lines[0]
+    figures = {"up_s": 9.0, "down_s": 3.0, "patience_s": 0.5}
+    lines = text_of("outages", latencies="rows", findings="more", **figures).splitlines()
+    assert [line[:12] for line in lines if line] == [
+        "# Availabili", "A robot asks", "*By the list", "```bash", "sudo .venv/b", "```", "![Availabili", "rows", "more",
+        "- The paper'", "- The machin",
+    ]  # fmt: skip
+    assert "means of 9 s and 3 s, drawn before" in lines[2]
 
 
 def test_the_page_of_table_one_and_figure_five_is_of_the_shipped_figures() -> None:
