@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from machine import MachineState
+from page_text import PAPERS
 from plot import Bar, Panel
 from report import markdown_table, percentile
 
@@ -18,12 +19,7 @@ CDR: Final = "overlay, CDR"
 _CELLS: Final = ("network", "total")
 _SHOWN: Final = (CYCLONE, JSON, CDR)  # in Table I
 PAPER_ADDED_S: Final = 0.014
-# What the tasks compute here, and how far that is from what the paper computed.
-COMPUTES: Final = {
-    "vSLAM": "RGB-D visual odometry with ORB features; stand-in for ORB-SLAM2: no map, no loop closure",
-    "motion planning": "OMPL's RRTConnect with FCL in Home, one thread; the paper: MPT, a parallel planner",
-    "grasp planning": "antipodal sampling on the depth image; stand-in for Dex-Net: no neural network ranks",
-}
+COMPUTES: Final[Mapping[str, str]] = PAPERS["computes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +33,7 @@ class PaperRow:
     total_s: float
 
 
-PAPER: Final = {
-    "vSLAM": PaperRow(0.68, 0.010, 1.4, 0.024, 1.4),
-    "motion planning": PaperRow(161.8, 0.008, 4.3, 0.023, 4.3),
-    "grasp planning": PaperRow(14.0, 0.065, 0.6, 0.089, 0.6),
-}
+PAPER: Final = {name: PaperRow(**row) for name, row in PAPERS["offload"].items()}
 
 Document = Mapping[str, Any]  # JSON
 

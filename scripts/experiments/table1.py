@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from experiment import Report, Rows, command_line, run_experiment
+from page_text import PAPERS
 from plot import Bar, Panel, save_bars
 from skeleton import Options
 
@@ -27,15 +28,7 @@ _WAYS: Final = ("one on-demand", "two on-demand", "two spot")
 _HEAD: Final = ("application", "needs", "", *_WAYS, "two spot / one on-demand", "machines")
 _TYPE_HEAD: Final = (*_WAYS, "a month: one", "two", "two spot", "two spot cost", "taken a month")
 REGIONS: Final = ("us-west-1", "us-west-2")  # the paper's
-# Application -> what a machine must have, and the paper's USD an hour: one on-demand, two on-demand, two spot.
-APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
-    "YOLO": ("cpu:16", (0.40, 0.80, 0.34)),
-    "SAM": ("cpu:4,T4", (0.53, 1.06, 0.44)),
-    "MPT Home": ("cpu:32", (1.79, 3.58, 1.69)),
-    "MPT Cubicles": ("cpu:32", (1.79, 3.58, 1.69)),
-    "MPT TwistyCool": ("cpu:64", (3.58, 7.16, 1.68)),
-    "Pick-scan-place": ("cpu:16", (0.40, 0.80, 0.34)),
-}
+APPLICATIONS: Final = {name: (needs, tuple(usd)) for name, (needs, usd) in PAPERS["applications"].items()}
 
 # Ratio -> the prices of a row that it divides: 0: one on-demand, 1: two on-demand, 2: two spot.
 _RATIOS: Final = {"one on-demand / two spot": (0, 2), "two on-demand / two spot": (1, 2)}

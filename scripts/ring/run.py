@@ -14,7 +14,7 @@ from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
 from lab.credentials import Carried
 from lab.process import Event, FailedError, LabProcess
-from lab.supervisor import READY_S, Supervisor, exit_code, failed
+from lab.supervisor import READY_S, TAIL, Supervisor, exit_code
 from proxy.config.config import Encoding
 from proxy.recordings.compare import compare
 from proxy.recordings.reader import BagReader
@@ -61,7 +61,7 @@ class Replay:
             sender_code = exit_code(self._sender, ENDING_S)
             sent = self._supervisor.said(self._sender, "done")
             if sent is None:
-                raise failed(self._sender, f"ended with code {sender_code} in the middle")
+                raise self._sender.failed(f"ended with code {sender_code} in the middle", TAIL)
             self._supervisor.release(self._receiver)
             self._receiver.send(signal.SIGINT)
             received = self._supervisor.wait_for(self._receiver, "done", ENDING_S)
