@@ -287,9 +287,10 @@ def test_the_least_of_two_recorded_runs_gains_by_how_rare_the_long_ones_are() ->
 
 def test_a_request_is_lost_only_while_all_its_machines_stay_down() -> None:
     needs("matplotlib")
-    from outages import Outage, share_unanswered
+    from outages import share_unanswered
+    from pictures import Span
 
-    one, other = [Outage(1.0, 4.0)], [Outage(3.0, 8.0)]
+    one, other = [Span("m1", 1.0, 4.0)], [Span("m2", 3.0, 8.0)]
     assert share_unanswered([one], 10.0, 0.0) == pytest.approx(0.3, abs=0.01)
     assert share_unanswered([one], 10.0, 0.5) == pytest.approx(0.25, abs=0.01)
     assert share_unanswered([one, other], 10.0, 0.5) == pytest.approx(0.05, abs=0.01)
@@ -323,8 +324,8 @@ def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> Non
     figures = {"up_s": 9.0, "down_s": 3.0, "patience_s": 0.5}
     lines = text_of("outages", latencies="rows", findings="more", **figures).splitlines()
     assert [line[:12] for line in lines if line] == [
-        "# Availabili", "A robot asks", "*By the list", "```bash", "sudo .venv/b", "```", "![Availabili", "rows", "more",
-        "- The paper'", "- The machin",
+        "# Availabili", "A robot asks", "*By the list", "```bash", "sudo .venv/b", "```", "![Availabili", "rows",
+        "more", "- The paper'", "- The machin",
     ]  # fmt: skip
     assert "means of 9 s and 3 s, drawn before" in lines[2]
 
