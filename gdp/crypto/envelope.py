@@ -193,10 +193,12 @@ class Sealer:
         salt = self._random_bytes(SALT_BYTES)
         head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
         cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
-        return Sealed(
-            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, origin=origin,
-            size=size, capacity=capacity,
+        sealed = Sealed(
+            cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, size=size,
+            capacity=capacity,
         )  # fmt: skip
+        sealed._origin = origin
+        return sealed
 
 
 class Sealed(Sequence[bytes]):
@@ -211,7 +213,6 @@ class Sealed(Sequence[bytes]):
         parts: int,
         prefix: bytes,
         message: bytes,
-        origin: Sealed | None,
         size: int,
         capacity: int,
     ) -> None:
@@ -219,7 +220,8 @@ class Sealed(Sequence[bytes]):
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._head, self.parts, self._prefix = head, parts, prefix
-        self._message, self._origin = message, origin
+        self._message = message
+        self._origin: Sealed | None = None  # opened when the first frame is requested
         self._capacity = capacity
         self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []
