@@ -1,6 +1,6 @@
 """Forwarding bench: frames a second through three switches, and the round trip of one frame, next to a Linux bridge.
 
-    sudo .venv/bin/python scripts/bench/forwarding.py                      a minute; JSON and plot to docs/benchmarks
+    sudo .venv/bin/python scripts/bench/forwarding.py                      a minute; JSON to docs/benchmarks
     sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
 
 ::
@@ -23,8 +23,7 @@ from functools import partial
 from typing import Final
 
 from forwarding_end import SINK, SOURCE
-from plot import Panel, panel_of
-from report import Rounds, Target, percentile
+from report import percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.frame.codec import ETHERTYPE, OVERHEAD_BYTES, Header, Kind, encode
@@ -145,14 +144,6 @@ def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> 
     return {**best, TRIP: statistics.median(trips), TRIP_P99: percentile(trips, 0.99)}
 
 
-def targets_of(over: Rounds) -> list[Target]:
-    """Return the targets of the kernel plane."""
-    return [
-        over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
-        over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
-    ]
-
-
 def measure(options: Options) -> Outcome:
     """Measure both, round by round."""
     recorder, pings = Recorder(), int(options.pings)
@@ -172,22 +163,15 @@ def measure(options: Options) -> Outcome:
         "cores": f"source {_SOURCE_CPU}, sink {_SINK_CPU}, switches anywhere",
         "trouble": recorder.notes or "none",
     }
-    return Outcome("forwarding", "Forwarding", over, targets_of(over), settings, lambda: panels_of(over))
-
-
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return panels of rates and round trips."""
-    both = (KERNEL, BRIDGE)
-    return [
-        panel_of(over, CASE, RATE, both, ours=(KERNEL,)),
-        panel_of(over, CASE, TRIP, both, p99=TRIP_P99, ours=(KERNEL,)),
+    targets = [
+        over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
+        over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
     ]
+    return Outcome("forwarding", "Forwarding", over, targets, settings)
 
 
 if __name__ == "__main__":
     quick = {"rounds": 1, "seconds": 0.15, "pings": 200}
-    parser = command_line(
-        __doc__, rounds=7, seconds=0.3, seconds_of="length of one try", quick=quick, has_record=True, has_plot=True
-    )
+    parser = command_line(__doc__, rounds=7, seconds=0.3, quick=quick, has_record=True)
     parser.add_argument("--pings", type=int, default=PINGS, help="in each round (default: %(default)s)")
     run_bench(parser, measure)

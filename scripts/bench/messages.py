@@ -29,7 +29,7 @@ from background_load import LOADS, SHARE, load_of
 from peers.chain import Chain
 from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
-from plot import Panel, panel_of
+from plot import panels_of
 from report import Rounds, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
@@ -103,11 +103,6 @@ def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list
     return targets
 
 
-def panels_of(over: Rounds, names: Sequence[str]) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    return [panel_of(over, case, MEDIAN, names, p99=P99, ours=OURS) for case in over.cases()]
-
-
 def positive(text: str) -> int:
     """Return a whole number above 0. Raises ``ValueError``: it is not."""
     number = int(text)
@@ -151,14 +146,13 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over, ours, cases),
         settings,
-        lambda: panels_of(over, names),
-        is_whole=is_whole(options),
+        panels_of(over, MEDIAN, names, p99=P99, ours=OURS),
     )
 
 
 def is_whole(options: Options) -> bool:
     """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
-    return not (options.quick or options.only or options.mtu) and options.load == "both"
+    return not (options.only or options.mtu) and options.load == "both"
 
 
 def main() -> None:
@@ -172,7 +166,7 @@ def main() -> None:
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
     parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
     options = parse(parser)
-    options.no_plot |= not is_whole(options)
+    options.no_plot |= options.quick or not is_whole(options)
     options.is_whole = is_whole
     perform(options, measure)
 

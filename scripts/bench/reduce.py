@@ -19,7 +19,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from machine import DATA, RefusedError, data_folder
-from plot import Panel, panel_of
 from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
@@ -234,14 +233,10 @@ def measure(options: Options) -> Outcome:
             targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
     settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES or "each once"}
     title = "Bytes and CPU time of reduced messages"
-    return Outcome("reduce", title, over, targets, settings, lambda: _panels(over, every))
-
-
-def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
-    return [panel_of(over, case.name, "bytes", [PLAIN, *case.reductions]) for case in (*every[:1], *every[3:5])]
+    return Outcome("reduce", title, over, targets, settings)
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True)
     parser.set_defaults(passes=2)  # messages of a figure, in 60; 0: each once
     run_bench(parser, measure)

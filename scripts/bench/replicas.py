@@ -32,7 +32,7 @@ sys.path.append(str(_HERE.parent / "experiments"))
 from asking import Asking  # noqa: E402 - it lies with the experiments
 from experiment import field_of, work_of  # noqa: E402
 from field import READY_S, Field, Served, Server  # noqa: E402
-from plot import Panel, panel_of  # noqa: E402
+from plot import panels_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from samples import Sample, Series  # noqa: E402
 from skeleton import Options, Outcome, command_line, run_bench  # noqa: E402
@@ -209,16 +209,6 @@ def targets_of(over: Rounds) -> list[Target]:
     return targets
 
 
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    rows = {ADDED: (ONE, TWO), HEDGED: (ONE, BOTH, LATE), KILLED: (THREE,)}
-    return [
-        panel_of(over, CASES[case], MEDIAN, list(who), p99=P99, ours=list(who))
-        for case, who in rows.items()
-        if CASES[case] in over.cases()
-    ]
-
-
 def measure(options: Options) -> Outcome:
     """Measure the parts in turn, round by round."""
     bench = Bench(options.rate, random.Random(SEED))
@@ -242,7 +232,7 @@ def measure(options: Options) -> Outcome:
             "requests a second while killed": options.rate,
             "seed": SEED,
         },
-        lambda: panels_of(bench.over),
+        panels_of(bench.over, MEDIAN, (ONE, TWO, BOTH, LATE, THREE), p99=P99),
     )
 
 

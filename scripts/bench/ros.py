@@ -35,7 +35,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from plot import Panel, panel_of
+from plot import panels_of
 from report import Rounds, Target
 from ros_row import READY_S, Row
 from ros_trace import read_calls, steps_of
@@ -161,7 +161,7 @@ def measure_trace(options: Options) -> Outcome:
             for who, each in pids.items():
                 for step, took_ms in steps_of(read_calls(stem, each)).items():
                     over.add(f"{who}: {step}", f"image, MTU {mtu}", MEDIAN, took_ms)
-    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {}, is_whole=False)
+    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {})
 
 
 def _figures(said: Mapping[str, float], cores: float) -> dict[str, float]:
@@ -208,12 +208,6 @@ def _call_targets(over: Rounds, _: Options, mtu: int) -> Iterator[Target]:
         yield over.target(f"{load}: {OVERLAY}, {column}", OVERLAY, load, column, 0.0, at_most=True)
 
 
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    names: Sequence[str] = (OVERLAY, SESSION, DIRECT)
-    return [panel_of(over, case, MEDIAN, names, p99=P99, ours=names[:2]) for case in over.cases()]
-
-
 def measure(options: Options) -> Outcome:
     """Measure every case, round by round, on a row of its own for each MTU."""
     recorder = Recorder()
@@ -231,8 +225,8 @@ def measure(options: Options) -> Outcome:
         "socket buffers, B": min(BUFFER_BYTES, int(_RMEM_MAX.read_text(encoding="ascii"))),
         "trouble": recorder.notes or "none",
     }
-    targets = targets_of(over, options)
-    return Outcome(name, f"{title} over three kernel switches", over, targets, settings, lambda: panels_of(over))
+    panels = panels_of(over, MEDIAN, (OVERLAY, SESSION, DIRECT), p99=P99, ours=(OVERLAY, SESSION))
+    return Outcome(name, f"{title} over three kernel switches", over, targets_of(over, options), settings, panels)
 
 
 def command(words: Sequence[str] | None = None) -> Options:

@@ -10,7 +10,7 @@ FIFO in each direction. On the same link and seed, one after the other:
 Each carries camera (30 Hz, raw or JPEG, best effort), lidar (10 Hz), tf (100 Hz), a map, service calls, and cmd_vel
 back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one way, from when a message was due.
 
-    sudo .venv/bin/python scripts/bench/uplink.py                     # a small grid; writes docs/benchmarks/uplink.*
+    sudo .venv/bin/python scripts/bench/uplink.py                     # a small grid; writes docs/benchmarks/uplink.json
     sudo .venv/bin/python scripts/bench/uplink.py --quick --no-save   # a few seconds each: does it work?
     sudo .venv/bin/python scripts/bench/uplink.py --only gdp --rates 1 5 --rtt 10 --loss 0 burst --fifo bdp --no-save
     sudo .venv/bin/python scripts/bench/uplink.py --rates Verizon-LTE-short --no-save
@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Final
 
 from machine import DATA, RefusedError
-from plot import Panel, panel_of
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
@@ -198,18 +197,6 @@ def targets_of(over: Rounds, links: Sequence[Conditions], choice: str) -> list[T
     return targets
 
 
-def panels_of(over: Rounds, links: Sequence[Conditions]) -> list[Panel]:
-    """Return panels of each link: urgent ages, images, and the share with TCP."""
-    panels = []
-    for link in links:
-        for stream in ("cmd_vel", "tf"):
-            case = case_of(link, stream)
-            panels.append(panel_of(over, case, score.AGE_P50, list(SYSTEMS), p99=score.AGE_P99, ours=[OURS], log=True))
-        panels.append(panel_of(over, case_of(link, "camera"), score.OF_LINK, list(SYSTEMS), ours=[OURS]))
-        panels.append(panel_of(over, case_of(link, "link"), score.SHARE_BOTH, list(SYSTEMS), ours=[OURS]))
-    return panels
-
-
 def measure(options: Options) -> Outcome:
     """Measure every system on every link, round by round."""
     recorder, links = Recorder(), links_of(options)
@@ -235,16 +222,13 @@ def measure(options: Options) -> Outcome:
             "camera, B": [CAMERA_BYTES[camera_of(link, options.camera)] for link in links],
             "trouble": recorder.notes or "none",
         },
-        lambda: panels_of(over, links),
         keeps_rows=bool(options.only),
     )
 
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = command_line(
-        __doc__, rounds=1, seconds=6.0, quick={"rounds": 1, "seconds": 2.0}, has_record=True, has_plot=True
-    )
+    parser = command_line(__doc__, rounds=1, seconds=6.0, quick={"rounds": 1, "seconds": 2.0}, has_record=True)
     parser.add_argument("--only", nargs="+", choices=[TCP, *SYSTEMS], help="these rows")
     parser.add_argument("--rates", nargs="+", help="Mbit/s, or names of recordings; 1, 5, 20 and 100 are of interest")
     parser.add_argument("--rtt", nargs="+", type=float, help=f"ms, such as {RTTS_MS}")
