@@ -10,6 +10,7 @@ settings are the defaults, including its packet sizes.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, Final, Literal, Protocol
@@ -21,7 +22,6 @@ from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
 from peers.chain import NODES, Chain, address
 from peers.gdp_endpoint import PING, PONG
-from peers.jsonl import EndSettings
 
 _GDP: Final = "peers.gdp_endpoint"
 _ZENOH: Final = "peers.zenoh_endpoint"
@@ -32,6 +32,7 @@ _MEASURED_S: Final = 180.0
 
 Measured = Mapping[str, Any]  # what ``exchange`` returns
 Pids = Mapping[str, Sequence[int]]
+Settings = Mapping[str, object]
 
 
 class Baseline(Protocol):
@@ -59,9 +60,9 @@ class GdpNet:
         """Start switches, RIB, B, A; as ``Baseline.measure``."""
         with ExitStack() as stack:
             nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=self.name))
-            own = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
+            ends = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
             between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
-            return _measured(stack, chain, _GDP, own, {"between": between}, (size, count))
+            return _measured(stack, chain, _GDP, ends, {"between": between}, size=size, count=count)
 
     def _admit(self, nodes: BenchNodes, node: str) -> object:
         if self._sign == "session":
@@ -80,29 +81,23 @@ class ZenohNet:
         with ExitStack() as stack:
             routers = []
             for before, node in zip(NODES, MIDDLE, strict=False):
-                own = {"listen": f"tls/0.0.0.0:{_ZENOH_PORT}", **self._identity(chain, node)}
-                if before in MIDDLE:
-                    own["connect"] = self._at(before, node)
-                settings = EndSettings("router", 0, 0, {}, own)
-                started = chain.start(node, "zenoh_router", ["-m", _ZENOH, settings.to_argument()])
-                routers.append(stack.enter_context(started))
+                upstream = before if before in MIDDLE else None
+                own = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], **self._own(chain, node, upstream)}
+                routers.append(stack.enter_context(_start(chain, node, _ZENOH, "router", {"own": own})))
                 routers[-1].read(_READY_S)
-            ends = [
-                {"connect": self._at(router, node), **self._identity(chain, node)}
-                for node, router in ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))
-            ]
-            return _measured(stack, chain, _ZENOH, ends, {"between": [each.pid for each in routers]}, (size, count))
+            pairs = ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))
+            ends = [{"own": self._own(chain, node, router)} for node, router in pairs]
+            pids = {"between": [each.pid for each in routers]}
+            return _measured(stack, chain, _ZENOH, ends, pids, size=size, count=count)
 
-    def _at(self, router: str, towards: str) -> str:
-        return f"tls/{address(router, towards)}:{_ZENOH_PORT}"
-
-    def _identity(self, chain: Chain, node: str) -> dict[str, str]:
-        """Return the path of a machine's certificate; the first call makes all of them."""
+    def _own(self, chain: Chain, node: str, router: str | None) -> dict[str, object]:
+        """Return the router that a machine connects to, and its certificate; the first call makes all of them."""
         directory = chain.directory / "tls"
         if not directory.exists():
             hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
             make_certificates(directory, hosts)
-        return {"certificate": str(directory / node)}
+        connect = [f"tls/{address(router, node)}:{_ZENOH_PORT}"] if router else []
+        return {"connect": connect, "certificate": str(directory / node)}
 
 
 def cyclone_xml(own: str, other: str) -> str:
@@ -123,9 +118,9 @@ class CycloneNet:
     def measure(self, chain: Chain, size: int, count: int) -> Measured:
         """Start B, then A; as ``Baseline.measure``."""
         left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
-        own = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
+        ends = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
         with ExitStack() as stack:
-            return _measured(stack, chain, _CYCLONE, own, {}, (size, count))
+            return _measured(stack, chain, _CYCLONE, ends, {}, size=size, count=count)
 
 
 BASELINES: Final[Mapping[str, Baseline]] = {
@@ -134,15 +129,14 @@ BASELINES: Final[Mapping[str, Baseline]] = {
 
 
 def _measured(
-    stack: ExitStack, chain: Chain, module: str, own: Sequence[dict[str, str]], pids: Pids, load: tuple[int, int]
+    stack: ExitStack, chain: Chain, module: str, ends: Sequence[Settings], pids: Pids, **load: int
 ) -> Measured:
-    """Start the endpoints at B and A, whose settings ``own`` has in the other order; return the figures of A."""
-
-    def start(role: str, node: str, settings: dict[str, str], counted: Pids) -> LabProcess:
-        every = EndSettings(role, *load, {place: list(each) for place, each in counted.items()}, settings)
-        argv = ["-m", module, every.to_argument()]
-        return stack.enter_context(chain.start(node, module.rpartition(".")[2], argv))
-
-    pong = start("pong", RIGHT, own[1], {})
+    """Start the endpoints at B and A with their settings, which ``ends`` has of A and of B; return the figures of A."""
+    pong = stack.enter_context(_start(chain, RIGHT, module, "pong", ends[1]))
     pong.read(_READY_S)
-    return start("ping", LEFT, own[0], {"receiver": [pong.pid], **pids}).read(_MEASURED_S)
+    settings = {**ends[0], **load, "pids": {"receiver": [pong.pid], **pids}}
+    return stack.enter_context(_start(chain, LEFT, module, "ping", settings)).read(_MEASURED_S)
+
+
+def _start(chain: Chain, node: str, module: str, role: str, settings: Settings) -> LabProcess:
+    return chain.start(node, f"{module.rpartition('.')[2]}-{role}", ["-m", module, role, json.dumps(settings)])
