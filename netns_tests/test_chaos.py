@@ -155,7 +155,7 @@ def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Ove
     assert "member P" not in overlay.processes
     overlay.start("member P")
     overlay.processes["member P"].read(READY_S)
-    assert overlay.incarnation_ids["member P"] == 2
+    assert len(overlay.lives["member P"]) == 2
     until(lambda: numbers(overlay, "R"), "a message of its new life")
     overlay.freeze("member R")
     overlay.thaw("member R")

@@ -162,7 +162,7 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, o
 
 def _new_name_s(overlay: Overlay, at: int) -> float:
     """Make P publish, and R read, an unknown name; return the seconds until its first message."""
-    arrivals_ns = overlay.books.arrivals_ns[len(overlay.plan.flows) + len(overlay.plan.services) + at, "R"]
+    arrivals_ns = overlay.books.arrivals_ns[1 + at, "R"]
     begun_ns = time.monotonic_ns()
     for who in ("member P", "member R"):
         overlay.processes[who].send(signal.SIGUSR1)

@@ -66,8 +66,8 @@ def _square(hz: float, ribs: tuple[str, ...] = ("s3",), *, new_names: bool = Fal
         ribs,
         {"P": "s1", "R": "s4"},
     )
-    spare = tuple(Flow(f"/new/{n}", "P", ("R",), hz=50.0) for n in range(NEW_TOPICS)) if new_names else ()
-    return Plan(topology, members, flows=_flows(hz), spare=spare)
+    new = (Flow(f"/new/{n}", "P", ("R",), hz=50.0, waits=True) for n in range(NEW_TOPICS if new_names else 0))
+    return Plan(topology, members, flows=(*_flows(hz), *new))
 
 
 def _borders(hz: float) -> Plan:

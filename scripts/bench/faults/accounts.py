@@ -91,18 +91,14 @@ class Books:
         self._plan = plan
         # by channel, reader, the reader's incarnation, the publisher's incarnation
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
-        self.reported_losses: defaultdict[tuple[int, str, int], int] = defaultdict(
-            int
-        )  # by channel, reader, its incarnation
-        self.reported_between: defaultdict[tuple[int, str, int], int] = defaultdict(
-            int
-        )  # the same, of before that incarnation
+        # by channel, reader, its incarnation; and the same, of before that incarnation
+        self.reported_losses: defaultdict[tuple[int, str, int], int] = defaultdict(int)
+        self.reported_between: defaultdict[tuple[int, str, int], int] = defaultdict(int)
         self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, incarnation -> moments
         self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
         self.wrong: list[str] = []
-        self._calls: dict[
-            tuple[int, str, int, int], list[int]
-        ] = {}  # channel, client, incarnation, number -> [since, answers]
+        # channel, client, incarnation, number -> [since, answers]
+        self._calls: dict[tuple[int, str, int, int], list[int]] = {}
         self.answered: list[tuple[int, int]] = []  # time of the call, time of the answer
         self.failed: list[tuple[int, int]] = []
 
@@ -112,8 +108,7 @@ class Books:
             if each.kind == Kind.DELIVERED:
                 self.accounts[each.channel, member, incarnation_id, each.incarnation_id].add(each.number)
                 self.arrivals_ns[each.channel, member].append(each.at_ns)
-                expected = self._plan.members.index(self._publisher(each.channel))
-                if each.other != expected:
+                if each.other != self._plan.members.index(self._plan.flows[each.channel].publisher):
                     self.wrong.append(f"{member} had a message of member {each.other} on channel {each.channel}")
             elif each.kind == Kind.PUBLISHED:
                 self.published[each.channel, incarnation_id].append(each.at_ns)
@@ -132,9 +127,6 @@ class Books:
         if each.kind != Kind.CALLED:
             call[1] += 1
             (self.answered if each.kind == Kind.ANSWERED else self.failed).append((call[0], each.at_ns))
-
-    def _publisher(self, channel: int) -> str:
-        return [*self._plan.flows, *self._plan.spare][channel].publisher
 
     def silences(
         self, channel: int, reader: str, begin_ns: int, end_ns: int, must: Timeline, above_s: float
@@ -223,15 +215,15 @@ class Books:
         lost = (len(self.published[channel, source]) - last for source, last in known.items() if source not in own)
         return sum(max(each, 0) for each in lost)
 
-    def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
+    def miscalled(self, until_ns: int, is_last_life: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without a result, or with more than one.
 
-        ``until_ns``: calls that began later may still be in progress. ``is_over``: whether an incarnation of a member
-        ended before its calls did.
+        ``until_ns``: calls that began later may still be in progress. ``is_last_life``: as in ``incomplete``; the calls
+        of an earlier incarnation ended with it.
         """
         found = []
         for (channel, client, incarnation_id, number), (since_ns, ends) in self._calls.items():
-            if ends > 1 or (not ends and since_ns < until_ns and not is_over(client, incarnation_id)):
+            if ends > 1 or (not ends and since_ns < until_ns and is_last_life(client, incarnation_id)):
                 found.append(f"call {number} of {client} on channel {channel}: {ends} answers")
         return found
 

@@ -10,7 +10,9 @@ import json
 import signal
 import struct
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -20,7 +22,7 @@ from report import progress
 from faults.accounts import Books
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
-from faults.plan import Flow, Plan, Service
+from faults.plan import Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import Disk, StoreCluster
 from gdp.closing import ClosedOnExit
@@ -66,7 +68,7 @@ class Overlay(ClosedOnExit):
 
     Attributes:
         processes: what was started and not killed; it may have ended by itself.
-        incarnation_ids: how often each process was started.
+        lives: every process that was started, by name.
         at: the switch that each member, or switch that moves, is plugged into.
         spaces: the namespaces, in which links can be cut.
         books: what the members have recorded, as far as ``watch`` has read it.
@@ -94,7 +96,7 @@ class Overlay(ClosedOnExit):
         journal = {"journal": JOURNAL_MIB} if has_journals else {}
         self._more = {role: {**journal, **(more or {}).get(role, {})} for role in ("switch", "rib")}
         self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
-        self.incarnation_ids: dict[str, int] = {}
+        self.lives: defaultdict[str, list[LabProcess]] = defaultdict(list)
         self.processes: dict[str, LabProcess] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
@@ -133,46 +135,45 @@ class Overlay(ClosedOnExit):
 
     def begin(self, fault: Fault) -> None:
         """Make a fault happen. Raises ``FailedError``: a process that it restarts does not come up."""
-        kind, targets = fault.kind, fault.targets
-        if kind in FRAMES:
-            self.disturb(targets[0], targets[1], FRAMES[kind])
-        elif kind in KILLS:
-            self.kill(targets[0])
-        elif kind is FaultKind.FREEZE:
-            self.freeze(targets[0])
-        elif kind is FaultKind.CLOCK:
-            self.step_clock(targets[0], fault.amount)
-        elif kind is FaultKind.ROAM:
-            self.move(*targets)
-        elif kind is FaultKind.REVOKE:
-            self.revoke(targets[0])
-        elif kind is FaultKind.DISK_FULL and self.disk is not None:
-            self.disk.fill()
-            for rib in targets[1:]:
-                self.kill(rib)
-                self.restart(rib)
-        elif self.store is not None and targets[0] == STORE:
-            progress(f"           {self.store.take(fault)}")
+        self._changes(fault)[0]()
         for link in links_of(fault):
             self.spaces.cut(*link)
 
     def end(self, fault: Fault) -> None:
         """Undo a fault that can be undone; a killed process is ready then. Raises as ``begin``."""
-        kind, targets = fault.kind, fault.targets
-        if kind in FRAMES:
-            self.calm(*targets)
-        elif kind in KILLS:
-            self.restart(targets[0])
-        elif kind is FaultKind.FREEZE:
-            self.thaw(targets[0])
-        elif kind is FaultKind.CLOCK:
-            self.step_clock(targets[0], 0.0)
-        elif kind is FaultKind.DISK_FULL and self.disk is not None:
-            self.disk.free()
-        elif self.store is not None and targets[0] == STORE:
-            self.store.give_back(fault)
+        self._changes(fault)[1]()
         for link in links_of(fault):
             self.spaces.restore_link(*link)
+
+    def _changes(self, fault: Fault) -> tuple[Callable[[], object], Callable[[], object]]:
+        """Return what makes a fault and what undoes it, but for links that lose their carrier."""
+        kind, targets = fault.kind, fault.targets
+        if kind in FRAMES:
+            return partial(self.disturb, *targets, FRAMES[kind]), partial(self.calm, *targets)
+        if kind in KILLS:
+            return partial(self.kill, targets[0]), partial(self.restart, targets[0])
+        if kind is FaultKind.FREEZE:
+            return partial(self.freeze, targets[0]), partial(self.thaw, targets[0])
+        if kind is FaultKind.CLOCK:
+            step = self._clocks[targets[0]].step
+            return partial(step, fault.amount), partial(step, 0.0)
+        if kind is FaultKind.ROAM:
+            return partial(self.move, *targets), _nothing
+        if kind is FaultKind.REVOKE:
+            return partial(self.revoke, targets[0]), _nothing
+        if kind is FaultKind.DISK_FULL and self.disk is not None:
+            return partial(self._fill, self.disk, targets[1:]), self.disk.free
+        if self.store is not None and targets[0] == STORE:
+            store = self.store
+            return lambda: progress(f"           {store.take(fault)}"), partial(store.give_back, fault)
+        return _nothing, _nothing
+
+    def _fill(self, disk: Disk, ribs: Sequence[str]) -> None:
+        """Fill the disk, and start RIBs again while it is full."""
+        disk.fill()
+        for rib in ribs:
+            self.kill(rib)
+            self.restart(rib)
 
     # processes
 
@@ -188,7 +189,7 @@ class Overlay(ClosedOnExit):
     def start(self, who: str) -> None:
         """Start a process, also one that was killed, with a new incarnation; does not wait for it."""
         role, _, node = who.partition(" ")
-        incarnation_id = self.incarnation_ids[who] = self.incarnation_ids.get(who, 0) + 1
+        incarnation_id = len(self.lives[who]) + 1
         if role == "switch":
             argv = ["gdp.cli.switch", "--json", "--config", str(self._switch_file(node))]
         elif role == "rib":
@@ -198,6 +199,7 @@ class Overlay(ClosedOnExit):
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self.processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
+        self.lives[who].append(self.processes[who])
 
     def restart(self, *names: str) -> None:
         """Start processes, and read records until each is ready: it joins the network then."""
@@ -226,13 +228,9 @@ class Overlay(ClosedOnExit):
             self._frozen.discard(who)
             self.processes[who].send(signal.SIGCONT)
 
-    def step_clock(self, who: str, seconds: float) -> None:
-        """Set a process's wall clock off the machine's by so many seconds."""
-        self._clocks[who].step(seconds)
-
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
         """Yield, by incarnation, what a member recorded since the last call."""
-        for incarnation_id in range(1, self.incarnation_ids.get(f"member {member}", 0) + 1):
+        for incarnation_id, _ in enumerate(self.lives[f"member {member}"], 1):
             if (member, incarnation_id) not in self._records:
                 self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
             yield incarnation_id, self._records[member, incarnation_id].read()
@@ -245,7 +243,7 @@ class Overlay(ClosedOnExit):
         end_s = time.monotonic() + seconds
         while True:
             for who in self.died() if is_strict else ():
-                raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
+                raise self.processes[who].failed("ended by itself")
             for member in self.plan.members:
                 for incarnation_id, records in self.read(member):
                     self.books.take(member, incarnation_id, records)
@@ -255,21 +253,13 @@ class Overlay(ClosedOnExit):
                 return
             time.sleep(min(LOOK_S, left_s))
 
-    def log_tail(self, who: str, lines: int = 15) -> str:
-        """Return the end of a process's log, of its latest incarnation."""
-        texts = [text for _, text in self.logs(who)]
-        return "\n".join(texts[-1].splitlines()[-lines:]) if texts else ""
-
     def keeps_snapshot(self, node: str) -> bool:
         """Return whether the RIB at a switch keeps a snapshot on the disk."""
         return self.disk is not None and node not in self._in_store
 
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
-        for incarnation_id in range(1, self.incarnation_ids.get(who, 0) + 1):
-            role, _, node = who.partition(" ")
-            path = self.directory / f"{role}-{incarnation_id}-{node}.log"
-            yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
+        yield from ((number, process.logged) for number, process in enumerate(self.lives[who], 1))
 
     def save_journals(self, folder: Path) -> None:
         """Write the incident of each switch and RIB that runs; not sealed, because the keys of a run end with it."""
@@ -357,39 +347,29 @@ class Overlay(ClosedOnExit):
         return [self._credentials.name(Role.RIB, at).to_text() for at in switches]
 
     def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
-        """Return the settings of a member process: its identity, and its flows and services."""
-        parts = ("publish", "read", "serve", "call", "spare")
-        settings: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
-        for channel, what in self.plan.channels(member):
-            if isinstance(what, Service):
-                part = {"channel": channel, "name": what.name, "hz": what.hz, "timeout_s": what.timeout_s}
-                settings["serve" if member in what.servers else "call"].append(part)
-            else:
-                settings["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
-        for channel, flow in self.plan.spares(member):
-            settings["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
+        """Return the settings of a member process: its identity, and its flows and services.
+
+        The token of a channel begins each of its messages, and no other channel's.
+        """
+        run = struct.pack("!I", int(self._run.id, 16))
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
             "records": str(self._record_file(member, incarnation_id)),
+            "member": member,
             "index": self.plan.members.index(member),
             "incarnation_id": incarnation_id,
-            "tokens": {channel: self._token(channel).hex() for channel, _ in self._parts(member)},
-            **settings,
+            "channels": [
+                {**asdict(what), "channel": channel, "token": (run + struct.pack("!I", channel)).hex()}
+                for channel, what in self.plan.channels(member)
+            ],
         }
 
     def _record_file(self, member: str, incarnation_id: int) -> Path:
         return self.directory / f"{member}-{incarnation_id}.records"
 
-    def _parts(self, member: str) -> list[tuple[int, Flow | Service]]:
-        return [*self.plan.channels(member), *self.plan.spares(member)]
-
-    def _token(self, channel: int) -> bytes:
-        """Return the prefix of every message of a channel, which no other channel has."""
-        return struct.pack("!I", int(self._run.id, 16)) + struct.pack("!I", channel)
-
     def _admit(self, member: str) -> None:
         """Give a member its delegations, and write its configuration."""
-        for _, what in self._parts(member):
+        for _, what in self.plan.channels(member):
             if isinstance(what, Service):
                 right = Right.SERVE if member in what.servers else Right.CALL
                 metadata = Metadata({"kind": "service", "name": what.name})
@@ -403,5 +383,5 @@ class Overlay(ClosedOnExit):
         )
 
 
-def _flow_part(channel: int, flow: Flow) -> dict[str, object]:
-    return {"channel": channel, "name": flow.topic, "hz": flow.hz, "reliable": flow.reliable, "size": flow.size}
+def _nothing() -> None:
+    """Neither make nor undo anything."""

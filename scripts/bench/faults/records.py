@@ -25,7 +25,6 @@ class Kind(IntEnum):
     CALLED = 5  # number: of the request
     ANSWERED = 6
     FAILED = 7
-    READERS = 8  # number: how many readers the publisher counts now
 
 
 class Record(NamedTuple):
