@@ -41,28 +41,32 @@ PATIENCE_S: Final = 40.0  # longer than a lease
 PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
+PUBLISHED, LOST, REPORTED, DOUBLED, NEVER = "published", "lost", "reported", "doubled", "no return"
 
 
 @dataclass(slots=True)
 class Measured:
-    """Result of a row: seconds, one figure an event.
+    """Result of a row.
 
     Attributes:
-        silence_s: from the event on.
-        return_s: the same after the event is undone.
-        new_name_s: until a name that is new after the event was read.
-        reported_lost: losses of the steady flow that R got a report of.
-        never: events after which the flow did not come back in time; their silence is at least the patience.
+        silence_ms: one an event, from the event on.
+        return_ms: the same after the event is undone.
+        new_name_ms: until a name that is new after the event was read.
+        counts: messages of the steady flow by their fate. ``no return``: events after which the flow did not come back
+            in time; their silence is at least the patience.
     """
 
-    silence_s: list[float] = field(default_factory=list)
-    return_s: list[float] = field(default_factory=list)
-    new_name_s: list[float] = field(default_factory=list)
-    published: int = 0
-    lost: int = 0
-    reported_lost: int = 0
-    doubled: int = 0
-    never: int = 0
+    silence_ms: list[float] = field(default_factory=list)
+    return_ms: list[float] = field(default_factory=list)
+    new_name_ms: list[float] = field(default_factory=list)
+    counts: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys((PUBLISHED, LOST, REPORTED, DOUBLED, NEVER), 0)
+    )
+
+    @property
+    def failed(self) -> int:
+        """Return how often the flow lost or doubled a message, or did not come back."""
+        return self.counts[LOST] + self.counts[DOUBLED] + self.counts[NEVER]
 
 
 class Flowing:
@@ -84,11 +88,9 @@ class Flowing:
     def await_steady(self, since_ns: int, patience_s: float = PATIENCE_S) -> bool:
         """Return whether the flow became steady in time."""
         end_s = time.monotonic() + patience_s
-        while time.monotonic() < end_s:
+        while not (is_steady := self.is_steady(since_ns)) and time.monotonic() < end_s:
             self._overlay.watch(LOOK_S, is_strict=True)
-            if self.is_steady(since_ns):
-                return True
-        return False
+        return is_steady
 
     def silence_s(self, since_ns: int) -> float:
         """Return the longest time between consecutive arrivals, the last before a moment included; up to now."""
@@ -119,11 +121,11 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         for at in range(rounds):
             _once(overlay, flow, row, at, found, options)
         books = overlay.books
-        found.published = len(books.published[0, 1])
+        count = len(books.published[0, 1])
         overlay.watch(LAST_S, is_strict=True)
         account = books.accounts[0, "R", 1, 1]
-        found.lost, found.doubled = account.missing(found.published), account.doubled
-        found.reported_lost = books.reported_losses[0, "R", 1]
+        found.counts |= {PUBLISHED: count, LOST: account.missing(count), DOUBLED: account.doubled}
+        found.counts[REPORTED] = books.reported_losses[0, "R", 1]
     return found
 
 
@@ -133,10 +135,10 @@ def _journals_kept(overlay: Overlay, row: Row, found: Measured, folder: Path | N
     try:
         yield
     except GdpError:
-        found.never += 1
+        found.counts[NEVER] += 1
         raise
     finally:
-        if folder is not None and (found.lost or found.never):
+        if folder is not None and found.failed:
             overlay.save_journals(folder / row.what.replace(" ", "-"))
 
 
@@ -145,54 +147,49 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, o
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
-        found.new_name_s.append(_new_name_s(overlay, at))
+        found.new_name_ms.append(1e3 * _new_name_s(overlay, at))
     if row.holds:
         overlay.watch(options.dead_s, is_strict=True)
     patience_s = 0.1 if row.holds and options.dead_s >= PATIENCE_S and not flow.is_steady(since_ns) else PATIENCE_S
-    found.never += not flow.await_steady(since_ns, patience_s)
-    found.silence_s.append(flow.silence_s(since_ns))
-    progress(f"  {at + 1}: {found.silence_s[-1] * 1e3:.1f} ms")
+    found.counts[NEVER] += not flow.await_steady(since_ns, patience_s)
+    found.silence_ms.append(1e3 * flow.silence_s(since_ns))
+    progress(f"  {at + 1}: {found.silence_ms[-1]:.1f} ms")
     if row.undo is not None:
         since_ns = time.monotonic_ns()
         row.undo(overlay, at)
-        found.never += not flow.await_steady(max(since_ns, time.monotonic_ns()))
-        found.return_s.append(flow.silence_s(since_ns))
+        found.counts[NEVER] += not flow.await_steady(time.monotonic_ns())
+        found.return_ms.append(1e3 * flow.silence_s(since_ns))
         overlay.watch(options.settle_s, is_strict=True)
 
 
 def _new_name_s(overlay: Overlay, at: int) -> float:
     """Make P publish, and R read, an unknown name; return the seconds until its first message."""
-    arrivals_ns = overlay.books.arrivals_ns[1 + at, "R"]
-    begun_ns = time.monotonic_ns()
+    arrivals_ns, begun_ns = overlay.books.arrivals_ns[1 + at, "R"], time.monotonic_ns()
     for who in ("member P", "member R"):
         overlay.processes[who].send(signal.SIGUSR1)
-    end_s = time.monotonic() + PATIENCE_S
-    while not arrivals_ns and time.monotonic() < end_s:
+    while not arrivals_ns and time.monotonic_ns() < begun_ns + PATIENCE_S * 1e9:
         overlay.watch(LOOK_S, is_strict=True)
     return ((arrivals_ns or [time.monotonic_ns()])[0] - begun_ns) / 1e9
 
 
 def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
     """Add the figures of a row; return its targets."""
-    asked = [(row.what, found.silence_s, row.target_s)]
-    if found.new_name_s:
-        asked.append((f"{row.what}: until a new name is read", found.new_name_s, row.new_name_s))
+    asked = [(row.what, found.silence_ms, row.target_s)]
+    if found.new_name_ms:
+        asked.append((f"{row.what}: until a new name is read", found.new_name_ms, row.new_name_s))
     targets = []
-    for who, seconds, target_s in asked:
-        for each in seconds:
-            over.add(who, case, SILENCE, 1e3 * each)
-        over.add(who, case, P99, 1e3 * percentile(seconds, 0.99))
+    for who, times_ms, target_s in asked:
+        for each in times_ms:
+            over.add(who, case, SILENCE, each)
+        over.add(who, case, P99, percentile(times_ms, 0.99))
         # A silence of nothing is compared with the row ``nothing``.
         target_ms = 1e3 * target_s if target_s else None
         targets.append(over.target(f"{who}: {P99}", who, case, P99, target_ms, at_most=True))
-    for each in found.return_s:
-        over.add(row.what, case, RETURN, 1e3 * each)
-    counts = {"published": found.published, "lost": found.lost, "reported": found.reported_lost}
-    counts |= {"doubled": found.doubled, "no return": found.never}
-    for column, count in counts.items():
+    for each in found.return_ms:
+        over.add(row.what, case, RETURN, each)
+    for column, count in found.counts.items():
         over.add(row.what, case, column, count)
-    faults = found.lost + found.doubled + found.never
-    return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([faults]))]
+    return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([found.failed]))]
 
 
 def measure(options: Options) -> Outcome:
