@@ -15,7 +15,6 @@ four read, who wait for the slowest or have a pace of their own.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -28,7 +27,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link.conditions import FRAME_BYTES, Conditions
 from thin_link.line import open_line
 from thin_link.score import AGE_P50, AGE_P99
-from thin_link.systems import start_role
+from thin_link.systems import run_window, start_role
 from thin_link.traffic import CAMERA_BYTES, OWN_PACE, TOGETHER, streams, wire_bytes
 
 from gdp.host.run_registry import Run
@@ -48,7 +47,6 @@ _SHARE: Final = 0.9
 _OF_ALONE: Final = 0.95
 _AGE_MS: Final = 300.0
 _SETTLE_S: Final = 6.0
-_DRAIN_S: Final = 2.5
 _READY_S: Final = 45.0
 
 
@@ -89,25 +87,17 @@ def exchange(lab: Lab, readers: Sequence[str], pace: str, options: Options, over
         lines = [stack.enter_context(open_line(lab, links[each], line_of(each), ends[each])) for each in readers]
         nodes = stack.enter_context(BenchNodes(lab, (HUB, EDGE, *map(switch_of, readers)), plane="kernel"))
         rights = {each: {Right.READ: [images.name]} for each in readers} | {ROBOT: {Right.PUBLISH: [images.name]}}
-        started = {}
+        started = []
         for each, granted in rights.items():
             own = {"config": str(nodes.admit_member(each, granted)), "readers": len(readers)}
             settings = {"system": "gdp", "camera": pace, "own": own}
             role = "robot" if each == ROBOT else "cloud"
-            started[each] = stack.enter_context(start_role(lab, each, role, settings, has_orders=True))
-        for end in started.values():
+            started.append(stack.enter_context(start_role(lab, each, role, settings, has_orders=True)))
+        for end in started:
             end.read(_READY_S)
-        for line in lines:
-            line.rewind()
-        start_ns = time.monotonic_ns() + 50_000_000
-        begin_ns = start_ns + round(_SETTLE_S * 1e9)
-        end_ns = begin_ns + round(options.seconds * 1e9)
-        for end in started.values():
-            end.tell(start_ns=start_ns, begin_ns=begin_ns, end_ns=end_ns, drained_ns=end_ns + round(_DRAIN_S * 1e9))
-        time.sleep((end_ns - time.monotonic_ns()) / 1e9 + _DRAIN_S)
-        for each in readers:
-            said = started[each].read(_READY_S)["streams"][images.name]
-            for column, figure in figures_of(links[each], said, options.seconds).items():
+        _, said = run_window(lines, started, options.seconds, _SETTLE_S)
+        for each, reported in zip(readers, said, strict=False):
+            for column, figure in figures_of(links[each], reported["streams"][images.name], options.seconds).items():
                 over.add(pace if len(readers) > 1 else ALONE, each, column, figure)
 
 

@@ -19,7 +19,6 @@ back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -27,13 +26,14 @@ from pathlib import Path
 from typing import Final
 
 from machine import DATA, RefusedError
-from report import Rounds, Target, progress
+from report import Rounds, Target
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
+from thin_link.exchange import Tally
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
-from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, Report, link_figures, merged, stream_figures, whole_share
-from thin_link.systems import SYSTEMS, System, start_role
+from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, link_figures, merged, stream_figures, whole_share
+from thin_link.systems import SYSTEMS, System, run_window, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
 from gdp.errors import LocalError
@@ -51,7 +51,6 @@ GRID: Final = (  # rate, round trip in ms, loss, FIFO
 RECORDED: Final = ("Verizon-LTE-short", 60.0, "0", "second")
 RTTS_MS: Final = (10.0, 60.0, 200.0)
 WARM_UP_S: Final = 3.0
-DRAIN_S: Final = 2.5
 READY_S: Final = 30.0
 RAW_CAMERA_BITS_S: Final = 50e6  # from this rate on, the camera is not compressed
 _FIGURES: Final = {"cmd_vel": 15.0, "tf": 15.0}  # asked: age p99 over idle, ms
@@ -96,7 +95,7 @@ def links_of(options: Options) -> list[Conditions]:
 
 def exchange(
     lab: Lab, link: Conditions, system: System | None, options: Options, *, with_tcp: bool
-) -> tuple[Used, Mapping[str, Report]]:
+) -> tuple[Used, Mapping[str, Tally]]:
     """Run the traffic of a system once (None: no system), with or without the TCP flow; return use and reports.
 
     Raises ``FailedError``: a process did not come up, or ended.
@@ -108,24 +107,8 @@ def exchange(
         if with_tcp:
             stack.enter_context(start_role(lab, CLOUD, "tcp-read", {"address": ADDRESSES[CLOUD]})).read(READY_S)
             stack.enter_context(start_role(lab, ROBOT, "tcp-send", {"address": ADDRESSES[CLOUD]})).read(READY_S)
-        line.rewind()
-        start_ns = time.monotonic_ns() + 50_000_000
-        begin_ns = start_ns + round(WARM_UP_S * 1e9)
-        end_ns = begin_ns + round(options.seconds * 1e9)
-        for end in ends:
-            end.tell(start_ns=start_ns, begin_ns=begin_ns, end_ns=end_ns, drained_ns=end_ns + round(DRAIN_S * 1e9))
-        time.sleep((begin_ns - time.monotonic_ns()) / 1e9)
-        line.begin()
-        time.sleep((end_ns - time.monotonic_ns()) / 1e9)
-        used = line.end()
-        said = [end.read(READY_S) for end in ends]
-    if not said:
-        return used, {}
-    for each in said:
-        if each["refusals"]:
-            progress(f"refused: {each['refusals']}")
-    robot, cloud = (each["streams"] for each in said)
-    return used, merged(streams(camera), robot, cloud)
+        (used,), said = run_window([line], ends, options.seconds, WARM_UP_S)
+    return used, merged(streams(camera), *(each["streams"] for each in said)) if said else {}
 
 
 def measure_system(lab: Lab, link: Conditions, system: System, options: Options, over: Rounds) -> dict[str, float]:

@@ -19,9 +19,9 @@ from report import Rounds
 from thin_link import score
 from thin_link.channel import Channel, ConstantRate, Loss, TraceRate
 from thin_link.conditions import Conditions, load_trace
-from thin_link.exchange import Exchange, Window
+from thin_link.exchange import Exchange, Tally, Window
 from thin_link.line import Flow, Used
-from thin_link.score import Report, idle_ms, link_figures, merged, stream_figures, whole_share
+from thin_link.score import idle_ms, link_figures, merged, stream_figures, whole_share
 from thin_link.traffic import Stream, carried_s, make_message, open_message, streams, wire_bytes
 
 from gdp.errors import LocalError
@@ -84,9 +84,9 @@ def test_the_highest_queue_of_each_tenth_of_a_second_is_kept_until_it_is_taken()
     link = channel()
     for at in (0, 0, 0, 150 * MS):
         link.offer(at, FRAME)
-    assert link.take_depths() == [3 * FRAME, FRAME]
+    assert link.take_counters().depth_bytes == [3 * FRAME, FRAME]
     link.offer(160 * MS, FRAME)
-    assert link.take_depths() == [FRAME]
+    assert link.take_counters().depth_bytes == [FRAME]
 
 
 @pytest.mark.parametrize(("share", "burst"), [(0.01, 1.0), (0.05, 1.0), (0.02, 8.0)])
@@ -216,11 +216,11 @@ def test_bulk_streams_share_what_is_left_max_min_fair() -> None:
     assert (wide["lidar"], wide["camera"]) == pytest.approx((10, 30))
 
 
-def reports(camera_ages_s: list[float]) -> tuple[tuple[Stream, ...], dict[str, Report]]:
+def reports(camera_ages_s: list[float]) -> tuple[tuple[Stream, ...], dict[str, Tally]]:
     """Return the JPEG traffic, and a window of a second in which cmd_vel and these images arrived."""
     mix = streams("jpeg")
-    found = {each.name: Report(10, 10, []) for each in mix}
-    found["camera"] = Report(30, 30, camera_ages_s)
+    found = {each.name: Tally(10, 10) for each in mix}
+    found["camera"] = Tally(30, 30, camera_ages_s)
     return mix, found
 
 
@@ -322,9 +322,9 @@ def test_a_message_outside_the_window_or_not_whole_is_not_an_arrival() -> None:
         cloud.take(stream, make_message(1, due_ns, bytes(100)), 300)
     cloud.take(stream, b"short", 300)
     tally = cloud.tallies["tf"]
-    assert (list(tally.ages_s), tally.doubled, tally.broken, tally.whole) == ([1], 1, 1, 0)
+    assert (tally.ages_s, tally.doubled, tally.broken, tally.whole) == ([1.5e-7], 1, 1, 0)
     cloud.take(stream, make_message(2, 50, bytes(100)), 150)
-    assert (list(tally.ages_s), tally.whole) == ([1], 1)  # it arrived in the window, and was due before
+    assert (tally.ages_s, tally.whole) == ([1.5e-7], 1)  # it arrived in the window, and was due before
 
 
 def test_the_grid_of_the_command_line_is_every_combination_of_what_was_chosen() -> None:

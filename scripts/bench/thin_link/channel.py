@@ -140,7 +140,7 @@ class Loss:
 
 @dataclass(slots=True)
 class Counters:
-    """Frames and bytes of a channel so far.
+    """Frames and bytes of a channel since they were last taken.
 
     Attributes:
         offered, queue_drops: frames that arrived, and of those, that found the queue full.
@@ -208,11 +208,10 @@ class Channel:
         self.rate.rewind(now_ns)
         self._loss.rewind()
 
-    def take_depths(self) -> list[int]:
-        """Return the depths since the last call."""
-        depths, self.counters.depth_bytes = self.counters.depth_bytes, []
-        self._slot = -1
-        return depths
+    def take_counters(self) -> Counters:
+        """Return the counters, and begin new ones."""
+        taken, self.counters, self._slot = self.counters, Counters(), -1
+        return taken
 
     def _note_depth(self, now_ns: int) -> None:
         depths, slot = self.counters.depth_bytes, now_ns // _SLOT_NS

@@ -60,7 +60,6 @@ class Line:
 
     def __init__(self, process: LabProcess) -> None:
         self._process = process
-        self._before: Mapping[str, Any] = self._ask()
 
     def rewind(self) -> None:
         """Begin recording and losses again: every system meets the same link from here on."""
@@ -68,37 +67,32 @@ class Line:
 
     def begin(self) -> None:
         """Begin a span."""
-        self._before = self._ask()
+        self._ask()
 
     def end(self) -> Used:
         """Return the use of the link since ``begin``.
 
         Raises ``FailedError``: the relay lost a frame itself, so that the figures would mean nothing.
         """
-        before, after = self._before, self._ask()
+        said = self._ask()
         for what in ("oversized", "refused", "kernel_drops"):
-            if count := after[what] - (0 if what == "kernel_drops" else before[what]):
-                raise FailedError(f"the relay of the link had {count} frames {what}")
-        up, down = (_flow(before[side], after[side]) for side in ("up", "down"))
-        return Used(up, down, after["late_us"] / 1e3)
+            if said[what]:
+                raise FailedError(f"the relay of the link had {said[what]} frames {what}")
+        return Used(_flow(said["up"]), _flow(said["down"]), said["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
         return self._process.ask(report=True, **order)
 
 
-def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
-    def grown(key: str) -> float:
-        """Return by how much a counter has grown."""
-        return float(after[key] - before[key])
-
-    offered, capacity = max(grown("offered"), 1.0), max(grown("capacity_bytes"), 1.0)
+def _flow(said: Mapping[str, Any]) -> Flow:
+    offered, capacity = max(said["offered"], 1), max(said["capacity_bytes"], 1.0)
     return Flow(
-        share=grown("delivered_bytes") / capacity,
-        marked_share=grown("marked_bytes") / capacity,
-        queue_drop_share=grown("queue_drops") / offered,
-        loss_share=grown("losses") / offered,
+        share=said["delivered_bytes"] / capacity,
+        marked_share=said["marked_bytes"] / capacity,
+        queue_drop_share=said["queue_drops"] / offered,
+        loss_share=said["losses"] / offered,
         capacity_bytes=capacity,
-        depths_bytes=tuple(after["depth_bytes"]),
+        depths_bytes=tuple(said["depth_bytes"]),
     )
 
 

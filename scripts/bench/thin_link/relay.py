@@ -2,8 +2,8 @@
 
 I/O; two AF_PACKET sockets, whole batches a system call. Run as ``python -m thin_link.relay FILE``; the file holds JSON
 with ``devices`` (from the robot, to the cloud), ``up`` and ``down`` (``Direction``) and ``seed``.
-Each line on its standard input is answered by one line of JSON with all counters; one with the word ``rewind`` begins
-recordings and losses again. It ends with its input.
+Each line on its standard input is answered by one line of JSON with all counters since the last one; one with the word
+``rewind`` begins recordings and losses again. It ends with its input.
 
 It runs under SCHED_FIFO where that is allowed, so the processes that it connects do not delay it. Its devices must have
 no offloads: a channel counts frames, not segments of TCP.
@@ -76,6 +76,7 @@ class _Relay:
         self._oversized = 0
         self._late_ns = array("q")  # of each frame since the last report
         self._start_ns = time.monotonic_ns()
+        self._reported_ns = 0
 
     def run(self, control: int) -> None:
         """Relay until the control input ends."""
@@ -147,9 +148,8 @@ class _Relay:
         sides = {}
         for side, way in zip(("up", "down"), self._ways, strict=True):
             way.channel.backlog_bytes(now_ns)
-            depths = {"depth_bytes": way.channel.take_depths()}
-            capacity = {"capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns)}
-            sides[side] = asdict(way.channel.counters) | capacity | depths
+            capacity = way.channel.rate.capacity_bytes(self._reported_ns, now_ns)
+            sides[side] = asdict(way.channel.take_counters()) | {"capacity_bytes": capacity}
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
@@ -157,7 +157,8 @@ class _Relay:
             late_us=percentile(self._late_ns, 0.99) / 1e3 if self._late_ns else 0.0,
             **sides,
         )
-        self._late_ns = array("q")
+        self._late_ns, self._reported_ns = array("q"), now_ns
+        self._drops, self._oversized = [0] * len(self._drops), 0
 
 
 def _open(device: str) -> socket.socket:

@@ -7,12 +7,12 @@ were due; ``fraction`` says how many of all that were due those are.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from report import percentile
 
 from thin_link.conditions import Conditions
+from thin_link.exchange import Tally
 from thin_link.line import Used
 from thin_link.traffic import Stream, wire_bytes
 
@@ -36,30 +36,22 @@ RELAY_LATE: Final = "relay late p99, ms"
 LINK_COLUMNS: Final = (SHARE, WHOLE, QUEUE_P50, DROPS, SHARE_BOTH, TCP_BOTH, RELAY_LATE)
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """One stream in one window: what was due and sent at one end, and the ages of what arrived at the other."""
+def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, Any]) -> dict[str, Tally]:
+    """Return all streams of a window, as they left one end and arrived at the other.
 
-    due: int
-    sent: int
-    ages_s: Sequence[float]
-    whole: int = 0  # that arrived in the window, whenever they were due
-
-
-def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, Any]) -> dict[str, Report]:
-    """Return the reports of all streams; an answer is due for each request that was."""
-    found: dict[str, Report] = {}
+    An answer is due for each request that was.
+    """
+    found: dict[str, Tally] = {}
     for each in mix:
         source, sink = (robot, cloud) if each.direction == "up" else (cloud, robot)
-        sent, arrived = source[each.name], sink[each.name]
-        due = robot[each.answers]["due"] if each.answers else sent["due"]
-        found[each.name] = Report(due, sent["sent"], arrived["ages_s"], arrived["whole"])
+        due = robot[each.answers]["due"] if each.answers else source[each.name]["due"]
+        found[each.name] = Tally(**{**sink[each.name], "due": due, "sent": source[each.name]["sent"]})
     return found
 
 
 def stream_figures(
     stream: Stream,
-    report: Report,
+    report: Tally,
     conditions: Conditions,
     mix: Sequence[Stream],
     could_s: Mapping[str, float],
@@ -93,7 +85,7 @@ def idle_ms(stream: Stream, conditions: Conditions, mix: Sequence[Stream]) -> fl
 
 
 def whole_share(
-    mix: Sequence[Stream], reports: Mapping[str, Report], could_s: Mapping[str, float], span_s: float
+    mix: Sequence[Stream], reports: Mapping[str, Tally], could_s: Mapping[str, float], span_s: float
 ) -> float:
     """Return the bytes of whole bulk messages, of those that the link could carry in a window."""
     bulk = [each for each in mix if each.bulk]

@@ -6,19 +6,22 @@ I/O. Starts processes; a context manager ends them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final, TypeAlias
 
 from peers.certificates import make_certificates
+from report import progress
 
 from gdp.trust.right import Right
 from lab.machines import BenchNodes, Lab
-from lab.process import LabProcess
-from thin_link.line import ADDRESSES, CLOUD, ROBOT
+from lab.process import Event, LabProcess
+from thin_link.line import ADDRESSES, CLOUD, ROBOT, Line, Used
 from thin_link.traffic import streams
 
 _READY_S: Final = 45.0
+_DRAIN_S: Final = 2.5
 _MODULE: Final = "uplink_endpoint"
 _PORT: Final = 7_447
 
@@ -28,6 +31,31 @@ Ends = tuple[LabProcess, LabProcess]
 def start_role(lab: Lab, node: str, role: str, settings: Mapping[str, Any], *, has_orders: bool = False) -> LabProcess:
     """Start a role of the endpoint process."""
     return lab.start(node, role, ["-m", _MODULE, role, json.dumps(settings)], has_orders=has_orders)
+
+
+def run_window(
+    lines: Sequence[Line], ends: Sequence[LabProcess], seconds: float, warm_up_s: float = 3.0
+) -> tuple[list[Used], list[Event]]:
+    """Let ends exchange their traffic; return the use of each link in a window, and what each end says of it.
+
+    Raises ``FailedError``: a process ended, or a relay lost a frame itself.
+    """
+    for line in lines:
+        line.rewind()
+    start_ns = time.monotonic_ns() + 50_000_000
+    begin_ns = start_ns + round(warm_up_s * 1e9)
+    end_ns = begin_ns + round(seconds * 1e9)
+    for end in ends:
+        end.tell(start_ns=start_ns, begin_ns=begin_ns, end_ns=end_ns, drained_ns=end_ns + round(_DRAIN_S * 1e9))
+    time.sleep((begin_ns - time.monotonic_ns()) / 1e9)
+    for line in lines:
+        line.begin()
+    time.sleep((end_ns - time.monotonic_ns()) / 1e9)
+    used = [line.end() for line in lines]
+    said = [end.read(_READY_S) for end in ends]
+    if refusals := [each["refusals"] for each in said if each["refusals"]]:
+        progress(f"refused: {refusals}")
+    return used, said
 
 
 @contextmanager
