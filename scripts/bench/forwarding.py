@@ -173,5 +173,5 @@ def measure(options: Options) -> Outcome:
 if __name__ == "__main__":
     quick = {"rounds": 1, "seconds": 0.15, "pings": 200}
     parser = command_line(__doc__, rounds=7, seconds=0.3, quick=quick, has_record=True)
-    parser.add_argument("--pings", type=int, default=PINGS, help="in each round (default: %(default)s)")
+    parser.set_defaults(pings=PINGS)
     run_bench(parser, measure)

@@ -103,14 +103,6 @@ def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list
     return targets
 
 
-def positive(text: str) -> int:
-    """Return a whole number above 0. Raises ``ValueError``: it is not."""
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
-
-
 def measure(options: Options) -> Outcome:
     """Measure every baseline in every case, round by round."""
     names = options.only or list(BASELINES)
@@ -157,10 +149,8 @@ def is_whole(options: Options) -> bool:
 
 def main() -> None:
     """Run the bench, or a part of it."""
-    parser = command_line(__doc__, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
-    parser.add_argument("--rounds", type=positive, default=5)
-    text = "messages above 100 kB; of smaller ones four times that"
-    parser.add_argument("--count", type=positive, default=80, help=text)
+    parser = command_line(__doc__, rounds=5, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
+    parser.set_defaults(count=80)  # messages above 100 kB; of smaller ones four times that
     parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"

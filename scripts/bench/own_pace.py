@@ -143,5 +143,5 @@ def measure(options: Options) -> Outcome:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 5.0}, has_record=True)
-    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
+    parser.set_defaults(seed=1)  # of the losses
     run_bench(parser, measure)

@@ -16,11 +16,8 @@ from __future__ import annotations
 import random
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 from faults.overlay import LOOK_S, Overlay
@@ -107,11 +104,7 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
     refuses.
     """
     found = Measured()
-    with (
-        new_run() as run,
-        Overlay(run, row.plan(HZ), has_journals=options.journals is not None) as overlay,
-        _journals_kept(overlay, row, found, options.journals),
-    ):
+    with new_run() as run, Overlay(run, row.plan(HZ)) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -127,19 +120,6 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         found.counts |= {PUBLISHED: count, LOST: account.missing(count), DOUBLED: account.doubled}
         found.counts[REPORTED] = books.reported_losses[0, "R", 1]
     return found
-
-
-@contextmanager
-def _journals_kept(overlay: Overlay, row: Row, found: Measured, folder: Path | None) -> Iterator[None]:
-    """Save the journals of a row that has failed or lost something."""
-    try:
-        yield
-    except GdpError:
-        found.counts[NEVER] += 1
-        raise
-    finally:
-        if folder is not None and found.failed:
-            overlay.save_journals(folder / row.what.replace(" ", "-"))
 
 
 def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
@@ -194,8 +174,6 @@ def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
 
 def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
-    if options.quick:
-        options.dead_s, options.settle_s = 3.0, 0.0
     over, targets, notes = Rounds(), list[Target](), list[str]()
     case = f"a flow of {HZ:g} messages/s"
     for name in options.only or ROWS:
@@ -214,9 +192,9 @@ def measure(options: Options) -> Outcome:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
+    quick = {"rounds": 1, "dead_s": 3.0, "settle_s": 0.0}
+    parser = command_line(__doc__, rounds=ROUNDS, quick=quick, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
-    parser.add_argument("--journals", type=Path, help="keep journals, and save those of a row that loses or fails here")
     parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
-    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
+    parser.set_defaults(settle_s=SETTLE_S)
     run_bench(parser, measure)
