@@ -77,7 +77,7 @@ def count_of(size: int, options: Options) -> int:
 def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
     """Return the figures of one baseline in one case, by column."""
     with load_of(loaded=loaded):
-        found = baseline.measure(chain, size, count)
+        found = baseline(chain, size=size, count=count)
     times_s: Sequence[float] = found["rtt_s"]
     figures = {MEDIAN: 1e3 * percentile(times_s, 0.5), P99: 1e3 * percentile(times_s, 0.99)}
     return figures | {CPU[place]: 1e3 * float(cpu_s) for place, cpu_s in found["cpu_s"].items()}

@@ -103,7 +103,7 @@ def exchange(
     camera = camera_of(link, options.camera)
     with ExitStack() as stack:
         line = stack.enter_context(open_line(lab, link))
-        ends = stack.enter_context(system.run(lab, camera)) if system else ()
+        ends = stack.enter_context(system(lab, camera)) if system else ()
         if with_tcp:
             stack.enter_context(start_role(lab, CLOUD, "tcp-read", {"address": ADDRESSES[CLOUD]})).read(READY_S)
             stack.enter_context(start_role(lab, ROBOT, "tcp-send", {"address": ADDRESSES[CLOUD]})).read(READY_S)
@@ -111,16 +111,16 @@ def exchange(
     return used, merged(streams(camera), *(each["streams"] for each in said)) if said else {}
 
 
-def measure_system(lab: Lab, link: Conditions, system: System, options: Options, over: Rounds) -> dict[str, float]:
+def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds) -> dict[str, float]:
     """Return the figures of a system on a link, and add those of its streams."""
     mix = streams(camera_of(link, options.camera))
-    used, reports = exchange(lab, link, system, options, with_tcp=False)
+    used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
     could_s = carried_s(mix, 8 * used.up.capacity_bytes / options.seconds, link.up.loss)
     for each in mix:
         found = stream_figures(each, reports[each.name], link, mix, could_s, options.seconds)
         for column in STREAM_COLUMNS if each.bulk else STREAM_COLUMNS[:-1]:
-            over.add(system.name, case_of(link, each.name), column, found.get(column))
-    both = exchange(lab, link, system, options, with_tcp=True)[0] if options.tcp else None
+            over.add(name, case_of(link, each.name), column, found.get(column))
+    both = exchange(lab, link, SYSTEMS[name], options, with_tcp=True)[0] if options.tcp else None
     return {**link_figures(link, used, both), score.WHOLE: whole_share(mix, reports, could_s, options.seconds)}
 
 
@@ -139,7 +139,7 @@ def trials_of(lab: Lab, link: Conditions, options: Options, over: Rounds) -> lis
         trials.append(Trial(case, TCP, columns, lambda _: measure_tcp(lab, link, options)))
     for name in chosen:
         if name in SYSTEMS:
-            run = partial(measure_system, lab, link, SYSTEMS[name], options, over)
+            run = partial(measure_system, lab, link, name, options, over)
             trials.append(Trial(case, name, LINK_COLUMNS, lambda _, run=run: run()))  # type: ignore[misc]
     return trials
 

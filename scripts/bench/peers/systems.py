@@ -11,9 +11,10 @@ settings are the defaults, including its packet sizes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, Final, Literal, Protocol
+from functools import partial
+from typing import Any, Final, Literal
 
 from gdp.trust.right import Right
 from lab.machines import BenchNodes
@@ -33,71 +34,47 @@ _MEASURED_S: Final = 180.0
 Measured = Mapping[str, Any]  # what ``exchange`` returns
 Pids = Mapping[str, Sequence[int]]
 Settings = Mapping[str, object]
+Baseline = Callable[..., Measured]
+"""Starts the processes of a way to carry messages on a chain, and measures ``count`` of ``size`` bytes.
+
+Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
+"""
 
 
-class Baseline(Protocol):
-    """A way to carry messages."""
-
-    @property
-    def name(self) -> str:
-        """Return the name of its row."""
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start its processes, and measure messages of one size.
-
-        Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
-        """
-
-
-class GdpNet:
-    """Switches with the data plane ``kernel``. ``sign``: what authenticates messages."""
-
-    def __init__(self, sign: Literal["always", "session"]) -> None:
-        self.name = "gdp-kernel" if sign == "always" else "gdp-kernel-session"
-        self._sign = sign
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start switches, RIB, B, A; as ``Baseline.measure``."""
-        with ExitStack() as stack:
-            nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=self.name))
-            ends = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
-            between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
-            return _measured(stack, chain, _GDP, ends, {"between": between}, size=size, count=count)
-
-    def _admit(self, nodes: BenchNodes, node: str) -> object:
-        if self._sign == "session":
-            return nodes.admit_member(node, {Right.CALL if node == LEFT else Right.SERVE: [PING]})
-        written, read = (PING, PONG) if node == LEFT else (PONG, PING)
-        return nodes.admit_member(node, {Right.PUBLISH: [written], Right.READ: [read]})
+def measure_gdp(chain: Chain, *, sign: Literal["always", "session"], **load: int) -> Measured:
+    """Start switches with the data plane ``kernel``, RIB, B, A. ``sign``: what authenticates messages."""
+    rights: dict[str, dict[Right, list[str]]] = {
+        LEFT: {Right.PUBLISH: [PING], Right.READ: [PONG]},
+        RIGHT: {Right.PUBLISH: [PONG], Right.READ: [PING]},
+    }
+    if sign == "session":
+        rights = {LEFT: {Right.CALL: [PING]}, RIGHT: {Right.SERVE: [PING]}}
+    with ExitStack() as stack:
+        nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=f"gdp-{sign}"))
+        ends = [{"sign": sign, "config": str(nodes.admit_member(*each))} for each in rights.items()]
+        between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
+        return _measured(stack, chain, _GDP, ends, {"between": between}, **load)
 
 
-class ZenohNet:
-    """Zenoh with mutual TLS."""
+def measure_zenoh(chain: Chain, **load: int) -> Measured:
+    """Start Zenoh with mutual TLS: routers from the left, then B, then A."""
+    directory = chain.directory / "tls"
+    if not directory.exists():
+        hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
+        make_certificates(directory, hosts)
 
-    name = "zenoh-mtls"
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start routers from the left, then B, then A; as ``Baseline.measure``."""
-        with ExitStack() as stack:
-            routers = []
-            for before, node in zip(NODES, MIDDLE, strict=False):
-                upstream = before if before in MIDDLE else None
-                own = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], **self._own(chain, node, upstream)}
-                routers.append(stack.enter_context(_start(chain, node, _ZENOH, "router", {"own": own})))
-                routers[-1].read(_READY_S)
-            pairs = ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))
-            ends = [{"own": self._own(chain, node, router)} for node, router in pairs]
-            pids = {"between": [each.pid for each in routers]}
-            return _measured(stack, chain, _ZENOH, ends, pids, size=size, count=count)
-
-    def _own(self, chain: Chain, node: str, router: str | None) -> dict[str, object]:
-        """Return the router that a machine connects to, and its certificate; the first call makes all of them."""
-        directory = chain.directory / "tls"
-        if not directory.exists():
-            hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
-            make_certificates(directory, hosts)
+    def own(node: str, router: str | None) -> Settings:
         connect = [f"tls/{address(router, node)}:{_ZENOH_PORT}"] if router else []
         return {"connect": connect, "certificate": str(directory / node)}
+
+    with ExitStack() as stack:
+        routers = []
+        for before, node in zip(NODES, MIDDLE, strict=False):
+            listening = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], **own(node, before if before in MIDDLE else None)}
+            routers.append(stack.enter_context(_start(chain, node, _ZENOH, "router", {"own": listening})))
+            routers[-1].read(_READY_S)
+        ends = [{"own": own(node, router)} for node, router in ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))]
+        return _measured(stack, chain, _ZENOH, ends, {"between": [each.pid for each in routers]}, **load)
 
 
 def cyclone_xml(own: str, other: str) -> str:
@@ -110,21 +87,19 @@ def cyclone_xml(own: str, other: str) -> str:
     )
 
 
-class CycloneNet:
-    """Cyclone DDS, reliable."""
-
-    name = "cyclone"
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start B, then A; as ``Baseline.measure``."""
-        left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
-        ends = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
-        with ExitStack() as stack:
-            return _measured(stack, chain, _CYCLONE, ends, {}, size=size, count=count)
+def measure_cyclone(chain: Chain, **load: int) -> Measured:
+    """Start B and A of Cyclone DDS, reliable."""
+    left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
+    ends = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
+    with ExitStack() as stack:
+        return _measured(stack, chain, _CYCLONE, ends, {}, **load)
 
 
 BASELINES: Final[Mapping[str, Baseline]] = {
-    each.name: each for each in (GdpNet("always"), GdpNet("session"), ZenohNet(), CycloneNet())
+    "gdp-kernel": partial(measure_gdp, sign="always"),
+    "gdp-kernel-session": partial(measure_gdp, sign="session"),
+    "zenoh-mtls": measure_zenoh,
+    "cyclone": measure_cyclone,
 }
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import Any, Final, TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
+from typing import Any, Final
 
 from peers.certificates import make_certificates
 from report import progress
@@ -71,62 +72,40 @@ def _both(lab: Lab, system: str, camera: str, places: tuple[str, str], own: tupl
         yield made[1], made[0]
 
 
-class Gdp:
+@contextmanager
+def _gdp(lab: Lab, camera: str) -> Iterator[Ends]:
     """Switches at robot and cloud, the RIB at the cloud, and a session of the library at either."""
-
-    name = "gdp"
-
-    @contextmanager
-    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, robot first, matched and waiting for a window; raises FailedError if one did not come up."""
-        mix = streams(camera)
-        up = [each.name for each in mix if each.direction == "up"]
-        down = [each.name for each in mix if each.direction == "down"]
-        with ExitStack() as stack:
-            nodes = stack.enter_context(BenchNodes(lab, (ROBOT, CLOUD), plane="kernel"))
-            robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
-            cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
-            own = ({"config": str(robot)}, {"config": str(cloud)})
-            yield stack.enter_context(_both(lab, "gdp", camera, ("a", "b"), own))
-
-
-class Zenoh:
-    """Two peers over one link with mutual TLS, of TCP or of QUIC."""
-
-    def __init__(self, scheme: str, congestion: str) -> None:
-        self.name = f"zenoh-{scheme}-{congestion}"
-        self._scheme = scheme
-        self._congestion = congestion
-
-    @contextmanager
-    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
-        """Run both ends, as ``Gdp.run``."""
-        directory = lab.directory / "tls"
-        if not directory.exists():
-            make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
-        at = f"{self._scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
-        own = [
-            {
-                "certificate": str(directory / node),
-                "congestion": self._congestion,
-                "listen": [at] if node == CLOUD else [],
-                "connect": [at] if node == ROBOT else [],
-            }
-            for node in (ROBOT, CLOUD)
-        ]
-        with _both(lab, "zenoh", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
+    mix = streams(camera)
+    up = [each.name for each in mix if each.direction == "up"]
+    down = [each.name for each in mix if each.direction == "down"]
+    with BenchNodes(lab, (ROBOT, CLOUD), plane="kernel") as nodes:
+        robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
+        cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
+        with _both(lab, "gdp", camera, ("a", "b"), ({"config": str(robot)}, {"config": str(cloud)})) as ends:
             yield ends
 
 
-System: TypeAlias = "Gdp | Zenoh"
+@contextmanager
+def _zenoh(scheme: str, congestion: str, lab: Lab, camera: str) -> Iterator[Ends]:
+    """Two peers over one link with mutual TLS, of TCP or of QUIC."""
+    directory, at = lab.directory / "tls", f"{scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
+    if not directory.exists():
+        make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
+    own = [
+        {"certificate": str(directory / node), "congestion": congestion, "listen": [], "connect": [], key: [at]}
+        for node, key in ((ROBOT, "connect"), (CLOUD, "listen"))
+    ]
+    with _both(lab, "zenoh", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
+        yield ends
 
+
+System = Callable[[Lab, str], AbstractContextManager[Ends]]
+"""Runs both ends, robot first, matched and waiting for a window; raises FailedError if one did not come up."""
 SYSTEMS: Final[Mapping[str, System]] = {
-    each.name: each
-    for each in (
-        Gdp(),
-        Zenoh("tls", "drop"),
-        Zenoh("tls", "block"),
-        Zenoh("quic", "drop"),
-        Zenoh("quic", "block"),
-    )
+    "gdp": _gdp,
+    **{
+        f"zenoh-{scheme}-{what}": partial(_zenoh, scheme, what)
+        for scheme in ("tls", "quic")
+        for what in ("drop", "block")
+    },
 }
