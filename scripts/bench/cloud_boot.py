@@ -91,7 +91,7 @@ def measure(options: Options) -> Outcome:
             site.run("down", CLUSTER)
             over.add(BASELINE, DOWN, COLUMN, time.monotonic() - begun_s)
         targets = [over.target("token to serving replica, s", BASELINE, WHOLE, COLUMN, TARGET_S, at_most=True)]
-    settings = {"rounds": options.rounds, "commands on the robot's side": 0}
+    settings = {"commands on the robot's side": 0}
     return Outcome("cloud_boot", "From a token to a serving replica", over, targets, settings)
 
 

@@ -93,7 +93,6 @@ def measure(options: Options) -> Outcome:
         over.target("first command to first image, s", BASELINE, TIMES, WHOLE, 90, at_most=True),
     ]
     settings = {
-        "rounds": options.rounds,
         "delay of each uplink, ms": _DELAY_MS,
         "commands": [f"{each.machine}: {each.text}" for each in commands],
         "tutorial, SHA-256": hashlib.sha256(PAGE.read_bytes()).hexdigest(),

@@ -156,7 +156,6 @@ def measure(options: Options) -> Outcome:
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
     settings = {
-        "rounds": options.rounds,
         "seconds a try": options.seconds,
         "pings": pings,
         "loss below": LOSS_MAX,

@@ -53,7 +53,7 @@ def measure(options: Options) -> Outcome:
                 trial = Trial(link.name, name, (GOODPUT, SHARE, LATE), lambda _, work=work: work())  # type: ignore[misc]
                 recorder.attempt(trial, number, options.rounds)
     over: Rounds = recorder.rounds
-    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "TCP": "cubic"}
+    settings = {"seconds of each figure": options.seconds, "TCP": "cubic"}
     settings["trouble"] = recorder.notes or "none"
     targets = [
         over.ratio(f"{GOODPUT}: {OURS} / {other}", OURS, other, link.name, GOODPUT, TARGET if at == 0 else 1.0)

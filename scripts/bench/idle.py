@@ -113,7 +113,7 @@ def measure(options: Options) -> Outcome:
     targets = [
         over.target(f"{case}: {column}", WHO, case, column, limit, at_most=True) for case, column, limit in found
     ]
-    return Outcome("idle", "Commands and nodes at rest", over, targets, {"rounds": options.rounds})
+    return Outcome("idle", "Commands and nodes at rest", over, targets, {})
 
 
 if __name__ == "__main__":

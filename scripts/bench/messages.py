@@ -122,7 +122,6 @@ def measure(options: Options) -> Outcome:
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
     settings = {
-        "rounds": options.rounds,
         "messages a round": [count_of(size, options) for size in SIZES],
         "answer, B": ANSWER.size,
         "ends of gdp spin, us": SPIN_US,

@@ -131,7 +131,7 @@ def measure(options: Options) -> Outcome:
             targets.append(over.target(f"{each}, {OF_LINK}", OWN_PACE, each, OF_LINK, _SHARE))
         asked = _AGE_MS + wire_bytes(CAMERA_BYTES["jpeg"]) * 8e3 / link.up.bits_s
         targets.append(over.target(f"{each}, {AGE_P99}", OWN_PACE, each, AGE_P99, asked, at_most=True))
-    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "seed": options.seed}
+    settings = {"seconds of each figure": options.seconds, "seed": options.seed}
     return Outcome(
         "own_pace",
         "One encoder, readers behind links of 100, 5 and 1 Mbit/s and a lossy one",

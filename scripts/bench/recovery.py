@@ -121,7 +121,6 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over),
         {
-            "rounds": options.rounds,
             "machines": machines,
             "gateway": options.gateway,
             "requests a second": RATE,

@@ -231,7 +231,7 @@ def measure(options: Options) -> Outcome:
         for name in case.reductions:
             what = f"{case.name}: {name} / {PLAIN}, bytes"
             targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
-    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES or "each once"}
+    settings = {"messages of a figure": options.passes * MESSAGES or "each once"}
     title = "Bytes and CPU time of reduced messages"
     return Outcome("reduce", title, over, targets, settings)
 

@@ -220,7 +220,6 @@ def measure(options: Options) -> Outcome:
     over = recorder.rounds
     name, title = ("services", "Calls of a ROS 2 service") if options.calls else ("ros", "Real ROS 2 nodes")
     settings = {
-        "rounds": options.rounds,
         "seconds": options.seconds,
         "socket buffers, B": min(BUFFER_BYTES, int(_RMEM_MAX.read_text(encoding="ascii"))),
         "trouble": recorder.notes or "none",

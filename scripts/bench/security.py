@@ -70,7 +70,7 @@ def measure(options: Options) -> Outcome:
             over.target(f"{what}: {P99}", what, CASE, P99, TARGET_MS, at_most=True),
             over.target(f"{what}: {OPEN}", what, CASE, OPEN, 0.0, at_most=True),
         ]
-    settings = {"rounds": options.rounds, "messages a second and flow": HZ}
+    settings = {"messages a second and flow": HZ}
     return Outcome("security", "From a revocation to the last message, three tiers", over, targets, settings)
 
 

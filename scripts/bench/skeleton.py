@@ -206,7 +206,8 @@ def finish(
     outcome: Outcome, options: Options, state: MachineState, took_s: float, *, is_saved: bool, is_drawn: bool
 ) -> None:
     """Print an outcome, and write the files that the options select."""
-    settings: Settings = {**outcome.settings, "burst core": VARIANT, "took, s": round(took_s)}
+    rounds = {"rounds": options.rounds} if hasattr(options, "rounds") else {}
+    settings: Settings = {**rounds, **outcome.settings, "burst core": VARIANT, "took, s": round(took_s)}
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
     own = OUTPUT if _is_whole(options) else None
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")

@@ -186,7 +186,7 @@ def measure(options: Options) -> Outcome:
         except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")
-    settings = {"events a row": options.rounds, "trouble": notes or "none"}
+    settings = {"trouble": notes or "none"}
     title = "Silence when something fails or moves"
     return Outcome("survive", title, over, targets, settings, keeps_rows=True, has_failed=bool(notes))
 

@@ -196,7 +196,6 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over, links, options.camera) if not options.only or OURS in options.only else [],
         {
-            "rounds": options.rounds,
             "seconds of each figure": options.seconds,
             "warm-up, s": WARM_UP_S,
             "seed": options.seed,

@@ -24,6 +24,7 @@ from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Plan, Service
 from faults.records import Record, RecordReader
+from faults.schedule import KILLS
 from faults.store import Disk, StoreCluster
 from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Role
@@ -43,7 +44,6 @@ from lab.process import FailedError, LabProcess, end_processes, until
 
 READY_S: Final = 60.0
 LOOK_S: Final = 0.1
-KILLS: Final = frozenset({FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER})
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
     FaultKind.LOSS: FrameFaults(lost=0.05),
@@ -98,8 +98,7 @@ class Overlay(ClosedOnExit):
         self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self.lives: defaultdict[str, list[LabProcess]] = defaultdict(list)
         self.processes: dict[str, LabProcess] = {}
-        self._frozen: set[str] = set()
-        self._records: dict[tuple[str, int], RecordReader] = {}
+        self._records: defaultdict[str, list[RecordReader]] = defaultdict(list)
         self.spaces = self._lab.namespaces
         self.books = Books(plan)
         self._credentials = OverlayCredentials(plan.topology, run.directory)
@@ -119,7 +118,7 @@ class Overlay(ClosedOnExit):
         self._links.close()
         if self.store is not None:
             self.store.close()
-        for who in list(self._frozen):
+        for who in self.processes:
             self.thaw(who)
         end_processes(list(self.processes.values()))  # all at once
 
@@ -195,7 +194,9 @@ class Overlay(ClosedOnExit):
         elif role == "rib":
             argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
         else:
-            argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
+            records = self.directory / f"{node}-{incarnation_id}.records"
+            self._records[node].append(RecordReader(records))
+            argv = ["faults.member", json.dumps(self._settings(node, incarnation_id, records))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self.processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
@@ -210,7 +211,6 @@ class Overlay(ClosedOnExit):
 
     def kill(self, who: str) -> None:
         """Kill a process at once (SIGKILL)."""
-        self._frozen.discard(who)
         self.processes.pop(who).kill_group()
 
     def died(self) -> list[str]:
@@ -219,21 +219,16 @@ class Overlay(ClosedOnExit):
 
     def freeze(self, who: str) -> None:
         """Stop a process (SIGSTOP)."""
-        self._frozen.add(who)
         self.processes[who].send(signal.SIGSTOP)
 
     def thaw(self, who: str) -> None:
-        """Continue a frozen process; harmless when it is not frozen."""
-        if who in self._frozen and who in self.processes:
-            self._frozen.discard(who)
+        """Continue a frozen process; harmless when it is not frozen, or was killed."""
+        if who in self.processes:
             self.processes[who].send(signal.SIGCONT)
 
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
         """Yield, by incarnation, what a member recorded since the last call."""
-        for incarnation_id, _ in enumerate(self.lives[f"member {member}"], 1):
-            if (member, incarnation_id) not in self._records:
-                self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
-            yield incarnation_id, self._records[member, incarnation_id].read()
+        yield from ((number, records.read()) for number, records in enumerate(self._records[member], 1))
 
     def watch(self, seconds: float, *, is_strict: bool = False) -> None:
         """Read into the books what members record, for so long.
@@ -346,7 +341,7 @@ class Overlay(ClosedOnExit):
         switches = [at for at in self.plan.ribs if self.plan.topology.domain_of(at).label == label and at != but]
         return [self._credentials.name(Role.RIB, at).to_text() for at in switches]
 
-    def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
+    def _settings(self, member: str, incarnation_id: int, records: Path) -> dict[str, object]:
         """Return the settings of a member process: its identity, and its flows and services.
 
         The token of a channel begins each of its messages, and no other channel's.
@@ -354,7 +349,7 @@ class Overlay(ClosedOnExit):
         run = struct.pack("!I", int(self._run.id, 16))
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
-            "records": str(self._record_file(member, incarnation_id)),
+            "records": str(records),
             "member": member,
             "index": self.plan.members.index(member),
             "incarnation_id": incarnation_id,
@@ -363,9 +358,6 @@ class Overlay(ClosedOnExit):
                 for channel, what in self.plan.channels(member)
             ],
         }
-
-    def _record_file(self, member: str, incarnation_id: int) -> Path:
-        return self.directory / f"{member}-{incarnation_id}.records"
 
     def _admit(self, member: str) -> None:
         """Give a member its delegations, and write its configuration."""
