@@ -31,7 +31,7 @@ from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
 from plot import panels_of
 from report import Rounds, Target, percentile
-from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.runtime.busy_poll import SPIN_US
 from lab.process import new_run
@@ -146,19 +146,11 @@ def is_whole(options: Options) -> bool:
     return not (options.only or options.mtu) and options.load == "both"
 
 
-def main() -> None:
-    """Run the bench, or a part of it."""
+if __name__ == "__main__":
     parser = command_line(__doc__, rounds=5, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
-    parser.set_defaults(count=80)  # messages above 100 kB; of smaller ones four times that
+    parser.set_defaults(count=80, is_whole=is_whole)  # messages above 100 kB; of smaller ones four times that
     parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
     parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
-    options = parse(parser)
-    options.no_plot |= options.quick or not is_whole(options)
-    options.is_whole = is_whole
-    perform(options, measure)
-
-
-if __name__ == "__main__":
-    main()
+    run_bench(parser, measure)

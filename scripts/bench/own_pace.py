@@ -114,14 +114,14 @@ def measure(options: Options) -> Outcome:
     recorder = Recorder()
     over = recorder.rounds
 
-    def ran(readers: Sequence[str], pace: str) -> dict[str, float]:
+    def ran(readers: Sequence[str], pace: str, _: int) -> dict[str, float]:
         with new_run() as run:
             exchange(machines(run), readers, pace, options, over)
         return {}
 
     trials = [
-        Trial("fast", ALONE, (), lambda _: ran(["fast"], OWN_PACE)),
-        *(Trial("all readers", pace, (), lambda _, pace=pace: ran([*LINKS], pace)) for pace in (TOGETHER, OWN_PACE)),  # type: ignore[misc]
+        Trial("fast", ALONE, (), partial(ran, ["fast"], OWN_PACE)),
+        *(Trial("all readers", pace, (), partial(ran, [*LINKS], pace)) for pace in (TOGETHER, OWN_PACE)),
     ]
     recorder.interleave(trials, options.rounds)
     ratio = partial(over.ratio, one=OWN_PACE, other=ALONE, case="fast", column=IMAGES_S, asked=_OF_ALONE)

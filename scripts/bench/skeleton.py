@@ -172,7 +172,7 @@ def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options], Outc
 def perform(options: Options, measure: Callable[[Options], Outcome]) -> None:
     """Run a bench to its table, JSON record and picture."""
     is_saved = not getattr(options, "no_save", False)
-    is_drawn = is_saved and not getattr(options, "no_plot", True)
+    is_drawn = is_saved and _is_whole(options) and not getattr(options, "no_plot", True)
     if is_drawn:
         require_plot()
     state, begun_s = machine_state(), time.monotonic()

@@ -111,8 +111,11 @@ def exchange(
     return used, merged(streams(camera), *(each["streams"] for each in said)) if said else {}
 
 
-def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds) -> dict[str, float]:
+def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds, _: int) -> dict[str, float]:
     """Return the figures of a system on a link, and add those of its streams."""
+    if name == TCP:
+        used, _ = exchange(lab, link, None, options, with_tcp=True)
+        return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
     mix = streams(camera_of(link, options.camera))
     used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
     could_s = carried_s(mix, 8 * used.up.capacity_bytes / options.seconds, link.up.loss)
@@ -124,23 +127,14 @@ def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over
     return {**link_figures(link, used, both), score.WHOLE: whole_share(mix, reports, could_s, options.seconds)}
 
 
-def measure_tcp(lab: Lab, link: Conditions, options: Options) -> dict[str, float]:
-    """Return the share of the link that the TCP flow has alone."""
-    used, _ = exchange(lab, link, None, options, with_tcp=True)
-    return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
-
-
 def trials_of(lab: Lab, link: Conditions, options: Options, over: Rounds) -> list[Trial]:
     """Return the trials of one link: TCP alone, then every system."""
-    chosen = options.only or [TCP, *SYSTEMS]
-    case, trials = case_of(link, "link"), []
-    if TCP in chosen and options.tcp:
-        columns = (score.TCP_ALONE, score.RELAY_LATE)
-        trials.append(Trial(case, TCP, columns, lambda _: measure_tcp(lab, link, options)))
-    for name in chosen:
-        if name in SYSTEMS:
-            run = partial(measure_system, lab, link, name, options, over)
-            trials.append(Trial(case, name, LINK_COLUMNS, lambda _, run=run: run()))  # type: ignore[misc]
+    trials = []
+    for name in options.only or [TCP, *SYSTEMS]:
+        if options.tcp or name != TCP:
+            columns = (score.TCP_ALONE, score.RELAY_LATE) if name == TCP else LINK_COLUMNS
+            work = partial(measure_system, lab, link, name, options, over)
+            trials.append(Trial(case_of(link, "link"), name, columns, work))
     return trials
 
 

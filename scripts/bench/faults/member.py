@@ -16,11 +16,11 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from peers.jsonl import say
 
-from faults.records import Kind, RecordWriter
+from faults.records import Kind, Record
 from gdp.client.participant import Message
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -39,7 +39,7 @@ _LOOK_S: Final = 0.25  # pause between two checks for losses
 class Part:
     """What a member does on one channel: ``settings`` are a flow or service, with its token."""
 
-    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: RecordWriter) -> None:
+    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: BinaryIO) -> None:
         self.channel: int = settings["channel"]
         self.token = bytes.fromhex(settings["token"])
         self.index, self.incarnation_id = member
@@ -56,13 +56,13 @@ class Part:
     def note(self, kind: Kind, number: int, other: int = 0, incarnation_id: int | None = None) -> None:
         """Record something now."""
         incarnation_id = self.incarnation_id if incarnation_id is None else incarnation_id
-        self._out.add(kind, self.channel, incarnation_id, other, number, time.monotonic_ns())
+        self._out.write(Record(kind, self.channel, incarnation_id, other, number, time.monotonic_ns()).to_bytes())
 
 
 class Source(Part):
     """Publishes one topic at an even rate."""
 
-    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: RecordWriter) -> None:
+    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: BinaryIO) -> None:
         super().__init__(end, settings, member, out)
         self._publisher = end.advertise(settings["topic"], reliable=settings["reliable"])
         self._filler = bytes(max(settings["size"] - _HEAD.size, 0))
@@ -85,7 +85,7 @@ class Source(Part):
 class Reading(Part):
     """Messages received on one topic."""
 
-    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: RecordWriter) -> None:
+    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: BinaryIO) -> None:
         super().__init__(end, settings, member, out)
         self._subscriptions = end.member.subscriptions
         end.subscribe(settings["topic"])
@@ -114,7 +114,7 @@ class Reading(Part):
 class Caller(Part):
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: RecordWriter) -> None:
+    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: BinaryIO) -> None:
         super().__init__(end, settings, member, out)
         self._client = ClientCore(end.member, self.topic, settings["name"], start=random.getrandbits(62))
         self._timeout_s, self._every_s = float(settings["timeout_s"]), 1.0 / float(settings["hz"])
@@ -150,7 +150,7 @@ class Caller(Part):
 class Server(Part):
     """Server that echoes each request of its channel."""
 
-    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: RecordWriter) -> None:
+    def __init__(self, end: End, settings: dict[str, Any], member: tuple[int, int], out: BinaryIO) -> None:
         super().__init__(end, settings, member, out)
         self._core = ServerCore(end.member, self.topic, start=random.getrandbits(62), at_once=None)
 
@@ -176,15 +176,14 @@ def part_of(member: str, settings: dict[str, Any]) -> type[Part]:
     return Source if member == settings["publisher"] else Reading
 
 
-def main() -> None:
+def run(settings: dict[str, Any], out: BinaryIO) -> None:
     """Run as a member until ended."""
-    settings: dict[str, Any] = json.loads(sys.argv[1])
-    out, member = RecordWriter(Path(settings["records"])), settings["member"]
     end = End.from_config(Path(settings["config"]), 0.0)
     parts: dict[Name, Part] = {}
 
     def begin(each: dict[str, Any]) -> None:
-        part = part_of(member, each)(end, each, (settings["index"], settings["incarnation_id"]), out)
+        kind = part_of(settings["member"], each)
+        part = kind(end, each, (settings["index"], settings["incarnation_id"]), out)
         parts[part.topic.name] = part
 
     waiting = iter([each for each in settings["channels"] if each.get("waits")])
@@ -201,13 +200,14 @@ def main() -> None:
                 part.go_on(now_s)
             end.member.flush(now_s)
             out.flush()
-            end.runtime.step(min(now_s + _LOOK_S, *(part.due_s for part in parts.values())))
+            end.runtime.step(min([now_s + _LOOK_S, *(part.due_s for part in parts.values())]))
             now_s = time.monotonic()
             for message in end.member.poll_messages():
                 parts[message.topic].take(message, now_s)
-        out.flush()
         end.leave()
 
 
 if __name__ == "__main__":
-    main()
+    given: dict[str, Any] = json.loads(sys.argv[1])
+    with Path(given["records"]).open("ab") as records:
+        run(given, records)
