@@ -16,7 +16,7 @@ from __future__ import annotations
 import random
 import signal
 import time
-from dataclasses import dataclass, field
+from collections import Counter
 from itertools import pairwise
 from typing import Final
 
@@ -30,6 +30,7 @@ from lab.process import FailedError, new_run
 
 ROUNDS: Final = 30
 HZ: Final = 500.0
+CASE: Final = f"a flow of {HZ:g} messages/s"
 DEAD_S: Final = 80.0  # longer than three leases of 24 s
 SETTLE_S: Final = 11.0  # longer than a link that came and went is left out of routes
 STEADY_S: Final = 0.5  # a flow that had no gap above ``STEADY_GAP_S`` for so long is steady
@@ -39,31 +40,6 @@ PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
 PUBLISHED, LOST, REPORTED, DOUBLED, NEVER = "published", "lost", "reported", "doubled", "no return"
-
-
-@dataclass(slots=True)
-class Measured:
-    """Result of a row.
-
-    Attributes:
-        silence_ms: one an event, from the event on.
-        return_ms: the same after the event is undone.
-        new_name_ms: until a name that is new after the event was read.
-        counts: messages of the steady flow by their fate. ``no return``: events after which the flow did not come back
-            in time; their silence is at least the patience.
-    """
-
-    silence_ms: list[float] = field(default_factory=list)
-    return_ms: list[float] = field(default_factory=list)
-    new_name_ms: list[float] = field(default_factory=list)
-    counts: dict[str, int] = field(
-        default_factory=lambda: dict.fromkeys((PUBLISHED, LOST, REPORTED, DOUBLED, NEVER), 0)
-    )
-
-    @property
-    def failed(self) -> int:
-        """Return how often the flow lost or doubled a message, or did not come back."""
-        return self.counts[LOST] + self.counts[DOUBLED] + self.counts[NEVER]
 
 
 class Flowing:
@@ -97,13 +73,13 @@ class Flowing:
         return max((b - a for a, b in pairwise(marks)), default=0) / 1e9
 
 
-def measure_row(row: Row, rounds: int, options: Options) -> Measured:
-    """Make the event of a row happen so often.
+def measure_row(row: Row, rounds: int, options: Options) -> tuple[Rounds, list[Target]]:
+    """Make the event of a row happen so often; return its figures and targets.
 
     Raises ``FailedError``: the network did not come up, or a process ended by itself. Raises ``GdpError``: the kernel
     refuses.
     """
-    found = Measured()
+    found, counts = Rounds(), Counter[str]()
     with new_run() as run, Overlay(run, row.plan(HZ)) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
@@ -112,34 +88,48 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         # path computation waits longer in a network that has just started (RFC 8405)
         overlay.watch(options.settle_s, is_strict=True)
         for at in range(rounds):
-            _once(overlay, flow, row, at, found, options)
+            counts[NEVER] += _once(overlay, flow, row, at, found, options)
         books = overlay.books
-        count = len(books.published[0, 1])
+        counts[PUBLISHED] = len(books.published[0, 1])
         overlay.watch(LAST_S, is_strict=True)
         account = books.accounts[0, "R", 1, 1]
-        found.counts |= {PUBLISHED: count, LOST: account.missing(count), DOUBLED: account.doubled}
-        found.counts[REPORTED] = books.reported_losses[0, "R", 1]
-    return found
+        counts[LOST], counts[DOUBLED] = account.missing(counts[PUBLISHED]), account.doubled
+        counts[REPORTED] = books.reported_losses[0, "R", 1]
+    targets = []
+    for what, target_s in ((row.what, row.target_s), (row.new_name, row.new_name_s)):
+        if times_ms := [each for each in found.column(what, CASE, SILENCE) if each is not None]:
+            found.add(what, CASE, P99, percentile(times_ms, 0.99))
+            # A silence of nothing is compared with the row ``nothing``.
+            target_ms = 1e3 * target_s if target_s else None
+            targets.append(found.target(f"{what}: {P99}", what, CASE, P99, target_ms, at_most=True))
+    for column in (PUBLISHED, LOST, REPORTED, DOUBLED, NEVER):
+        found.add(row.what, CASE, column, counts[column])
+    failed = counts[LOST] + counts[DOUBLED] + counts[NEVER]
+    return found, [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([failed]))]
 
 
-def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
+def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Rounds, options: Options) -> int:
+    """Make the event happen once; return how often the flow did not come back, whose silence is that until then."""
     time.sleep(random.random() * PHASE_S)  # events hit any phase of every timer
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
-        found.new_name_ms.append(1e3 * _new_name_s(overlay, at))
+        found.add(row.new_name, CASE, SILENCE, 1e3 * _new_name_s(overlay, at))
     if row.holds:
         overlay.watch(options.dead_s, is_strict=True)
     patience_s = 0.1 if row.holds and options.dead_s >= PATIENCE_S and not flow.is_steady(since_ns) else PATIENCE_S
-    found.counts[NEVER] += not flow.await_steady(since_ns, patience_s)
-    found.silence_ms.append(1e3 * flow.silence_s(since_ns))
-    progress(f"  {at + 1}: {found.silence_ms[-1]:.1f} ms")
-    if row.undo is not None:
-        since_ns = time.monotonic_ns()
-        row.undo(overlay, at)
-        found.counts[NEVER] += not flow.await_steady(time.monotonic_ns())
-        found.return_ms.append(1e3 * flow.silence_s(since_ns))
-        overlay.watch(options.settle_s, is_strict=True)
+    never = not flow.await_steady(since_ns, patience_s)
+    silence_ms = 1e3 * flow.silence_s(since_ns)
+    found.add(row.what, CASE, SILENCE, silence_ms)
+    progress(f"  {at + 1}: {silence_ms:.1f} ms")
+    if row.undo is None:
+        return never
+    since_ns = time.monotonic_ns()
+    row.undo(overlay, at)
+    never += not flow.await_steady(time.monotonic_ns())
+    found.add(row.what, CASE, RETURN, 1e3 * flow.silence_s(since_ns))
+    overlay.watch(options.settle_s, is_strict=True)
+    return never
 
 
 def _new_name_s(overlay: Overlay, at: int) -> float:
@@ -152,37 +142,18 @@ def _new_name_s(overlay: Overlay, at: int) -> float:
     return ((arrivals_ns or [time.monotonic_ns()])[0] - begun_ns) / 1e9
 
 
-def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
-    """Add the figures of a row; return its targets."""
-    asked = [(row.what, found.silence_ms, row.target_s)]
-    if found.new_name_ms:
-        asked.append((f"{row.what}: until a new name is read", found.new_name_ms, row.new_name_s))
-    targets = []
-    for who, times_ms, target_s in asked:
-        for each in times_ms:
-            over.add(who, case, SILENCE, each)
-        over.add(who, case, P99, percentile(times_ms, 0.99))
-        # A silence of nothing is compared with the row ``nothing``.
-        target_ms = 1e3 * target_s if target_s else None
-        targets.append(over.target(f"{who}: {P99}", who, case, P99, target_ms, at_most=True))
-    for each in found.return_ms:
-        over.add(row.what, case, RETURN, each)
-    for column, count in found.counts.items():
-        over.add(row.what, case, column, count)
-    return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([found.failed]))]
-
-
 def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
     over, targets, notes = Rounds(), list[Target](), list[str]()
-    case = f"a flow of {HZ:g} messages/s"
     for name in options.only or ROWS:
         row = ROWS[name]
         rounds = min(options.rounds, NEW_TOPICS) if row.new_name_s is not None else options.rounds
         rounds = min(rounds, 3) if row.holds else rounds
         progress(f"{name}: {row.what}, {rounds} times")
         try:
-            targets += add(over, row, case, measure_row(row, rounds, options))
+            found, asked = measure_row(row, rounds, options)
+            over.values |= found.values
+            targets += asked
         except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")

@@ -53,6 +53,11 @@ class Row:
     new_name_s: float | None = None
     holds: bool = False
 
+    @property
+    def new_name(self) -> str:
+        """Return the label of the figures of a new name."""
+        return f"{self.what}: until a new name is read"
+
 
 def _flows(hz: float) -> tuple[Flow, ...]:
     return (Flow(TOPIC, "P", ("R",), hz=hz),)

@@ -69,7 +69,7 @@ def camera_of(link: Conditions, choice: str) -> str:
     """Return the camera on a link: the chosen one, or by its rate."""
     if choice != "auto":
         return choice
-    return "raw" if link.up.mean_bits_s >= RAW_CAMERA_BITS_S else "jpeg"
+    return "raw" if link.up.bits_s >= RAW_CAMERA_BITS_S else "jpeg"
 
 
 def links_of(options: Options) -> list[Conditions]:
@@ -155,7 +155,7 @@ def targets_of(over: Rounds, links: Sequence[Conditions], choice: str) -> list[T
             case = case_of(link, stream)
             targets.append(over.target(f"{case}, {score.OVER_IDLE}", OURS, case, score.OVER_IDLE, asked, at_most=True))
         case, camera = case_of(link, "camera"), camera_of(link, choice)
-        age_ms = _AGE_MS + wire_bytes(CAMERA_BYTES[camera]) * 8e3 / link.up.mean_bits_s
+        age_ms = _AGE_MS + wire_bytes(CAMERA_BYTES[camera]) * 8e3 / link.up.bits_s
         targets.append(over.target(f"{case}, {score.AGE_P99}", OURS, case, score.AGE_P99, age_ms, at_most=True))
         share = _SATURATED_SHARE if camera == "raw" else _FRESH_SHARE
         targets.append(over.target(f"{case}, {score.OF_LINK}", OURS, case, score.OF_LINK, share))

@@ -17,10 +17,10 @@ import uplink
 from machine import data_folder
 from report import Rounds
 from thin_link import score
-from thin_link.channel import Channel, ConstantRate, Loss, TraceRate
+from thin_link.channel import Channel, ConstantRate, Flow, Loss, TraceRate
 from thin_link.conditions import Conditions, load_trace
 from thin_link.exchange import Exchange, Tally, Window
-from thin_link.line import Flow, Used
+from thin_link.line import Used
 from thin_link.score import idle_ms, link_figures, merged, stream_figures, whole_share
 from thin_link.traffic import Stream, carried_s, make_message, open_message, streams, wire_bytes
 
@@ -84,9 +84,9 @@ def test_the_highest_queue_of_each_tenth_of_a_second_is_kept_until_it_is_taken()
     link = channel()
     for at in (0, 0, 0, 150 * MS):
         link.offer(at, FRAME)
-    assert link.take_counters().depth_bytes == [3 * FRAME, FRAME]
+    assert link.take_flow(150 * MS).depths_bytes == (3 * FRAME, FRAME)
     link.offer(160 * MS, FRAME)
-    assert link.take_counters().depth_bytes == [FRAME]
+    assert link.take_flow(160 * MS).depths_bytes == (FRAME,)
 
 
 @pytest.mark.parametrize(("share", "burst"), [(0.01, 1.0), (0.05, 1.0), (0.02, 8.0)])
@@ -163,8 +163,8 @@ def test_each_direction_of_a_recording_has_its_own_rate(tmp_path: Path) -> None:
     (tmp_path / "radio.up").write_text("10\n20\n", encoding="ascii")
     (tmp_path / "radio.down").write_text("1\n2\n", encoding="ascii")
     found = Conditions.of("radio", 60, "burst", "second", seed=1, traces=tmp_path)
-    assert found.up.mean_bits_s == pytest.approx(1.2e6)
-    assert found.down.mean_bits_s == pytest.approx(12e6)
+    assert found.up.bits_s == pytest.approx(1.2e6)
+    assert found.down.bits_s == pytest.approx(12e6)
     assert (found.up.loss, found.up.burst) == (0.02, 8.0)
 
 
@@ -173,10 +173,10 @@ def test_a_missing_recording_is_named_with_the_option_for_its_folder(tmp_path: P
         Conditions.of("radio", 60, "0", "bdp", seed=1, traces=tmp_path)
 
 
-@pytest.mark.parametrize(("loss", "fifo"), [("7", "bdp"), ("0", "deep")])
-def test_an_unknown_loss_or_fifo_is_refused(loss: str, fifo: str) -> None:
-    with pytest.raises(LocalError, match="loss is one of"):
-        Conditions.of("10", 60, loss, fifo, seed=1)
+def test_a_rate_that_is_none_is_refused() -> None:
+    for rate in ("0", "fast"):
+        with pytest.raises(LocalError, match="rate"):
+            Conditions.of(rate, 60, "0", "bdp", seed=1)
 
 
 def test_a_recording_of_something_else_is_refused(tmp_path: Path) -> None:

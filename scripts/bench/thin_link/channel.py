@@ -158,6 +158,25 @@ class Counters:
     depth_bytes: list[int] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """One direction of a link over a span.
+
+    Attributes:
+        share: bytes that were delivered, of those that the link could carry.
+        marked_share: the same, of the TCP flow alone.
+        queue_drop_share, loss_share: of the frames offered to the link.
+        depths_bytes: highest queue in each tenth of a second.
+    """
+
+    share: float
+    marked_share: float
+    queue_drop_share: float
+    loss_share: float
+    capacity_bytes: float
+    depths_bytes: tuple[int, ...]
+
+
 class Channel:
     """One direction of a link; moments of successive calls never decrease.
 
@@ -173,6 +192,7 @@ class Channel:
         self._waiting = deque[tuple[int, int, bool, bool]]()  # departure, bytes, lost, marked
         self._backlog = 0
         self._slot = -1
+        self._taken_ns = 0
 
     def offer(self, now_ns: int, size: int, *, is_marked: bool = False) -> int | None:
         """Return when a frame that arrived now is due at the far end; None where it is dropped or lost."""
@@ -208,10 +228,20 @@ class Channel:
         self.rate.rewind(now_ns)
         self._loss.rewind()
 
-    def take_counters(self) -> Counters:
-        """Return the counters, and begin new ones."""
-        taken, self.counters, self._slot = self.counters, Counters(), -1
-        return taken
+    def take_flow(self, now_ns: int) -> Flow:
+        """Return the flow since the last call, and begin new counters."""
+        self.backlog_bytes(now_ns)
+        taken, since_ns = self.counters, self._taken_ns
+        self.counters, self._slot, self._taken_ns = Counters(), -1, now_ns
+        offered, capacity = max(taken.offered, 1), max(self.rate.capacity_bytes(since_ns, now_ns), 1.0)
+        return Flow(
+            share=taken.delivered_bytes / capacity,
+            marked_share=taken.marked_bytes / capacity,
+            queue_drop_share=taken.queue_drops / offered,
+            loss_share=taken.losses / offered,
+            capacity_bytes=capacity,
+            depths_bytes=tuple(taken.depth_bytes),
+        )
 
     def _note_depth(self, now_ns: int) -> None:
         depths, slot = self.counters.depth_bytes, now_ns // _SLOT_NS

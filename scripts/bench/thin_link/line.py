@@ -6,7 +6,7 @@ I/O. Starts a process in the namespace between robot and cloud.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,6 +17,7 @@ from lab.machines import Lab
 from lab.namespaces import clear_offloads, mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
+from thin_link.channel import Flow
 from thin_link.conditions import FRAME_BYTES, Conditions
 
 ROBOT: Final = "s1"
@@ -25,25 +26,6 @@ LINE: Final = "line"
 ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
 _INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
 _READY_S: Final = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """One direction of a link over a span.
-
-    Attributes:
-        share: bytes that were delivered, of those that the link could carry.
-        marked_share: the same, of the TCP flow alone.
-        queue_drop_share, loss_share: of the frames offered to the link.
-        depths_bytes: highest queue in each tenth of a second.
-    """
-
-    share: float
-    marked_share: float
-    queue_drop_share: float
-    loss_share: float
-    capacity_bytes: float
-    depths_bytes: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,22 +60,10 @@ class Line:
         for what in ("oversized", "refused", "kernel_drops"):
             if said[what]:
                 raise FailedError(f"the relay of the link had {said[what]} frames {what}")
-        return Used(_flow(said["up"]), _flow(said["down"]), said["late_us"] / 1e3)
+        return Used(Flow(**said["up"]), Flow(**said["down"]), said["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
         return self._process.ask(report=True, **order)
-
-
-def _flow(said: Mapping[str, Any]) -> Flow:
-    offered, capacity = max(said["offered"], 1), max(said["capacity_bytes"], 1.0)
-    return Flow(
-        share=said["delivered_bytes"] / capacity,
-        marked_share=said["marked_bytes"] / capacity,
-        queue_drop_share=said["queue_drops"] / offered,
-        loss_share=said["losses"] / offered,
-        capacity_bytes=capacity,
-        depths_bytes=tuple(said["depth_bytes"]),
-    )
 
 
 def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:

@@ -76,7 +76,6 @@ class _Relay:
         self._oversized = 0
         self._late_ns = array("q")  # of each frame since the last report
         self._start_ns = time.monotonic_ns()
-        self._reported_ns = 0
 
     def run(self, control: int) -> None:
         """Relay until the control input ends."""
@@ -145,19 +144,16 @@ class _Relay:
 
     def _report(self) -> None:
         now_ns = time.monotonic_ns() - self._start_ns
-        sides = {}
-        for side, way in zip(("up", "down"), self._ways, strict=True):
-            way.channel.backlog_bytes(now_ns)
-            capacity = way.channel.rate.capacity_bytes(self._reported_ns, now_ns)
-            sides[side] = asdict(way.channel.take_counters()) | {"capacity_bytes": capacity}
+        up, down = (asdict(way.channel.take_flow(now_ns)) for way in self._ways)
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
             kernel_drops=sum(kernel_drops(way.source) for way in self._ways),
             late_us=percentile(self._late_ns, 0.99) / 1e3 if self._late_ns else 0.0,
-            **sides,
+            up=up,
+            down=down,
         )
-        self._late_ns, self._reported_ns = array("q"), now_ns
+        self._late_ns = array("q")
         self._drops, self._oversized = [0] * len(self._drops), 0
 
 

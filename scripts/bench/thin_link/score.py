@@ -79,7 +79,7 @@ def stream_figures(
 def idle_ms(stream: Stream, conditions: Conditions, mix: Sequence[Stream]) -> float:
     """Return the age of a message on the idle link: one way, or for an answer both, and its time on the wire."""
     way = conditions.up if stream.direction == "up" else conditions.down
-    found = way.delay_ms + wire_bytes(stream.size) * 8e3 / way.mean_bits_s
+    found = way.delay_ms + wire_bytes(stream.size) * 8e3 / way.bits_s
     asked = next((each for each in mix if each.name == stream.answers), None)
     return found + (idle_ms(asked, conditions, mix) if asked else 0.0)
 
@@ -95,7 +95,7 @@ def whole_share(
 
 def link_figures(conditions: Conditions, alone: Used, both: Used | None) -> dict[str, float]:
     """Return the figures of the uplink, alone and with a TCP flow."""
-    byte_ms = 8e3 / conditions.up.mean_bits_s
+    byte_ms = 8e3 / conditions.up.bits_s
     found = {
         SHARE: alone.up.share,
         DROPS: 100 * alone.up.queue_drop_share,
