@@ -89,7 +89,8 @@ class Plan:
 
     def channels(self, member: str) -> Iterable[tuple[int, Flow | Service]]:
         """Return what a member takes part in, with its channel."""
-        return [each for each in enumerate((*self.flows, *self.services)) if each[1].has(member)]
+        parts: tuple[Flow | Service, ...] = (*self.flows, *self.services)
+        return [(channel, part) for channel, part in enumerate(parts) if part.has(member)]
 
 
 VICTIM: Final = "victim"  # the member whose membership is revoked
