@@ -73,7 +73,6 @@ class Chaos:
         self._overlay, self._plan = overlay, overlay.plan
         self._faults = faults
         self.books = overlay.books
-        self._under_way: list[Fault] = []
         self._continuity = Continuity(self._plan, self.books)
         self._begun_ns = self._last_ns = 0  # of the first and the last event
         self._revoked_ns: int | None = None
@@ -98,14 +97,9 @@ class Chaos:
             begun_s += max(time.monotonic() - begun_s - at_s, 0.0)
             self._overlay.watch(begun_s + at_s - time.monotonic())
             progress(f"{at_s:7.2f} s  {'+' if begins else '-'} {fault.kind.value}: {', '.join(fault.targets)}")
-            if begins:
-                self._under_way.append(fault)
-                self._overlay.begin(fault)
-                if fault.kind is FaultKind.REVOKE:
-                    self._revoked_ns = time.monotonic_ns()
-            else:
-                self._overlay.end(fault)
-                self._under_way.remove(fault)
+            (self._overlay.begin if begins else self._overlay.end)(fault)
+            if fault.kind is FaultKind.REVOKE:
+                self._revoked_ns = time.monotonic_ns()
             self._last_ns = self._note()
         self._overlay.watch(AFTER_S)
 
@@ -148,7 +142,7 @@ class Chaos:
     def _note(self) -> int:
         """Record what must be connected from now on; return the moment."""
         at = {mover: self._overlay.at[mover] for mover in self._plan.homes}
-        broken, now_ns = broken_by(self._under_way, at), time.monotonic_ns()
+        broken, now_ns = broken_by(self._overlay.active, at), time.monotonic_ns()
         if self._revoked_ns is not None:
             broken.members.add(VICTIM)
         self._continuity.note(now_ns, broken)

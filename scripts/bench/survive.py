@@ -122,10 +122,11 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Rounds, opt
     silence_ms = 1e3 * flow.silence_s(since_ns)
     found.add(row.what, CASE, SILENCE, silence_ms)
     progress(f"  {at + 1}: {silence_ms:.1f} ms")
-    if row.undo is None:
+    if not overlay.active:
         return never
     since_ns = time.monotonic_ns()
-    row.undo(overlay, at)
+    for fault in list(overlay.active):
+        overlay.end(fault)
     never += not flow.await_steady(time.monotonic_ns())
     found.add(row.what, CASE, RETURN, 1e3 * flow.silence_s(since_ns))
     overlay.watch(options.settle_s, is_strict=True)

@@ -33,11 +33,11 @@ from gdp.host.run_registry import Run
 from gdp.journal.incident import Incident
 from gdp.management.control_client import NodeConnection, find_control_socket
 from gdp.metadata import Metadata
-from gdp.stores.keyring import load_domain, load_identity
-from gdp.trust.revocation import Revocation
+from gdp.stores.keyring import NODE_CERTIFICATE
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
 from lab.faults import STORE, Fault, FaultKind, links_of
+from lab.machine import gdp
 from lab.machines import Lab
 from lab.namespaces import received
 from lab.process import FailedError, LabProcess, end_processes, until
@@ -69,6 +69,7 @@ class Overlay(ClosedOnExit):
     Attributes:
         processes: what was started and not killed; it may have ended by itself.
         lives: every process that was started, by name.
+        active: faults that have begun and not ended.
         at: the switch that each member, or switch that moves, is plugged into.
         spaces: the namespaces, in which links can be cut.
         books: what the members have recorded, as far as ``watch`` has read it.
@@ -98,6 +99,7 @@ class Overlay(ClosedOnExit):
         self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self.lives: defaultdict[str, list[LabProcess]] = defaultdict(list)
         self.processes: dict[str, LabProcess] = {}
+        self.active: list[Fault] = []
         self._records: defaultdict[str, list[RecordReader]] = defaultdict(list)
         self.spaces = self._lab.namespaces
         self.books = Books(plan)
@@ -134,12 +136,14 @@ class Overlay(ClosedOnExit):
 
     def begin(self, fault: Fault) -> None:
         """Make a fault happen. Raises ``FailedError``: a process that it restarts does not come up."""
+        self.active.append(fault)
         self._changes(fault)[0]()
         for link in links_of(fault):
             self.spaces.cut(*link)
 
     def end(self, fault: Fault) -> None:
         """Undo a fault that can be undone; a killed process is ready then. Raises as ``begin``."""
+        self.active.remove(fault)
         self._changes(fault)[1]()
         for link in links_of(fault):
             self.spaces.restore_link(*link)
@@ -276,15 +280,17 @@ class Overlay(ClosedOnExit):
 
     def revoke(self, member: str) -> None:
         """Revoke a member's membership: each switch receives the statement."""
-        label = self.plan.topology.domain_of(member).label
-        authority = load_domain(self.directory / "domains" / label)
-        identity = load_identity(self.directory / "nodes" / f"proxy-{member}", time.time())
-        held = identity.member
-        wire = Revocation.make(authority.key, authority.root.subject, held.fingerprint, held.not_after_unix_s)
-        (self.directory / "revocations" / f"{member}.revoke").write_bytes(wire)
+        gdp(*self.revocation(member))
         for node in self.plan.switches:
             if f"switch {node}" in self.processes:
                 self.processes[f"switch {node}"].send(signal.SIGHUP)
+
+    def revocation(self, member: str) -> list[str]:
+        """Return the words of ``gdp`` that revoke a membership, into a file that switches read at the next SIGHUP."""
+        certificate = self._credentials.identity(Role.PROXY, member) / NODE_CERTIFICATE
+        domain = self._credentials.domain(self.plan.topology.domain_of(member).label)
+        out = self.directory / "revocations" / f"{member}.revoke"
+        return ["cert", "revoke", str(certificate), "--domain", str(domain), "--out", str(out)]
 
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
         """Apply faults to the frames of a link, both ways."""
