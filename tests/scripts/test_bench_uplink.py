@@ -84,9 +84,9 @@ def test_the_highest_queue_of_each_tenth_of_a_second_is_kept_until_it_is_taken()
     link = channel()
     for at in (0, 0, 0, 150 * MS):
         link.offer(at, FRAME)
-    assert link.take_flow(150 * MS).depths_bytes == (3 * FRAME, FRAME)
+    assert link.take_flow(150 * MS).depth_bytes == [3 * FRAME, FRAME]
     link.offer(160 * MS, FRAME)
-    assert link.take_flow(160 * MS).depths_bytes == (FRAME,)
+    assert link.take_flow(160 * MS).depth_bytes == [FRAME]
 
 
 @pytest.mark.parametrize(("share", "burst"), [(0.01, 1.0), (0.05, 1.0), (0.02, 8.0)])
@@ -258,7 +258,14 @@ def test_an_answer_is_due_for_each_request_that_was() -> None:
 
 
 def test_the_share_of_a_system_is_that_of_the_link_without_the_tcp_flow() -> None:
-    flow = Flow(0.9, 0.3, 0.25, 0.0, 1e6, (7_500, 15_000, 7_500))
+    flow = Flow(
+        offered=4,
+        queue_drops=1,
+        delivered_bytes=900,
+        marked_bytes=300,
+        capacity_bytes=1e3,
+        depth_bytes=[7_500, 15_000, 7_500],
+    )
     used = Used(flow, flow, 0.2)
     found = link_figures(Conditions.of("10", 60, "0", "bdp", seed=1), used, used)
     assert found[score.SHARE_BOTH] == pytest.approx(0.6)

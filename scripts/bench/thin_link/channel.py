@@ -139,14 +139,15 @@ class Loss:
 
 
 @dataclass(slots=True)
-class Counters:
-    """Frames and bytes of a channel since they were last taken.
+class Flow:
+    """Frames and bytes of one direction of a link over a span.
 
     Attributes:
         offered, queue_drops: frames that arrived, and of those, that found the queue full.
         losses, delivered: frames that have left the queue, by their fate.
         delivered_bytes, marked_bytes: of the delivered frames, and of those that the caller marks.
         depth_bytes: highest queue of each tenth of a second in which a frame arrived, in order.
+        capacity_bytes: what the link could carry.
     """
 
     offered: int = 0
@@ -156,25 +157,17 @@ class Counters:
     delivered_bytes: int = 0
     marked_bytes: int = 0
     depth_bytes: list[int] = field(default_factory=list)
+    capacity_bytes: float = 0.0
 
+    @property
+    def share(self) -> float:
+        """Return the bytes that were delivered, of those that the link could carry."""
+        return self.delivered_bytes / max(self.capacity_bytes, 1.0)
 
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """One direction of a link over a span.
-
-    Attributes:
-        share: bytes that were delivered, of those that the link could carry.
-        marked_share: the same, of the TCP flow alone.
-        queue_drop_share, loss_share: of the frames offered to the link.
-        depths_bytes: highest queue in each tenth of a second.
-    """
-
-    share: float
-    marked_share: float
-    queue_drop_share: float
-    loss_share: float
-    capacity_bytes: float
-    depths_bytes: tuple[int, ...]
+    @property
+    def marked_share(self) -> float:
+        """Return the same of the marked frames."""
+        return self.marked_bytes / max(self.capacity_bytes, 1.0)
 
 
 class Channel:
@@ -185,7 +178,7 @@ class Channel:
 
     def __init__(self, rate: Rate, *, delay_ns: int, fifo_bytes: int, loss: Loss) -> None:
         self.rate = rate
-        self.counters = Counters()
+        self.counters = Flow()
         self._delay_ns = delay_ns
         self._fifo_bytes = fifo_bytes
         self._loss = loss
@@ -231,17 +224,10 @@ class Channel:
     def take_flow(self, now_ns: int) -> Flow:
         """Return the flow since the last call, and begin new counters."""
         self.backlog_bytes(now_ns)
-        taken, since_ns = self.counters, self._taken_ns
-        self.counters, self._slot, self._taken_ns = Counters(), -1, now_ns
-        offered, capacity = max(taken.offered, 1), max(self.rate.capacity_bytes(since_ns, now_ns), 1.0)
-        return Flow(
-            share=taken.delivered_bytes / capacity,
-            marked_share=taken.marked_bytes / capacity,
-            queue_drop_share=taken.queue_drops / offered,
-            loss_share=taken.losses / offered,
-            capacity_bytes=capacity,
-            depths_bytes=tuple(taken.depth_bytes),
-        )
+        taken, self.counters, self._slot = self.counters, Flow(), -1
+        taken.capacity_bytes = self.rate.capacity_bytes(self._taken_ns, now_ns)
+        self._taken_ns = now_ns
+        return taken
 
     def _note_depth(self, now_ns: int) -> None:
         depths, slot = self.counters.depth_bytes, now_ns // _SLOT_NS

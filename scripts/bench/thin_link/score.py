@@ -98,11 +98,11 @@ def link_figures(conditions: Conditions, alone: Used, both: Used | None) -> dict
     byte_ms = 8e3 / conditions.up.bits_s
     found = {
         SHARE: alone.up.share,
-        DROPS: 100 * alone.up.queue_drop_share,
+        DROPS: 100 * alone.up.queue_drops / max(alone.up.offered, 1),
         RELAY_LATE: max(alone.late_ms, both.late_ms if both else 0.0),
     }
-    if alone.up.depths_bytes:
-        found[QUEUE_P50] = byte_ms * percentile(alone.up.depths_bytes, 0.5)
+    if alone.up.depth_bytes:
+        found[QUEUE_P50] = byte_ms * percentile(alone.up.depth_bytes, 0.5)
     if both:
         found[SHARE_BOTH] = both.up.share - both.up.marked_share
         found[TCP_BOTH] = both.up.marked_share
