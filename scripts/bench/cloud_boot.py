@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -28,13 +27,10 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from fog.supervisor.core.record import Record
 from gdp.enrolment.registry import Registry
-from lab.process import FailedError, new_run
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from lab.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from lab.debian import BootedMachine, debian_root, why_not
 from lab.namespaces import Space
+from lab.process import FailedError, new_run
 
 if TYPE_CHECKING:
     from lab.ec2 import DataCenter

@@ -21,8 +21,9 @@ import random
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -76,57 +77,16 @@ _SLOW: Final = {"slow_in": 100, "slow_s": 0.2, "threads": 8}
 Figures = Mapping[str, Mapping[str, float | None]]  # by row and column
 
 
-class Kills:
-    """Kills of all replicas but one at random moments, and their restart; then another one stays. A context manager.
+@contextmanager
+def kills(here: Field, draw: random.Random) -> Iterator[list[float]]:
+    """Kill all replicas but one at random moments, and start them again; then another one stays. Yield the deaths."""
+    servers, over, deaths_s = list(here.servers.values()), threading.Event(), list[float]()
 
-    ``count``: deaths.
-    """
-
-    def __init__(self, here: Field, draw: random.Random) -> None:
-        self.count = 0
-        self._servers = list(here.servers.values())
-        self._draw = draw
-        self._over = threading.Event()
-        self._error: FailedError | None = None
-        self._thread = threading.Thread(target=self._run, name="kills")
-
-    def __enter__(self) -> Kills:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-
-    def _run(self) -> None:
-        try:
-            self._all_serve(self._servers)
-            while not self._over.wait(_REST_S):
-                self._turn()
-        except FailedError as error:
-            self._error = error
-
-    def _turn(self) -> None:
-        stays = self._draw.choice(self._servers)
-        others = self._draw.sample([each for each in self._servers if each is not stays], len(self._servers) - 1)
-        for server in others:
-            self._over.wait(self._draw.uniform(0, _APART_S))
-            server.kill()
-            self.count += 1
-        for server in others:
-            self._over.wait(self._draw.uniform(0, _AWAY_S))
-            server.begin()
-        for server in others:
-            server.wait()
-        self._all_serve(others)
-
-    def _all_serve(self, servers: Sequence[Server]) -> None:
+    def all_serve(servers: Sequence[Server]) -> None:
         """Wait until each node reports a request, or until no more are sent."""
         for server in servers:
             late_s = time.monotonic() + READY_S
-            while not self._over.is_set():
+            while not over.is_set():
                 try:
                     server.hear(_STEP_S)
                     break
@@ -134,11 +94,36 @@ class Kills:
                     if time.monotonic() > late_s:
                         raise
 
+    def run() -> None:
+        """Work until the block ends."""
+        all_serve(servers)
+        while not over.wait(_REST_S):
+            stays = draw.choice(servers)
+            others = draw.sample([each for each in servers if each is not stays], len(servers) - 1)
+            for server in others:
+                over.wait(draw.uniform(0, _APART_S))
+                server.kill()
+                deaths_s.append(time.monotonic())
+            for server in others:
+                over.wait(draw.uniform(0, _AWAY_S))
+                server.begin()
+            for server in others:
+                server.wait()
+            all_serve(others)
+
+    with ThreadPoolExecutor(1) as pool:
+        killing = pool.submit(run)
+        try:
+            yield deaths_s
+        finally:
+            over.set()
+        killing.result()
+
 
 def killed(count: int, options: Options, draw: random.Random) -> Figures:
     """Call three replicas while two of them are killed repeatedly."""
     served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
-    with _field(served) as here, Kills(here, draw) as kills:
+    with _field(served) as here, kills(here, draw) as deaths_s:
         found, asking = _ask(here, ["/number"], count, lanes=_LANES, rate=options.rate, counts_answers=True)
     samples = found["/number"]
     figures: dict[str, float | None] = {
@@ -147,7 +132,7 @@ def killed(count: int, options: Options, draw: random.Random) -> Figures:
         "answers": asking.heard,
         TWICE: asking.twice,
     }
-    return {THREE: {**figures, COUNT: count, KILLS: kills.count, **_latencies(samples)}}
+    return {THREE: {**figures, COUNT: count, KILLS: len(deaths_s), **_latencies(samples)}}
 
 
 def added(count: int, *_: object) -> Figures:

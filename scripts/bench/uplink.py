@@ -22,6 +22,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -77,16 +78,10 @@ def links_of(options: Options) -> list[Conditions]:
 
     Raises ``RefusedError``: an unknown word, or a recording that is not there.
     """
-    if any((options.rates, options.rtt, options.loss, options.fifo)):
-        words = [
-            (rate, rtt, loss, fifo)
-            for rate in options.rates or ["10"]
-            for rtt in options.rtt or [60.0]
-            for loss in options.loss or ["0"]
-            for fifo in options.fifo or ["second"]
-        ]
-    else:
-        words = [*GRID[:1]] if options.quick else [*GRID, RECORDED]
+    chosen = (options.rates, options.rtt, options.loss, options.fifo)
+    words = [*GRID[:1]] if options.quick else [*GRID, RECORDED]
+    if any(chosen):
+        words = list(product(*(each or [usual] for each, usual in zip(chosen, GRID[0], strict=True))))
     try:
         return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
     except LocalError as error:

@@ -22,8 +22,9 @@ from thin_link.exchange import Arrival, Carrier, Exchange, Window
 from thin_link.relay import MARKED_PORT
 from thin_link.traffic import Direction, streams
 
+from lab.process import until
+
 _PATIENCE_S: Final = 30.0
-_POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
 
 
@@ -44,11 +45,7 @@ def traffic(settings: Settings, direction: Direction) -> None:
     exchange = Exchange(streams(settings["camera"]), direction)
     carrier = _carrier(settings, exchange.take)
     exchange.join(carrier)
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while not carrier.is_matched():
-        if time.monotonic() > deadline_s:
-            raise TimeoutError("no reader: the other end did not appear")
-        time.sleep(_POLL_S)
+    until(carrier.is_matched, "a reader: the other end did not appear", _PATIENCE_S)
     say(event="ready")
     order = read_order()
     window = Window(order["start_ns"], order["begin_ns"], order["end_ns"])

@@ -75,9 +75,7 @@ class Exchange:
         self._window: Window | None = None
         self.tallies = {each.name: Tally() for each in self._mix}
         self._arrived = set[tuple[str, int]]()  # stream, number
-        self._answers: dict[str, tuple[Stream, queue.Queue[tuple[int, int]]]] = {
-            each.answers: (each, queue.Queue(_QUEUE)) for each in self._mix if each.answers
-        }
+        self._requests = {each.answers: queue.Queue[tuple[int, int]](_QUEUE) for each in self._mix if each.answers}
         self.refusals: list[str] = []
         self._senders: dict[str, Callable[[bytes], None]] = {}
 
@@ -115,9 +113,9 @@ class Exchange:
             else:
                 self._arrived.add((stream.name, number))
                 tally.ages_s.append((now_ns - due_ns) / 1e9)
-        if stream.name in self._answers:
+        if stream.name in self._requests:
             try:
-                self._answers[stream.name][1].put_nowait(opened)
+                self._requests[stream.name].put_nowait(opened)
             except queue.Full:
                 self.refusals.append(f"{stream.name}: too many requests wait")
 
@@ -136,7 +134,7 @@ class Exchange:
 
     def _answer(self, stream: Stream, send: Callable[[bytes], None], window: Window) -> None:
         """Answer each request; the age of an answer counts from when its request was due."""
-        body, waiting, tally = os.urandom(stream.size), self._answers[stream.answers][1], self.tallies[stream.name]
+        body, waiting, tally = os.urandom(stream.size), self._requests[stream.answers], self.tallies[stream.name]
         while True:
             number, due_ns = waiting.get()
             self._send(stream, send, make_message(number, due_ns, body))
