@@ -18,7 +18,8 @@ from functools import partial
 from typing import Final
 
 from peers.jsonl import Settings, read_order, run_role, say
-from thin_link.exchange import Arrival, Carrier, Exchange, Window
+from thin_link.carriers import CARRIERS
+from thin_link.exchange import Exchange, Window
 from thin_link.relay import MARKED_PORT
 from thin_link.traffic import Direction, streams
 
@@ -28,22 +29,10 @@ _PATIENCE_S: Final = 30.0
 _CHUNK: Final = 1 << 16
 
 
-def _carrier(settings: Settings, arrived: Arrival) -> Carrier:
-    """Return the end of the system; its library is loaded by none other."""
-    own = dict(settings["own"])
-    if settings["system"] == "gdp":
-        from thin_link.gdp_carrier import GdpCarrier
-
-        return GdpCarrier(own, arrived)
-    from thin_link.zenoh_carrier import ZenohCarrier
-
-    return ZenohCarrier(own, arrived)
-
-
 def traffic(settings: Settings, direction: Direction) -> None:
     """Exchange the traffic once for each command with a window; report every stream after it."""
     exchange = Exchange(streams(settings["camera"]), direction)
-    carrier = _carrier(settings, exchange.take)
+    carrier = CARRIERS[settings["system"]](settings["own"], exchange.take)
     exchange.join(carrier)
     until(carrier.is_matched, "a reader: the other end did not appear", _PATIENCE_S)
     say(event="ready")
