@@ -14,6 +14,7 @@ import struct
 import sys
 import time
 from array import array
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from typing import Any, Final
 
@@ -160,6 +161,7 @@ def end(ifname: str, cpu: int) -> None:
     say(event="ready")
     gc.freeze()
     gc.disable()
+    work: Mapping[str, Callable[..., Mapping[str, object]]]
     work = {"send": send, "count": count_frames, "ping": ping, "answer": answer_pings}
     while True:
         order: dict[str, Any] = read_order()

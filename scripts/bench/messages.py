@@ -30,7 +30,7 @@ from peers.chain import Chain
 from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
 from plot import panels_of
-from report import Rounds, Target, percentile
+from report import Rounds, Settings, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.runtime.busy_poll import SPIN_US
@@ -121,7 +121,7 @@ def measure(options: Options) -> Outcome:
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
-    settings = {
+    settings: Settings = {
         "messages a round": [count_of(size, options) for size in SIZES],
         "answer, B": ANSWER.size,
         "ends of gdp spin, us": SPIN_US,

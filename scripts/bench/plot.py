@@ -70,7 +70,7 @@ def panels_of(
         for who in contenders:
             if spread := over.spread(who, case, column):
                 tail = over.spread(who, case, p99) if p99 else None
-                low, high = (None, tail and tail.median) if p99 else (spread.low, spread.high)
+                low, high = (None, tail.median if tail else None) if p99 else (spread.low, spread.high)
                 bars.append(Bar(who, spread.median, low, high, ours is None or who in ours))
         if bars:
             panels.append(Panel(case, unit, bars))

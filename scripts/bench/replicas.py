@@ -21,7 +21,7 @@ import random
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -139,7 +139,7 @@ def added(count: int, *_: object) -> Figures:
     """Call one server and two replicas in turn; all are idle between two calls."""
     names = {ONE: "/one", TWO: "/two"}
     with _field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
-        found, _ = _ask(here, list(names.values()), count, rate=_RESTFUL)
+        found = _ask(here, list(names.values()), count, rate=_RESTFUL)[0]
     return {who: _latencies(found[name]) for who, name in names.items()}
 
 
@@ -164,7 +164,11 @@ def hedged(count: int, *_: object) -> Figures:
     return figures
 
 
-PARTS: Final = {KILLED: killed, ADDED: added, HEDGED: hedged}
+PARTS: Final[Mapping[str, Callable[[int, Options, random.Random], Figures]]] = {
+    KILLED: killed,
+    ADDED: added,
+    HEDGED: hedged,
+}
 
 
 def _field(served: Sequence[Served], **settings: object) -> AbstractContextManager[Field]:

@@ -118,7 +118,7 @@ def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Rounds, opt
     if row.holds:
         overlay.watch(options.dead_s, is_strict=True)
     patience_s = 0.1 if row.holds and options.dead_s >= PATIENCE_S and not flow.is_steady(since_ns) else PATIENCE_S
-    never = not flow.await_steady(since_ns, patience_s)
+    never = int(not flow.await_steady(since_ns, patience_s))
     silence_ms = 1e3 * flow.silence_s(since_ns)
     found.add(row.what, CASE, SILENCE, silence_ms)
     progress(f"  {at + 1}: {silence_ms:.1f} ms")

@@ -16,12 +16,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 
 from lab.faults import Fault, FaultKind
+from lab.namespaces import received
 from lab.topology import Link, ends_of, make_topology
 
 CUT, KILL = FaultKind.CUT, FaultKind.KILL_SWITCH
@@ -129,9 +131,10 @@ def _on_path(kind: FaultKind, last: str = "s4", **ways: str) -> Callable[[Overla
     """
 
     def fail(overlay: Overlay, _: int) -> None:
-        before = overlay.received(last, list(ways))
+        space, frames = overlay.spaces[last], partial(received, list(ways))
+        before = space.inside(frames)
         time.sleep(_COUNT_S)
-        after = overlay.received(last, list(ways))
+        after = space.inside(frames)
         failed = ways[max(ways, key=lambda way: after[way] - before[way])]
         overlay.begin(Fault(kind, (failed,) if kind is FaultKind.KILL_SWITCH else ends_of(failed), 0.0))
 

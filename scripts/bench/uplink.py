@@ -109,7 +109,7 @@ def exchange(
 def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds, _: int) -> dict[str, float]:
     """Return the figures of a system on a link, and add those of its streams."""
     if name == TCP:
-        used, _ = exchange(lab, link, None, options, with_tcp=True)
+        used = exchange(lab, link, None, options, with_tcp=True)[0]
         return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
     mix = streams(camera_of(link, options.camera))
     used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)

@@ -39,7 +39,6 @@ from lab.credentials import OverlayCredentials
 from lab.faults import STORE, Fault, FaultKind, links_of
 from lab.machine import gdp
 from lab.machines import Lab
-from lab.namespaces import received
 from lab.process import FailedError, LabProcess, end_processes, until
 
 READY_S: Final = 60.0
@@ -72,6 +71,7 @@ class Overlay(ClosedOnExit):
         active: faults that have begun and not ended.
         at: the switch that each member, or switch that moves, is plugged into.
         spaces: the namespaces, in which links can be cut.
+        links: the frames of links, which can be disturbed.
         books: what the members have recorded, as far as ``watch`` has read it.
 
     Raises:
@@ -108,7 +108,7 @@ class Overlay(ClosedOnExit):
         if has_clocks:
             (run.directory / "clocks").mkdir()
             self._clocks = {who: Clock(run.directory / "clocks" / who.replace(" ", "-")) for who in self.everybody()}
-        self._links = LinkFaults()
+        self.links = LinkFaults(self.spaces)
         self.disk = Disk(run) if has_disk else None
         self.store = StoreCluster(run, self.spaces, in_store) if in_store else None
         self._in_store = frozenset(in_store)
@@ -117,7 +117,7 @@ class Overlay(ClosedOnExit):
 
     def close(self) -> None:
         """End all processes, and remove the faults."""
-        self._links.close()
+        self.links.close()
         if self.store is not None:
             self.store.close()
         for who in self.processes:
@@ -152,7 +152,8 @@ class Overlay(ClosedOnExit):
         """Return what makes a fault and what undoes it, but for links that lose their carrier."""
         kind, targets = fault.kind, fault.targets
         if kind in FRAMES:
-            return partial(self.disturb, *targets, FRAMES[kind]), partial(self.calm, *targets)
+            a, b = targets
+            return partial(self.links.set, a, b, FRAMES[kind]), partial(self.links.clear, a, b)
         if kind in KILLS:
             return partial(self.kill, targets[0]), partial(self.restart, targets[0])
         if kind is FaultKind.FREEZE:
@@ -292,26 +293,12 @@ class Overlay(ClosedOnExit):
         out = self.directory / "revocations" / f"{member}.revoke"
         return ["cert", "revoke", str(certificate), "--domain", str(domain), "--out", str(out)]
 
-    def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
-        """Apply faults to the frames of a link, both ways."""
-        for own, other in ((a, b), (b, a)):
-            self._links.set(self.spaces[own].path, other, faults)
-
-    def calm(self, a: str, b: str) -> None:
-        """Remove the faults of a link."""
-        for own, other in ((a, b), (b, a)):
-            self._links.clear(self.spaces[own].path, other)
-
     def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
         """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
         limit = max(round(bits_s / 8 * fifo_s), _BUCKET_BYTES)
         shape = f"tbf rate {bits_s:.0f}bit burst {_BUCKET_BYTES} limit {limit}"  # before the bucket, frames wait
         for own, other in ((a, b), (b, a)):
             self.spaces[own].run("tc", "qdisc", "add", "dev", other, "root", *shape.split())
-
-    def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
-        """Return how many frames have come in at a node's devices towards these neighbours."""
-        return self._lab.inside(node, partial(received, neighbours))
 
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""

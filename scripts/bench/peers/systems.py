@@ -59,9 +59,8 @@ def measure_gdp(chain: Chain, *, sign: Literal["always", "session"], **load: int
 def measure_zenoh(chain: Chain, **load: int) -> Measured:
     """Start Zenoh with mutual TLS: routers from the left, then B, then A."""
     directory = chain.directory / "tls"
-    if not directory.exists():
-        hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
-        make_certificates(directory, hosts)
+    hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
+    make_certificates(directory, hosts)
 
     def own(node: str, router: str | None) -> Settings:
         connect = [f"tls/{address(router, node)}:{_ZENOH_PORT}"] if router else []

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import gdp
 from gdp.runtime.busy_poll import SPIN_US
 from gdp.runtime.memory_tuning import tune_memory
-from thin_link.exchange import Arrival
+from thin_link.exchange import Arrival, Carrier
 from thin_link.traffic import Stream
 
 if TYPE_CHECKING:
@@ -108,4 +108,4 @@ def _key(stream: Stream) -> str:
     return "robot/" + stream.name.replace(" ", "_")
 
 
-CARRIERS: Final = {"gdp": GdpCarrier, "zenoh": ZenohCarrier}
+CARRIERS: Final[Mapping[str, Callable[[dict[str, Any], Arrival], Carrier]]] = {"gdp": GdpCarrier, "zenoh": ZenohCarrier}

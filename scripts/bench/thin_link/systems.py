@@ -89,8 +89,7 @@ def _gdp(lab: Lab, camera: str) -> Iterator[Ends]:
 def _zenoh(scheme: str, congestion: str, lab: Lab, camera: str) -> Iterator[Ends]:
     """Two peers over one link with mutual TLS, of TCP or of QUIC."""
     directory, at = lab.directory / "tls", f"{scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
-    if not directory.exists():
-        make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
+    make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
     own = [
         {"certificate": str(directory / node), "congestion": congestion, "listen": [], "connect": [], key: [at]}
         for node, key in ((ROBOT, "connect"), (CLOUD, "listen"))
