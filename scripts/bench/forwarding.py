@@ -31,7 +31,7 @@ from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab
 from lab.namespaces import mac_addresses
-from lab.process import FailedError, LabProcess, UndoneOnExit, new_run
+from lab.process import FailedError, LabProcess, new_run
 from lab.topology import chain
 
 KERNEL, BRIDGE = "kernel", "bridge"
@@ -59,21 +59,19 @@ def data_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> byt
     return macs + ETHERTYPE.to_bytes(2, "big") + encode(header) + bytes(payload)
 
 
-class Row(Lab, UndoneOnExit):
-    """The five machines, with source and sink running; a context manager that ends these. Raises as ``Lab``."""
+class Row(Lab):
+    """The five machines, with source and sink running until ``stack`` closes. Raises as ``Lab``."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, stack: ExitStack) -> None:
         super().__init__(run, chain(5))
         nodes = self.topology.nodes
         self._macs = {node: self.inside(node, partial(mac_addresses, self.topology.neighbours(node))) for node in nodes}
-        with ExitStack() as undo:
-            self._source, self._sink = (
-                undo.enter_context(self._worker(node, "end", cpu=cpu, ifname=self.topology.neighbours(node)[0]))
-                for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
-            )
-            self._source.read(_READY_S)
-            self._sink.read(_READY_S)
-            self._undo = undo.pop_all()
+        self._source, self._sink = (
+            stack.enter_context(self._worker(node, "end", cpu=cpu, ifname=self.topology.neighbours(node)[0]))
+            for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
+        )
+        self._source.read(_READY_S)
+        self._sink.read(_READY_S)
 
     @contextmanager
     def kernel(self) -> Iterator[Mapping[str, str]]:
@@ -147,7 +145,8 @@ def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> 
 def measure(options: Options) -> Outcome:
     """Measure both, round by round."""
     recorder, pings = Recorder(), int(options.pings)
-    with new_run() as run, Row(run) as row:
+    with new_run() as run, ExitStack() as stack:
+        row = Row(run, stack)
         columns = (RATE, LOSS, TRIP, TRIP_P99)
         trials = [
             Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))

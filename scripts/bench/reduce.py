@@ -72,15 +72,20 @@ def described(type_name: str) -> Channel:
     return Channel("/a", type_name, 2, definition=definition, definition_format="msg")
 
 
-def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
-    """Return the message of an image, [height, width] or [height, width, channels]."""
-    types, (height, width) = STORE.types, pixels.shape[:2]
+def serialised(type_name: str, **fields: Any) -> bytes:
+    """Return a message with a header, in CDR."""
+    types = STORE.types
     stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+    return bytes(STORE.serialize_cdr(types[type_name](header=header, **fields), type_name))
+
+
+def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
+    """Return the message of an image, [height, width] or [height, width, channels]."""
+    height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels).view(np.uint8).ravel()
     fields = {"height": height, "width": width, "encoding": encoding, "step": data.size // height}
-    message = types[IMAGE](header=header, is_bigendian=0, data=data, **fields)
-    return bytes(STORE.serialize_cdr(message, IMAGE))
+    return serialised(IMAGE, is_bigendian=0, data=data, **fields)
 
 
 def frames(pattern: str) -> list[npt.NDArray[Any]]:
@@ -138,15 +143,11 @@ def cases(bags: Path) -> list[Case]:
 
 def cloud(points: npt.NDArray[np.float32]) -> bytes:
     """Return the message of a point cloud, float32 [points, 4]: x, y, z, intensity."""
-    types, count = STORE.types, len(points)
-    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
-    field = types["sensor_msgs/msg/PointField"]
+    count, field = len(points), STORE.types["sensor_msgs/msg/PointField"]
     named = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate(("x", "y", "z", "i"))]
     data = np.ascontiguousarray(points, np.float32).view(np.uint8).ravel()
     sizes = {"height": 1, "width": count, "point_step": 16, "row_step": 16 * count}
-    message = types[CLOUD](header=header, fields=named, is_bigendian=False, data=data, is_dense=True, **sizes)
-    return bytes(STORE.serialize_cdr(message, CLOUD))
+    return serialised(CLOUD, fields=named, is_bigendian=False, data=data, is_dense=True, **sizes)
 
 
 def _points(depths: Sequence[npt.NDArray[np.uint16]]) -> Case:

@@ -41,9 +41,9 @@ class Silence(NamedTuple):
 
 @dataclass(slots=True)
 class Account:
-    """Messages of one incarnation of a publisher at one of a reader; ``counts``: deliveries by number, up to 255."""
+    """Messages of one incarnation of a publisher at one of a reader; ``first``: the number that came first."""
 
-    counts: bytearray = field(default_factory=bytearray)
+    numbers: set[int] = field(default_factory=set)
     first: int = 0
     last: int = 0
     doubled: int = 0
@@ -51,18 +51,14 @@ class Account:
     def add(self, number: int) -> None:
         """Record a message."""
         self.first = self.first or number
-        if number >= len(self.counts):
-            self.counts.extend(bytes(number + 1 - len(self.counts) + 4_096))
-        if self.counts[number]:
-            self.doubled += 1
-        self.counts[number] = min(self.counts[number] + 1, 255)
         self.last = max(self.last, number)
+        self.doubled += number in self.numbers
+        self.numbers.add(number)
 
     def missing(self, until: int) -> int:
         """Return how many numbers did not arrive, from the first that did up to one."""
-        if not self.first:
-            return 0
-        return max(until + 1 - self.first, 0) - sum(map(bool, self.counts[self.first : until + 1]))
+        came = sum(self.first <= number <= until for number in self.numbers)
+        return max(until + 1 - self.first, 0) - came if self.first else 0
 
 
 class Timeline:
