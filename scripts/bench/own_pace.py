@@ -40,6 +40,7 @@ from lab.topology import flat_topology
 ROBOT, EDGE, HUB = "robot", "s0", "s1"
 LINKS: Final = {"fast": ("100", "0"), "medium": ("5", "0"), "thin": ("1", "0"), "lossy": ("100", "burst")}
 RTT_MS: Final = 20.0
+SEED: Final = 1  # of the losses
 ALONE: Final = "alone"
 IMAGES_S, OF_LINK = "images/s", "of the link"
 COLUMNS: Final = (IMAGES_S, OF_LINK, AGE_P50, AGE_P99)
@@ -73,18 +74,21 @@ def machines(run: Run) -> Lab:
     return lab
 
 
-def links_of(seed: int) -> dict[str, Conditions]:
-    """Return the links by reader; bursts are counted in frames, so the few frames of reports have no such losses."""
-    links = {each: Conditions.of(rate, RTT_MS, loss, "second", seed=seed) for each, (rate, loss) in LINKS.items()}
-    return {each: replace(link, down=replace(link.down, loss=0.0)) for each, link in links.items()}
+def link_of(reader: str) -> Conditions:
+    """Return the link of a reader; bursts are counted in frames, so the few frames of reports have no such losses."""
+    rate, loss = LINKS[reader]
+    link = Conditions.of(rate, RTT_MS, loss, "second", seed=SEED)
+    return replace(link, down=replace(link.down, loss=0.0))
 
 
 def exchange(lab: Lab, readers: Sequence[str], pace: str, options: Options, over: Rounds) -> None:
     """Publish to these readers for a while; add the figures of each."""
-    (images,), links = streams(pace), links_of(options.seed)
+    (images,) = streams(pace)
     with ExitStack() as stack:
-        ends = {each: (HUB, switch_of(each)) for each in readers}
-        lines = [stack.enter_context(open_line(lab, links[each], line_of(each), ends[each])) for each in readers]
+        lines = [
+            stack.enter_context(open_line(lab, link_of(each), line_of(each), (HUB, switch_of(each))))
+            for each in readers
+        ]
         nodes = stack.enter_context(BenchNodes(lab, (HUB, EDGE, *map(switch_of, readers)), plane="kernel"))
         rights = {each: {Right.READ: [images.name]} for each in readers} | {ROBOT: {Right.PUBLISH: [images.name]}}
         started = []
@@ -97,7 +101,8 @@ def exchange(lab: Lab, readers: Sequence[str], pace: str, options: Options, over
             end.read(_READY_S)
         _, said = run_window(lines, started, options.seconds, _SETTLE_S)
         for each, reported in zip(readers, said, strict=False):
-            for column, figure in figures_of(links[each], reported["streams"][images.name], options.seconds).items():
+            figures = figures_of(link_of(each), reported["streams"][images.name], options.seconds)
+            for column, figure in figures.items():
                 over.add(pace if len(readers) > 1 else ALONE, each, column, figure)
 
 
@@ -126,12 +131,12 @@ def measure(options: Options) -> Outcome:
     recorder.interleave(trials, options.rounds)
     ratio = partial(over.ratio, one=OWN_PACE, other=ALONE, case="fast", column=IMAGES_S, asked=_OF_ALONE)
     targets = [ratio("fast, images/s: own-pace / alone")]
-    for each, link in links_of(options.seed).items():
+    for each in LINKS:
         if each in ("medium", "thin"):
             targets.append(over.target(f"{each}, {OF_LINK}", OWN_PACE, each, OF_LINK, _SHARE))
-        asked = _AGE_MS + wire_bytes(CAMERA_BYTES["jpeg"]) * 8e3 / link.up.bits_s
+        asked = _AGE_MS + wire_bytes(CAMERA_BYTES["jpeg"]) * 8e3 / link_of(each).up.bits_s
         targets.append(over.target(f"{each}, {AGE_P99}", OWN_PACE, each, AGE_P99, asked, at_most=True))
-    settings = {"seconds of each figure": options.seconds, "seed": options.seed}
+    settings = {"seconds of each figure": options.seconds, "seed": SEED}
     return Outcome(
         "own_pace",
         "One encoder, readers behind links of 100, 5 and 1 Mbit/s and a lossy one",
@@ -143,5 +148,4 @@ def measure(options: Options) -> Outcome:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 5.0}, has_record=True)
-    parser.set_defaults(seed=1)  # of the losses
     run_bench(parser, measure)
