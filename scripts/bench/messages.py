@@ -41,11 +41,9 @@ P99: Final = "RTT p99, ms"
 CPU: Final = {"sender": "sender CPU, ms", "receiver": "receiver CPU, ms", "between": "CPU between, ms"}
 COLUMNS: Final = (MEDIAN, P99, *CPU.values())
 SMALL, IMAGE = 100, 921_600
-SIZES: Final = (SMALL, IMAGE)
+TIMES: Final = {SMALL: 4, IMAGE: 1}  # of ``count`` messages, by size
 MTUS: Final = (1_500, 9_000)
 OURS: Final = tuple(name for name in BASELINES if name.startswith("gdp"))
-_SMALL_TIMES: Final = 4  # so many times as many messages of up to 100 kB are sent
-_LARGE_BYTES: Final = 100_000
 _SECURED: Final = "zenoh-mtls"
 _UNSECURED: Final = "cyclone"
 _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
@@ -66,12 +64,6 @@ Case = tuple[int, int, bool]  # bytes, MTU, whether other processes take half of
 def case_of(size: int, mtu: int, *, loaded: bool) -> str:
     """Return the name of a case."""
     return f"{size:,} B, MTU {mtu}{', cores half taken' if loaded else ''}"
-
-
-def count_of(size: int, options: Options) -> int:
-    """Return how many messages of a size are measured in a round."""
-    count = int(options.count)
-    return count if size > _LARGE_BYTES else _SMALL_TIMES * count
 
 
 def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
@@ -107,7 +99,7 @@ def measure(options: Options) -> Outcome:
     """Measure every baseline in every case, round by round."""
     names = options.only or list(BASELINES)
     recorder = Recorder()
-    cases: list[Case] = list(product(SIZES, options.mtu or MTUS, LOADS[options.load]))
+    cases: list[Case] = list(product(TIMES, options.mtu or MTUS, LOADS[options.load]))
     with ExitStack() as stack:
         chains = {mtu: Chain(mtu, stack.enter_context(new_run())) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)}
         trials = [
@@ -115,14 +107,14 @@ def measure(options: Options) -> Outcome:
                 case_of(size, mtu, loaded=loaded),
                 name,
                 COLUMNS,
-                partial(measure_one, BASELINES[name], chains[mtu], size, count_of(size, options), loaded),
+                partial(measure_one, BASELINES[name], chains[mtu], size, TIMES[size] * options.count, loaded),
             )
             for (size, mtu, loaded), name in product(cases, names)
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
     settings: Settings = {
-        "messages a round": [count_of(size, options) for size in SIZES],
+        "messages a round": [times * options.count for times in TIMES.values()],
         "answer, B": ANSWER.size,
         "ends of gdp spin, us": SPIN_US,
         "shared memory": "off everywhere",
@@ -148,7 +140,7 @@ def is_whole(options: Options) -> bool:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=5, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
-    parser.set_defaults(count=80, is_whole=is_whole)  # messages above 100 kB; of smaller ones four times that
+    parser.set_defaults(count=80, is_whole=is_whole)
     parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"

@@ -7,7 +7,6 @@ has 16 bytes: the number, the bytes that arrived, and, where the number requests
 
 CPU is the reading of the processes' own clocks over the measured messages: A's, B's, and that of all in between.
 Kernel forwarding on the way runs in the process that was interrupted, mostly the one that sent.
-Source of the clocks: Linux, include/linux/posix-timers.h, ``MAKE_PROCESS_CPUCLOCK``.
 """
 
 from __future__ import annotations
@@ -20,6 +19,8 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
 
+from machine import processor_s
+
 from peers.jsonl import Settings, say
 
 IMAGE: Final = "sensor_msgs/msg/Image"
@@ -28,7 +29,6 @@ ANSWER: Final = struct.Struct("!QII")  # number, bytes, CRC-32 or 0
 _NUMBER: Final = struct.Struct("!Q")
 _CHECKED: Final = 1 << 63  # in a number: answer with the CRC
 _GREETING_S: Final = 0.1
-_SCHEDULED: Final = 2  # CPUCLOCK_SCHED: of all threads of a process, in ns
 
 # CDR_LE; stamp; frame_id "cam"; height 1, width; encoding "mono8"; is_bigendian, step; length of data.
 _IMAGE_HEAD: Final = struct.Struct("<4siII4sIII6sBxII")
@@ -74,16 +74,15 @@ def exchange(way: Way, size: int, count: int, pids: Mapping[str, Sequence[int]])
     ``pids``: of the processes at each machine. Raises ``TimeoutError``: an answer did not come. Raises ``ValueError``:
     B received other bytes than were sent.
     """
-    clocks = {place: [~pid << 3 | _SCHEDULED for pid in each] for place, each in pids.items()}
     numbers, message = iter(range(1, _CHECKED)), image(size)
     _greet(way)
     _once(way, message, next(numbers) | _CHECKED)
     for _ in range(count):  # windows open, caches fill
         _once(way, message, next(numbers))
-    before = _read(clocks)
+    before = _used_s(pids)
     rtts = [_once(way, message, next(numbers)) for _ in range(count)]
-    after = _read(clocks)
-    return {"rtt_s": rtts, "cpu_s": {place: (after[place] - before[place]) / count for place in clocks}}
+    after = _used_s(pids)
+    return {"rtt_s": rtts, "cpu_s": {place: (after[place] - before[place]) / count for place in pids}}
 
 
 def _greet(way: Way) -> None:
@@ -115,5 +114,5 @@ def _once(way: Way, image_bytes: bytearray, number: int) -> float:
     return ended_s - begun_s
 
 
-def _read(clocks: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    return {place: sum(map(time.clock_gettime, each)) for place, each in clocks.items()}
+def _used_s(pids: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    return {place: sum(map(processor_s, each)) for place, each in pids.items()}
