@@ -100,7 +100,7 @@ def frames(pattern: str) -> list[npt.NDArray[Any]]:
 def recorded(path: Path, topic_type: str) -> tuple[Channel, list[bytes]] | None:
     """Return the first messages of a type; None where the recording is missing, which is reported."""
     if not path.exists():
-        progress(f"left out: {topic_type}, for there is no {path} (see --bags)")
+        progress(f"left out: {topic_type}, for there is no {path}")
         return None
     found: list[bytes] = []
     channel: Channel | None = None
@@ -132,13 +132,23 @@ def cases(bags: Path) -> list[Case]:
             ("16UC1", depth, png | compressed),
         )
     ]
-    optional = [
-        _of_bag(bags / "tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
-        _of_bag(bags / "ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
-        _short(bags / "tilt_laser.bag", "sensor_msgs/msg/Imu"),
-        _short(bags / "rosbag2_test", "geometry_msgs/msg/PoseStamped"),
-    ]
-    return [*found, _points(depth), *(each for each in optional if each is not None)]
+    found.append(_points(depth))
+    for bag, type_name, what in (
+        ("tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
+        ("ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
+        ("tilt_laser.bag", "sensor_msgs/msg/Imu", ""),
+        ("rosbag2_test", "geometry_msgs/msg/PoseStamped", ""),
+    ):
+        if taken := recorded(bags / bag, type_name):
+            channel, messages = taken
+            tried: Mapping[str, Settings] = compressed
+            if not what:  # short ones: half of them train a dictionary
+                half_way = len(messages) // 2
+                dictionary: bytes = zstd.train_dict(messages[:half_way], 4_096).dict_content
+                tried = {"zstd 3": zstd_of(3), "zstd 3, dictionary of 4 KiB": zstd_of(3, dictionary)}
+                messages = messages[half_way:]
+            found.append(Case(f"{what or type_name}, recorded", channel, messages, tried))
+    return found
 
 
 def cloud(points: npt.NDArray[np.float32]) -> bytes:
@@ -164,24 +174,6 @@ def _points(depths: Sequence[npt.NDArray[np.uint16]]) -> Case:
     half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 100))}}
     tried = thinned | half | {f"zstd {level}": zstd_of(level) for level in LEVELS} | both
     return Case("point cloud of depth 320x240, recorded", described(CLOUD), messages, tried)
-
-
-def _of_bag(bag: Path, type_name: str, what: str) -> Case | None:
-    found = recorded(bag, type_name)
-    if found is None:
-        return None
-    return Case(f"{what}, recorded", *found, {f"zstd {level}": zstd_of(level) for level in LEVELS})
-
-
-def _short(bag: Path, type_name: str) -> Case | None:
-    found = recorded(bag, type_name)
-    if found is None:
-        return None
-    channel, messages = found
-    half = len(messages) // 2
-    dictionary: bytes = zstd.train_dict(messages[:half], 4_096).dict_content
-    reductions = {"zstd 3": zstd_of(3), "zstd 3, dictionary of 4 KiB": zstd_of(3, dictionary)}
-    return Case(f"{type_name}, recorded", channel, messages[half:], reductions)
 
 
 def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]:
