@@ -27,7 +27,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link.conditions import FRAME_BYTES, Conditions
 from thin_link.line import open_line
 from thin_link.score import AGE_P50, AGE_P99
-from thin_link.systems import run_window, start_role
+from thin_link.systems import run_window, started
 from thin_link.traffic import CAMERA_BYTES, OWN_PACE, TOGETHER, streams, wire_bytes
 
 from gdp.host.run_registry import Run
@@ -48,7 +48,6 @@ _SHARE: Final = 0.9
 _OF_ALONE: Final = 0.95
 _AGE_MS: Final = 300.0
 _SETTLE_S: Final = 6.0
-_READY_S: Final = 45.0
 
 
 def line_of(reader: str) -> str:
@@ -90,16 +89,13 @@ def exchange(lab: Lab, readers: Sequence[str], pace: str, options: Options, over
             for each in readers
         ]
         nodes = stack.enter_context(BenchNodes(lab, (HUB, EDGE, *map(switch_of, readers)), plane="kernel"))
-        rights = {each: {Right.READ: [images.name]} for each in readers} | {ROBOT: {Right.PUBLISH: [images.name]}}
-        started = []
-        for each, granted in rights.items():
-            own = {"config": str(nodes.admit_member(each, granted)), "readers": len(readers)}
-            settings = {"system": "gdp", "camera": pace, "own": own}
-            role = "robot" if each == ROBOT else "cloud"
-            started.append(stack.enter_context(start_role(lab, each, role, settings, has_orders=True)))
-        for end in started:
-            end.read(_READY_S)
-        _, said = run_window(lines, started, options.seconds, _SETTLE_S)
+        roles = [*((each, "cloud", Right.READ) for each in readers), (ROBOT, "robot", Right.PUBLISH)]
+        own = [
+            (each, role, {"config": str(nodes.admit_member(each, {right: [images.name]})), "readers": len(readers)})
+            for each, role, right in roles
+        ]
+        ends = stack.enter_context(started(lab, "gdp", pace, own))
+        _, said = run_window(lines, ends, options.seconds, _SETTLE_S)
         for each, reported in zip(readers, said, strict=False):
             figures = figures_of(link_of(each), reported["streams"][images.name], options.seconds)
             for column, figure in figures.items():

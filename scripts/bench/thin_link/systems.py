@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from typing import Any, Final
@@ -60,16 +60,18 @@ def run_window(
 
 
 @contextmanager
-def _both(lab: Lab, system: str, camera: str, places: tuple[str, str], own: tuple[Any, Any]) -> Iterator[Ends]:
-    """Start cloud and robot at their places, and wait until they are matched."""
+def started(
+    lab: Lab, system: str, camera: str, ends: Iterable[tuple[str, str, Mapping[str, Any]]]
+) -> Iterator[list[LabProcess]]:
+    """Start ends, each by its machine, role and own settings, and wait until they are matched."""
     with ExitStack() as stack:
         made = []
-        for role, node, mine in zip(("cloud", "robot"), places[::-1], own[::-1], strict=True):
-            settings = {"system": system, "camera": camera, "own": mine}
+        for node, role, own in ends:
+            settings = {"system": system, "camera": camera, "own": own}
             made.append(stack.enter_context(start_role(lab, node, role, settings, has_orders=True)))
         for end in made:
             end.read(_READY_S)
-        yield made[1], made[0]
+        yield made
 
 
 @contextmanager
@@ -78,11 +80,14 @@ def _gdp(lab: Lab, camera: str) -> Iterator[Ends]:
     mix = streams(camera)
     up = [each.name for each in mix if each.direction == "up"]
     down = [each.name for each in mix if each.direction == "down"]
+    rights = {
+        ("a", "robot"): {Right.PUBLISH: up, Right.READ: down},
+        ("b", "cloud"): {Right.PUBLISH: down, Right.READ: up},
+    }
     with BenchNodes(lab, (ROBOT, CLOUD), plane="kernel") as nodes:
-        robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
-        cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
-        with _both(lab, "gdp", camera, ("a", "b"), ({"config": str(robot)}, {"config": str(cloud)})) as ends:
-            yield ends
+        ends = [(*each, {"config": str(nodes.admit_member(each[0], granted))}) for each, granted in rights.items()]
+        with started(lab, "gdp", camera, reversed(ends)) as (cloud, robot):
+            yield robot, cloud
 
 
 @contextmanager
@@ -90,12 +95,12 @@ def _zenoh(scheme: str, congestion: str, lab: Lab, camera: str) -> Iterator[Ends
     """Two peers over one link with mutual TLS, of TCP or of QUIC."""
     directory, at = lab.directory / "tls", f"{scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
     make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
-    own = [
-        {"certificate": str(directory / node), "congestion": congestion, "listen": [], "connect": [], key: [at]}
-        for node, key in ((ROBOT, "connect"), (CLOUD, "listen"))
+    ends = [
+        (node, role, {"certificate": str(directory / node), "congestion": congestion, key: [at]})
+        for node, role, key in ((CLOUD, "cloud", "listen"), (ROBOT, "robot", "connect"))
     ]
-    with _both(lab, "zenoh", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
-        yield ends
+    with started(lab, "zenoh", camera, ends) as (cloud, robot):
+        yield robot, cloud
 
 
 System = Callable[[Lab, str], AbstractContextManager[Ends]]
